@@ -1,0 +1,55 @@
+"""neurocal: camera calibration by a neural network whose weights are the camera.
+
+The names below are loaded on first use, so that a command imports only what it needs.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neurocal_cli.calibration import Calibration
+    from neurocal_cli.camera import Intrinsics, Pose
+    from neurocal_cli.errors import NeurocalError
+    from neurocal_cli.evaluation import evaluate_camera
+    from neurocal_cli.io.calibration_yaml import read_calibration, write_calibration
+    from neurocal_cli.io.points_csv import read_points, write_points
+    from neurocal_cli.methods import calibrate
+    from neurocal_cli.points import Correspondences
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Calibration": "calibration",
+    "Correspondences": "points",
+    "Intrinsics": "camera",
+    "NeurocalError": "errors",
+    "Pose": "camera",
+    "calibrate": "methods",
+    "evaluate_camera": "evaluation",
+    "read_calibration": "io.calibration_yaml",
+    "read_points": "io.points_csv",
+    "write_calibration": "io.calibration_yaml",
+    "write_points": "io.points_csv",
+}
+
+__all__ = [
+    "Calibration",
+    "Correspondences",
+    "Intrinsics",
+    "NeurocalError",
+    "Pose",
+    "calibrate",
+    "evaluate_camera",
+    "read_calibration",
+    "read_points",
+    "write_calibration",
+    "write_points",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

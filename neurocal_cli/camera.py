@@ -1,0 +1,252 @@
+"""The pinhole camera of the paper's section 2: A, D, P = A D, its 11 parameters and derivatives.
+
+Five intrinsic parameters make A, six extrinsic ones make D = [R | t]. The estimators work on the
+five free entries of A, which are the network's output weights; the paper's alpha_v and theta
+follow from them. Conventions: see `geometry`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation, rotation_to_euler, rq
+
+__all__ = [
+    "INTRINSIC_NAMES",
+    "POSE_NAMES",
+    "Intrinsics",
+    "Pose",
+    "decompose",
+    "project",
+    "projection_jacobian",
+]
+
+INTRINSIC_NAMES = ("alpha_u", "alpha_v", "u0", "v0", "theta")
+POSE_NAMES = ("R_x", "R_y", "R_z", "t_x", "t_y", "t_z")
+
+# A matrix read from a file is a rotation when R R^T is the identity to this accuracy.
+_ROTATION_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """The five intrinsic parameters of the paper's matrix A.
+
+    Parameters
+    ----------
+    alpha_u, alpha_v : float [px]
+        Scale factors, both positive.
+    u0, v0 : float [px]
+        Principal point.
+    theta : float [rad]
+        Angle between the image axes, in (0, pi); pi/2 means no skew.
+
+    Raises
+    ------
+    InputError
+        A value that is not finite or out of range.
+    """
+
+    alpha_u: float
+    alpha_v: float
+    u0: float
+    v0: float
+    theta: float = np.pi / 2
+
+    def __post_init__(self) -> None:
+        for name in INTRINSIC_NAMES:
+            object.__setattr__(self, name, float(getattr(self, name)))
+        values = np.array([getattr(self, name) for name in INTRINSIC_NAMES])
+        if not np.isfinite(values).all():
+            raise InputError("intrinsic parameters must be finite numbers")
+        if self.alpha_u <= 0 or self.alpha_v <= 0:
+            raise InputError("alpha_u and alpha_v must be positive")
+        if not 0 < self.theta < np.pi:
+            raise InputError("theta must lie between 0 and pi")
+
+    @property
+    def A(self) -> Array:
+        """(3, 3) array: the paper's A without its last, zero column."""
+        return np.array(
+            [
+                [self.alpha_u, -self.alpha_u / np.tan(self.theta) if self.skewed else 0.0, self.u0],
+                [0.0, self.alpha_v / np.sin(self.theta), self.v0],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+
+    @property
+    def skewed(self) -> bool:
+        """Whether theta differs from the float nearest to pi/2, where tan is not infinite."""
+        return self.theta != np.pi / 2
+
+    @classmethod
+    def from_matrix(cls, A: Array) -> Intrinsics:
+        """Read the parameters off an upper triangular A, scaled so that ``A[2, 2] = 1``."""
+        A = np.asarray(A, dtype=float)
+        if A.shape != (3, 3) or not np.isfinite(A).all() or A[2, 2] == 0:
+            raise InputError("a camera matrix must be 3 x 3, finite, with A[2, 2] = 1")
+        A = A / A[2, 2]
+        if np.abs(A[[1, 2, 2], [0, 0, 1]]).max() > 1e-9 * np.abs(A).max():
+            raise InputError("a camera matrix must be upper triangular")
+        theta = float(np.arctan2(A[0, 0], -A[0, 1])) if A[0, 1] != 0 else np.pi / 2
+        return cls(A[0, 0], A[1, 1] * np.sin(theta), A[0, 2], A[1, 2], theta)
+
+    def values(self) -> Array:
+        """(5,) array in the order of `INTRINSIC_NAMES`."""
+        return np.array([getattr(self, name) for name in INTRINSIC_NAMES])
+
+    def entry_jacobian(self) -> Array:
+        """Derivative of (alpha_u, alpha_v, u0, v0, theta) by A's (A11, A12, A22, A13, A23); (5, 5)."""
+        sine, cosine = np.sin(self.theta), np.cos(self.theta)
+        # theta = atan2(A11, -A12) and alpha_v = A22 sin(theta).
+        theta_by_a11 = -sine * cosine / self.alpha_u
+        theta_by_a12 = sine * sine / self.alpha_u
+        alpha_v_by_theta = self.alpha_v / np.tan(self.theta)
+        J = np.zeros((5, 5))
+        J[0, 0] = J[2, 3] = J[3, 4] = 1.0
+        J[1] = [alpha_v_by_theta * theta_by_a11, alpha_v_by_theta * theta_by_a12, sine, 0.0, 0.0]
+        J[4, :2] = theta_by_a11, theta_by_a12
+        return J
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """World to camera, ``Xc = R M + t``.
+
+    Parameters
+    ----------
+    R : (3, 3) array
+        A rotation; it is replaced by the nearest exact one.
+    t : (3,) array
+        In the world's unit.
+
+    Raises
+    ------
+    InputError
+        Wrong shapes, values that are not finite, R not a rotation.
+    """
+
+    R: Array
+    t: Array
+
+    def __post_init__(self) -> None:
+        R, t = np.array(self.R, dtype=float), np.array(self.t, dtype=float).reshape(-1)
+        if R.shape != (3, 3) or t.shape != (3,) or not (np.isfinite(R).all() and np.isfinite(t).all()):
+            raise InputError("a pose needs a finite 3 x 3 rotation R and 3 numbers t")
+        if np.abs(R @ R.T - np.eye(3)).max() > _ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+            raise InputError("R is not a rotation: R R^T must be the identity and det R = +1")
+        if np.abs(R @ R.T - np.eye(3)).max() > 1e-14:
+            R = nearest_rotation(R)
+        for name, array in (("R", R), ("t", t)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @classmethod
+    def from_euler(cls, R_x: float, R_y: float, R_z: float, t: Array) -> Pose:
+        """Pose from Euler angles [rad] and a translation."""
+        return cls(euler_to_rotation(R_x, R_y, R_z), t)
+
+    @property
+    def euler(self) -> Array:
+        """(3,) array R_x, R_y, R_z [rad]."""
+        return rotation_to_euler(self.R)
+
+    @property
+    def D(self) -> Array:
+        """(3, 4) array [R | t], the paper's D without its last row."""
+        return np.column_stack([self.R, self.t])
+
+
+def project(A: Array, pose: Pose, world: Array) -> tuple[Array, Array]:
+    """Project world points into the image, paper eq. (1).
+
+    Parameters
+    ----------
+    A : (3, 3) array
+    pose : Pose
+    world : (N, 3) array
+
+    Returns
+    -------
+    pixels : (N, 2) array [px]
+    depth : (N,) array
+        z in the camera's frame; a pixel means something only where it is positive.
+    """
+    camera = world @ pose.R.T + pose.t
+    depth = camera[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        image = camera[:, :2] / depth[:, None]
+    return image @ A[:2, :2].T + A[:2, 2], depth
+
+
+def projection_jacobian(A: Array, camera: Array) -> tuple[Array, Array]:
+    """Derivatives of the pixels, paper eq. (1), by A's entries and by the pose.
+
+    Parameters
+    ----------
+    A : (3, 3) array
+    camera : (..., 3) array
+        Points in the camera's frame, ``R M + t``.
+
+    Returns
+    -------
+    by_A : (..., 2, 5) array
+        By A11, A12, A22, A13, A23.
+    by_pose : (..., 2, 6) array
+        By omega and tau of ``Xc -> exp(omega) Xc + tau``, so R -> exp(omega) R and
+        t -> exp(omega) t + tau.
+    """
+    q = 1.0 / camera[..., 2]
+    x, y = camera[..., 0] * q, camera[..., 1] * q
+    by_A = np.zeros((*q.shape, 2, 5))
+    by_A[..., 0, 0], by_A[..., 0, 1], by_A[..., 0, 3] = x, y, 1.0
+    by_A[..., 1, 2], by_A[..., 1, 4] = y, 1.0
+    # Derivatives of (x, y): the interaction matrix of a point.
+    normal = np.zeros((*q.shape, 2, 6))
+    normal[..., 0, 0], normal[..., 0, 1], normal[..., 0, 2] = -x * y, 1 + x * x, -y
+    normal[..., 1, 0], normal[..., 1, 1], normal[..., 1, 2] = -1 - y * y, x * y, x
+    normal[..., 0, 3] = normal[..., 1, 4] = q
+    normal[..., 0, 5], normal[..., 1, 5] = -x * q, -y * q
+    return by_A, A[:2, :2] @ normal
+
+
+def decompose(P: Array, world: Array | None = None) -> tuple[Intrinsics, Pose]:
+    """Split a projection matrix into its 11 parameters (Faugeras 1993).
+
+    Parameters
+    ----------
+    P : (3, 4) array
+        Defined up to scale and sign.
+    world : (N, 3) array, optional
+        Points that lie in front of the camera; they fix the sign of P. Without them the sign that
+        makes R a rotation is taken.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        P's left 3 x 3 block is singular (a camera at infinity), points on both sides of the
+        camera, or points that only a mirrored camera could see.
+    """
+    P = np.asarray(P, dtype=float)
+    M = P[:, :3]
+    if np.linalg.cond(M / np.linalg.norm(M, axis=1, keepdims=True)) > 1e14:
+        raise DegenerateGeometryError("the projection matrix is singular: it is no camera with a focal length")
+    if world is None:
+        sign = np.sign(np.linalg.det(M))
+    else:
+        depth = world @ P[2, :3] + P[2, 3]
+        if depth.min() < 0 < depth.max():
+            raise DegenerateGeometryError("the points lie on both sides of the camera")
+        sign = np.sign(depth.sum())
+    if sign * np.linalg.det(M) < 0:
+        raise DegenerateGeometryError(
+            "only a mirrored camera could see these points; check the axes of X,Y,Z "
+            "(right-handed?) and of u,v (v downwards?)"
+        )
+    K, R = rq(sign * M)
+    t = np.linalg.solve(K, sign * P[:, 3])
+    return Intrinsics.from_matrix(K / K[2, 2]), Pose(nearest_rotation(R), t)

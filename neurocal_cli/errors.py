@@ -1,0 +1,56 @@
+"""Everything that can go wrong, under one root.
+
+The library raises these and nothing else on purpose; the command layer turns each into one line
+and the exit code that the class names. A message says what is wrong, where, and what to do.
+"""
+
+from __future__ import annotations
+
+__all__ = [
+    "DegenerateGeometryError",
+    "FormatError",
+    "InputError",
+    "NeurocalError",
+    "UsageError",
+]
+
+
+class NeurocalError(Exception):
+    """Root of all errors that a caller of neurocal may want to catch."""
+
+    exit_code = 1
+
+
+class InputError(NeurocalError, ValueError):
+    """An array or a value that cannot be used: wrong shape, not finite, too few."""
+
+
+class FormatError(NeurocalError, ValueError):
+    """A file that cannot be read as what it should be.
+
+    Parameters
+    ----------
+    problem : str
+        What is wrong and what to do.
+    source : str
+        The file's name, ``<stdin>`` for a stream.
+    line : int, optional
+        Line number, counted from 1.
+    """
+
+    def __init__(self, problem: str, source: str = "", line: int | None = None) -> None:
+        place = source if line is None else f"{source}:{line}"
+        super().__init__(f"{place}: {problem}" if place else problem)
+        self.problem = problem
+        self.source = source
+        self.line = line
+
+
+class DegenerateGeometryError(NeurocalError):
+    """Points that are well formed but cannot determine what is asked for."""
+
+
+class UsageError(NeurocalError):
+    """A request that makes no sense as put, whatever the data: the user's to change."""
+
+    exit_code = 2

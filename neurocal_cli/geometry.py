@@ -1,0 +1,194 @@
+"""Rotations, similarities and the conventions that everything else relies on.
+
+Conventions, stated once
+------------------------
+* Pixels: the centre of the top-left pixel is (0, 0); u grows to the right, v downwards.
+* World to camera: ``Xc = R M + t``, column vectors, right-handed; camera x right, y down, z forward.
+* Euler angles in radians, fixed axes: ``R = Rz(R_z) Ry(R_y) Rx(R_x)``, R_y in [-pi/2, pi/2].
+  The paper never states its order; this one reproduces its Table 1 scene.
+* ``P = A [R | t]`` with A upper triangular, positive diagonal, ``A[2, 2] = 1``.
+* A point in front of the camera has positive depth.
+
+Arrays of rotations carry leading batch axes: ``(..., 3, 3)``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+__all__ = [
+    "Array",
+    "cross_matrix",
+    "euler_jacobian",
+    "euler_to_rotation",
+    "nearest_rotation",
+    "plane_basis",
+    "rotation_exp",
+    "rotation_to_euler",
+    "rq",
+    "similarity",
+]
+
+# Below this cosine of R_y the x and z axes coincide and only R_x -/+ R_z is defined.
+_GIMBAL_COSINE = 1e-12
+
+
+def euler_to_rotation(R_x: float, R_y: float, R_z: float) -> Array:
+    """Rotation matrix ``Rz(R_z) Ry(R_y) Rx(R_x)``.
+
+    Parameters
+    ----------
+    R_x, R_y, R_z : float [rad]
+
+    Returns
+    -------
+    R : (3, 3) array
+    """
+    cx, cy, cz = np.cos(R_x), np.cos(R_y), np.cos(R_z)
+    sx, sy, sz = np.sin(R_x), np.sin(R_y), np.sin(R_z)
+    return np.array(
+        [
+            [cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx],
+            [sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx],
+            [-sy, cy * sx, cy * cx],
+        ]
+    )
+
+
+def rotation_to_euler(R: Array) -> Array:
+    """Euler angles of rotations; R_z is 0 where R_y is +-pi/2.
+
+    Parameters
+    ----------
+    R : (..., 3, 3) array
+
+    Returns
+    -------
+    angles : (..., 3) array of R_x, R_y, R_z [rad]
+    """
+    R = np.asarray(R, dtype=float)
+    cy = np.hypot(R[..., 0, 0], R[..., 1, 0])
+    locked = cy < _GIMBAL_COSINE
+    R_y = np.arctan2(-R[..., 2, 0], cy)
+    R_z = np.where(locked, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
+    R_x = np.where(
+        locked,
+        np.arctan2(-R[..., 1, 2], R[..., 1, 1]),
+        np.arctan2(R[..., 2, 1], R[..., 2, 2]),
+    )
+    return np.stack([R_x, R_y, R_z], axis=-1)
+
+
+def euler_jacobian(R: Array) -> Array:
+    """Derivative of the Euler angles by a small left rotation, ``R -> exp(omega) R``.
+
+    Columns of the inverse are the instantaneous axes of R_x, R_y, R_z in the camera frame.
+    At gimbal lock the pseudo-inverse is returned: only the defined combination moves.
+
+    Parameters
+    ----------
+    R : (..., 3, 3) array
+
+    Returns
+    -------
+    J : (..., 3, 3) array, d(R_x, R_y, R_z) / d omega
+    """
+    _, R_y, R_z = np.moveaxis(rotation_to_euler(R), -1, 0)
+    cy, sy, cz, sz = np.cos(R_y), np.sin(R_y), np.cos(R_z), np.sin(R_z)
+    zero, one = np.zeros_like(cy), np.ones_like(cy)
+    axes = np.stack(
+        [
+            np.stack([cz * cy, -sz, zero], -1),
+            np.stack([sz * cy, cz, zero], -1),
+            np.stack([-sy, zero, one], -1),
+        ],
+        axis=-2,
+    )
+    return np.linalg.pinv(axes, rcond=1e-9)
+
+
+def cross_matrix(w: Array) -> Array:
+    """Matrix of the cross product, ``cross_matrix(w) @ x == np.cross(w, x)``; (..., 3) -> (..., 3, 3)."""
+    w = np.asarray(w, dtype=float)
+    K = np.zeros((*w.shape[:-1], 3, 3))
+    K[..., 0, 1], K[..., 0, 2] = -w[..., 2], w[..., 1]
+    K[..., 1, 0], K[..., 1, 2] = w[..., 2], -w[..., 0]
+    K[..., 2, 0], K[..., 2, 1] = -w[..., 1], w[..., 0]
+    return K
+
+
+def rotation_exp(w: Array) -> Array:
+    """Rotation by the angle |w| about the axis w (Rodrigues); (..., 3) -> (..., 3, 3)."""
+    K = cross_matrix(w)
+    angle2 = (np.asarray(w, dtype=float) ** 2).sum(-1)[..., None, None]
+    angle = np.sqrt(angle2)
+    # sinc stays accurate at angle 0: sin(x)/x and (1 - cos x)/x^2 without a branch.
+    sine = np.sinc(angle / np.pi)
+    versine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    return np.eye(3) + sine * K + versine * (K @ K)
+
+
+def nearest_rotation(M: Array) -> Array:
+    """Rotation nearest to M in the Frobenius norm, determinant +1; (..., 3, 3) -> (..., 3, 3)."""
+    U, _, Vt = np.linalg.svd(M)
+    flip = np.ones((*np.shape(M)[:-2], 3))
+    flip[..., 2] = np.sign(np.linalg.det(U @ Vt))
+    return (U * flip[..., None, :]) @ Vt
+
+
+def rq(M: Array) -> tuple[Array, Array]:
+    """Factor M = K Q, K upper triangular with positive diagonal, Q orthogonal; (..., 3, 3)."""
+    reverse = np.eye(3)[::-1]
+    q, r = np.linalg.qr(np.swapaxes(reverse @ M, -1, -2))
+    K = reverse @ np.swapaxes(r, -1, -2) @ reverse
+    Q = reverse @ np.swapaxes(q, -1, -2)
+    sign = np.where(np.diagonal(K, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+    return K * sign[..., None, :], sign[..., :, None] * Q
+
+
+def similarity(points: Array) -> tuple[Array, float]:
+    """Centre and scale that bring points into [-1, 1], the paper's s_1 and s_2 with an origin.
+
+    Dividing by s alone leaves data far from the origin badly conditioned (Hartley 1997), so the
+    centroid is taken off first.
+
+    Parameters
+    ----------
+    points : (N, D) array
+
+    Returns
+    -------
+    centre : (D,) array
+    scale : float
+        Largest absolute centred coordinate; 1 when all the points coincide.
+    """
+    centre = points.mean(axis=0)
+    scale = float(np.abs(points - centre).max(initial=0.0))
+    return centre, scale if scale > 0 else 1.0
+
+
+def plane_basis(points: Array) -> tuple[Array, Array]:
+    """Principal axes of points and their rms extents along them.
+
+    Parameters
+    ----------
+    points : (N, 3) array
+
+    Returns
+    -------
+    Q : (3, 3) array
+        Rotation whose columns are the principal axes, largest extent first.
+    extent : (3,) array
+        Rms extent along each axis, in the points' unit.
+    """
+    centred = points - points.mean(axis=0)
+    _, singular, Vt = np.linalg.svd(centred.T @ centred)
+    Q = Vt.T
+    if np.linalg.det(Q) < 0:
+        Q = Q * np.array([1.0, 1.0, -1.0])
+    # The product squares the condition: measure the extents on the points themselves.
+    extent = np.sqrt(np.mean((centred @ Q) ** 2, axis=0))
+    return Q, extent

@@ -1,0 +1,200 @@
+"""Known points and where they were seen: the data that a calibration learns from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = ["Correspondences"]
+
+_ONLY_VIEW = "view"  # the name of the single view of points that name none
+_LARGEST = 1e100  # squares of coordinates beyond this overflow; no camera sees such a point
+
+
+@dataclass(frozen=True, eq=False)
+class Correspondences:
+    """World points and their pixels, grouped by view.
+
+    Parameters
+    ----------
+    world : (N, 3) array
+        X, Y, Z in the world's unit.
+    pixels : (N, 2) array [px]
+        u, v; the centre of the top-left pixel is (0, 0).
+    view : (N,) labels, optional
+        The image that each row belongs to; None: all rows are one view.
+    image_size : (width, height), optional [px]
+    image_center : (u0, v0), optional [px]
+        The image centre as given with the data, for type 2.
+    point : (N,) labels, optional
+        An id that is the same for the same physical point in all images.
+    covariance : (N, 3) array, optional [px^2]
+        Columns suu, suv, svv of each pixel's covariance. Only ratios between points matter: the
+        noise level itself is estimated from the residuals.
+    unit : str
+        Of the world coordinates.
+    source : str
+        Where the rows come from, for messages.
+    lines : (N,) int array, optional
+        Line of each row in its file, for messages.
+
+    Attributes
+    ----------
+    view_names : tuple of str
+        In order of first appearance.
+    view_index : (N,) int array
+        Position of each row's view in `view_names`.
+
+    Raises
+    ------
+    InputError
+        Shapes that do not fit, no rows, numbers that are not finite (or beyond 1e100), a
+        covariance that is not positive definite.
+    """
+
+    world: Array
+    pixels: Array
+    view: NDArray[Any] | Sequence[Any] | None = None
+    image_size: tuple[int, int] | None = None
+    image_center: tuple[float, float] | None = None
+    point: NDArray[Any] | Sequence[Any] | None = None
+    covariance: Array | None = None
+    unit: str = "mm"
+    source: str = "points"
+    lines: NDArray[np.int64] | None = None
+    view_names: tuple[str, ...] = field(init=False)
+    view_index: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        world = _matrix("world", self.world, 3)
+        pixels = _matrix("pixels", self.pixels, 2)
+        n = len(world)
+        if len(pixels) != n:
+            raise InputError(
+                f"{self.source}: {n} world points but {len(pixels)} pixels; give one pixel a point"
+            )
+        if n == 0:
+            raise InputError(f"{self.source}: there are no points; give at least one row of X,Y,Z,u,v")
+        self._set(world=_frozen(world), pixels=_frozen(pixels))
+        for name in ("view", "point", "lines"):
+            labels = getattr(self, name)
+            if labels is not None:
+                labels = np.array(labels)  # a copy: it is made read-only
+                if labels.shape != (n,):
+                    raise InputError(f"{self.source}: {name} needs one entry for each of the {n} points")
+                self._set(**{name: _frozen(labels)})
+        self._check_finite()
+        names, index = _factorise(self.view, n)
+        self._set(view_names=names, view_index=_frozen(index))
+        if self.covariance is not None:
+            self._check_covariance(_matrix("covariance", self.covariance, 3))
+        if self.image_size is not None:
+            width, height = (int(s) for s in self.image_size)
+            if width <= 0 or height <= 0:
+                raise InputError(f"{self.source}: image_size must be two positive whole numbers")
+            self._set(image_size=(width, height))
+        if self.image_center is not None:
+            u0, v0 = (float(c) for c in self.image_center)
+            if not np.isfinite([u0, v0]).all():
+                raise InputError(f"{self.source}: image_center must be two finite numbers")
+            self._set(image_center=(u0, v0))
+
+    def __len__(self) -> int:
+        return len(self.world)
+
+    @property
+    def n_points(self) -> int:
+        """Number of rows."""
+        return len(self.world)
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+        return len(self.view_names)
+
+    def place(self, row: int) -> str:
+        """Where a row came from, ``file:line`` or ``points, row 7``."""
+        if self.lines is not None:
+            return f"{self.source}:{int(self.lines[row])}"
+        return f"{self.source}, row {row + 1}"
+
+    def select(self, rows: NDArray[Any] | slice) -> Correspondences:
+        """The same data restricted to some rows (a mask, indices or a slice)."""
+
+        def pick(values: Any) -> Any:
+            return None if values is None else np.asarray(values)[rows]
+
+        return replace(
+            self,
+            world=self.world[rows],
+            pixels=self.pixels[rows],
+            view=pick(self.view),
+            point=pick(self.point),
+            covariance=pick(self.covariance),
+            lines=pick(self.lines),
+        )
+
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def _check_finite(self) -> None:
+        for name, values in (("X,Y,Z", self.world), ("u,v", self.pixels)):
+            good = np.abs(values).max(axis=1) <= _LARGEST  # False for nan as well
+            if not good.all():
+                row = int(np.argmin(good))
+                raise InputError(
+                    f"{self.place(row)}: {name} must be finite numbers of a sensible size, found "
+                    f"{', '.join(f'{x:g}' for x in values[row])}; correct or remove the row"
+                )
+
+    def _check_covariance(self, covariance: Array) -> None:
+        suu, suv, svv = covariance.T
+        with np.errstate(over="ignore", invalid="ignore"):
+            good = (suu > 0) & (svv > 0) & (suu * svv > suv * suv) & (suu * svv < np.inf)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise InputError(
+                f"{self.place(row)}: the pixel's covariance (sigma, or suu,suv,svv) must be positive "
+                "definite; correct or remove the row"
+            )
+        self._set(covariance=_frozen(covariance))
+
+
+def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
+    try:
+        array = np.array(values, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be an array of numbers, shape (N, {columns})") from error
+    if array.ndim != 2 or array.shape[1] != columns:
+        raise InputError(f"{name} must have the shape (N, {columns}), found {array.shape}")
+    return array
+
+
+def _frozen(array: NDArray[Any]) -> NDArray[Any]:
+    array.setflags(write=False)
+    return array
+
+
+def _factorise(labels: NDArray[Any] | Sequence[Any] | None, n: int) -> tuple[tuple[str, ...], NDArray[np.int64]]:
+    """Names in order of first appearance and each row's position among them.
+
+    Rows of a view mostly stand together, so only the first row of each run is sorted.
+    """
+    if labels is None:
+        return (_ONLY_VIEW,), np.zeros(n, dtype=np.int64)
+    labels = np.asarray(labels)
+    starts = np.flatnonzero(np.concatenate([[True], labels[1:] != labels[:-1]]))
+    distinct, first, inverse = np.unique(labels[starts], return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    run_lengths = np.diff(np.concatenate([starts, [n]]))
+    return tuple(str(distinct[k]) for k in order), np.repeat(rank[inverse.ravel()], run_lengths)
