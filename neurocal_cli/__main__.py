@@ -1,0 +1,26 @@
+"""Entry point of ``neurocal`` and of ``python -m neurocal_cli``."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+
+__all__ = ["main"]
+
+
+def main() -> None:
+    """Run the command line and leave with its exit code."""
+    if not sys.warnoptions:
+        # Warnings of the libraries below are for their developers; what a user should know is in
+        # the result's own warnings.
+        warnings.simplefilter("ignore")
+    try:
+        from neurocal_cli.commands import neurocal
+
+        neurocal(prog_name="neurocal")
+    except KeyboardInterrupt:  # pressed while modules are still being loaded
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

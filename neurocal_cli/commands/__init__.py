@@ -1,0 +1,110 @@
+"""The command line: the group ``neurocal``, whose commands load when they run.
+
+A command parses, reads, calls one function of the library and shows what it returns. Errors of all
+commands become one line and an exit code here and nowhere else. Modules of commands import nothing
+but click at their top, so that ``--help`` needs no numpy.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from importlib import import_module
+from typing import Any
+
+import click
+
+from neurocal_cli import __version__
+from neurocal_cli.commands.streams import one_line, say
+from neurocal_cli.errors import NeurocalError
+
+__all__ = ["neurocal"]
+
+_HOMES = {
+    "calibrate": "calibrate",
+    "evaluate": "evaluate",
+    "man": "man",
+}
+
+
+class _LazyGroup(click.Group):
+    """A group that imports a command's module when the command is asked for.
+
+    Parameters
+    ----------
+    homes : dict
+        Module of each command, relative to this package; it holds the command under its name.
+    """
+
+    def __init__(self, *args: Any, homes: Mapping[str, str], **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self._homes = homes
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(self._homes)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name in self._homes:
+            self._load(cmd_name)
+        else:
+            for name in self._homes:  # so that click can suggest the nearest name
+                self._load(name)
+        return self.commands.get(cmd_name)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
+            raise  # click's own, and a reader that has seen enough
+        except KeyboardInterrupt:
+            message, exit_code = "interrupted", 130
+        except NeurocalError as error:
+            message, exit_code = str(error), error.exit_code
+        except Exception as error:
+            if os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0"):
+                raise
+            message, exit_code = _explain(error), 1
+        say(f"Error: {one_line(message)}")
+        raise click.exceptions.Exit(exit_code)
+
+    def _load(self, name: str) -> None:
+        if name not in self.commands:
+            self.add_command(getattr(import_module(f"{__name__}.{self._homes[name]}"), name), name)
+
+
+def _explain(error: Exception) -> str:
+    """Put an error that is none of neurocal's own into words."""
+    if isinstance(error, MemoryError):
+        return "not enough memory; use fewer points"
+    if isinstance(error, RecursionError):
+        return "the input is nested too deeply to be read"
+    if isinstance(error, UnicodeError):
+        return f"text that cannot be read or written ({error}); use UTF-8"
+    if isinstance(error, OSError) and error.strerror:
+        place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
+        return f"{place}{error.strerror}"
+    what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    return f"internal error: {what}; run with NEUROCAL_DEBUG=1 to see where"
+
+
+@click.command(
+    cls=_LazyGroup,
+    homes=_HOMES,
+    context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
+)
+@click.version_option(__version__, message="%(prog)s %(version)s", help="Show the version and exit.")
+def neurocal() -> None:
+    """Calibrate cameras with a neural network whose weights are the camera.
+
+    The network starts from random weights, learns from known points and where they were seen, and
+    ends as the camera: its output weights are the intrinsic parameters, its hidden weights the pose.
+
+    Results go to standard output and all else to standard error; `-` as a file name stands for
+    standard input or output, so commands can be chained.
+
+    \b
+    Examples:
+      neurocal calibrate points.csv -o camera.yaml
+      neurocal evaluate camera camera.yaml
+      cat points.csv | neurocal calibrate - | neurocal evaluate camera -
+    """  # noqa: D301 - click's mark of a paragraph not to be wrapped

@@ -1,0 +1,120 @@
+"""``neurocal evaluate``: how good a result is."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import click
+
+from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
+from neurocal_cli.commands.streams import check_one_stdin, is_terminal, note, warn
+
+if TYPE_CHECKING:
+    from neurocal_cli.evaluation import CameraEvaluation
+    from neurocal_cli.points import Correspondences
+
+__all__ = ["evaluate"]
+
+
+@click.group()
+def evaluate() -> None:
+    """Measure how good a result is.
+
+    \b
+    Examples:
+      neurocal evaluate camera camera.yaml
+      neurocal evaluate camera camera.yaml other_points.csv --json
+    """  # noqa: D301 - as in the group
+
+
+@evaluate.command(cls=Command)
+@click.argument(
+    "calibration",
+    metavar="CAMERA.yaml",
+    type=INPUT,
+    cls=Argument,
+    description="A calibration written by neurocal; - is standard input.",
+)
+@click.argument(
+    "points",
+    metavar="[POINTS.csv]",
+    type=INPUT,
+    required=False,
+    cls=Argument,
+    description="Points to judge the camera by; without them, those it was calibrated from.",
+)
+@json_option
+def camera(calibration: str, points: str | None, as_json: bool) -> None:
+    """Measure the reprojection error of a calibrated camera, in pixels.
+
+    Every point is projected through the camera and compared with the pixel where it was seen. The
+    error of a set of points is sqrt(mean(du^2 + dv^2)), with du, dv = predicted minus observed; bias
+    is the mean of du and of dv.
+
+    Without POINTS.csv the camera is judged by the points it was calibrated from, which flatters it.
+    With points of views that the calibration does not know, the pose of each such view is fitted
+    first, with the intrinsic parameters fixed (calibration type 3), and the view is marked `fitted`;
+    views that the calibration knows keep their calibrated pose. Points behind the camera are counted
+    and kept out of all averages.
+
+    \b
+    Examples:
+      neurocal evaluate camera camera.yaml
+      neurocal evaluate camera camera.yaml other_points.csv --json
+      cat points.csv | neurocal calibrate - | neurocal evaluate camera -
+    """  # noqa: D301 - as in the group
+    check_one_stdin(calibration, points)
+    from neurocal_cli.evaluation import evaluate_camera
+    from neurocal_cli.io.calibration_yaml import read_calibration
+
+    evaluation = evaluate_camera(read_calibration(calibration), _read_points(points))
+    _tell(evaluation)
+    _show(evaluation, as_json)
+
+
+def _read_points(name: str | None) -> Correspondences | None:
+    if name is None:
+        return None
+    from neurocal_cli.io.points_csv import read_points
+
+    notes: list[str] = []
+    points = read_points([name], notes=notes)
+    note(notes)
+    return points
+
+
+def _tell(evaluation: CameraEvaluation) -> None:
+    fitted = evaluation.fitted_views
+    if fitted:
+        names = ", ".join(fitted[:5]) + (", ..." if len(fitted) > 5 else "")
+        note([f"{names}: not in the calibration, so the pose is fitted with the intrinsic parameters fixed"])
+    warn(evaluation.warnings)
+
+
+def _show(evaluation: CameraEvaluation, as_json: bool) -> None:
+    from neurocal_cli.report import evaluation_json, evaluation_report, evaluation_tables
+
+    if as_json:
+        click.echo(json.dumps(evaluation_json(evaluation), indent=2, allow_nan=False))
+    elif is_terminal(sys.stdout):
+        _show_tables(evaluation_tables(evaluation))
+    else:
+        click.echo(evaluation_report(evaluation))
+
+
+def _show_tables(tables: Sequence[Sequence[Sequence[str]]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    console = Console()
+    for rows in tables:
+        table = Table()
+        for k, heading in enumerate(rows[0]):
+            table.add_column(Text(heading), justify="left" if k == 0 else "right")
+        for row in rows[1:]:
+            table.add_row(*(Text(cell) for cell in row))
+        console.print(table)

@@ -1,0 +1,203 @@
+"""Man pages out of the commands' own help, so that the two cannot differ."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+
+import click
+
+from neurocal_cli import __version__
+from neurocal_cli.commands.options import Argument
+
+__all__ = ["man", "man_pages"]
+
+_EXIT_STATUS = (
+    ("0", "Done."),
+    ("1", "The data cannot give an answer: unreadable, malformed or degenerate. No file was changed."),
+    ("2", "Wrong usage."),
+    ("3", "An answer was written, but training did not converge; it says `converged: false`."),
+    ("130", "Interrupted."),
+)
+
+_FILES = (
+    (
+        "POINTS.csv",
+        "A line for each known point, with columns X, Y, Z (world) and u, v (pixels; the centre of the "
+        "top-left pixel is 0, 0), and optionally view, which names the image. Columns are found by the "
+        "names in the first line, in any order; five columns without a first line of names are X, Y, Z, "
+        "u, v. Lines that begin with # are comments or say `image_size: 640 480`, `image_center: 320 240` "
+        "or `unit: mm`.",
+    ),
+    (
+        "CAMERA.yaml",
+        "A ROS camera_info file with one more block, `neurocal`: all parameters with their standard "
+        "deviations, the pose of each view, how the training went, and the points.",
+    ),
+)
+
+_ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, unexpected errors show where in the program they arose."),)
+
+
+@click.command(hidden=True)
+@click.argument(
+    "directory",
+    metavar="DIR",
+    type=click.Path(file_okay=False),
+    cls=Argument,
+    description="Folder for the pages.",
+)
+@click.pass_context
+def man(ctx: click.Context, directory: str) -> None:
+    """Write the man pages of all commands into a folder.
+
+    \b
+    Examples:
+      neurocal man man
+    """  # noqa: D301 - as in the group
+    from neurocal_cli.io.files import write_whole
+
+    os.makedirs(directory, exist_ok=True)
+    for name, page in man_pages(ctx.find_root().command).items():
+        write_whole(os.path.join(directory, name), page)
+
+
+def man_pages(root: click.Command) -> dict[str, str]:
+    """File names and texts of the man pages of a command and all below it.
+
+    Hidden commands have none.
+    """
+    contexts = list(_walk(click.Context(root, info_name="neurocal", **root.context_settings)))
+    names = [_page_name(ctx) for ctx in contexts]
+    return {f"{_page_name(ctx)}.1": _page(ctx, names) for ctx in contexts}
+
+
+def _walk(ctx: click.Context) -> Iterator[click.Context]:
+    yield ctx
+    group = ctx.command
+    if isinstance(group, click.Group):
+        for name in group.list_commands(ctx):
+            command = group.get_command(ctx, name)
+            if command is not None and not command.hidden:
+                yield from _walk(click.Context(command, info_name=name, parent=ctx))
+
+
+def _page_name(ctx: click.Context) -> str:
+    return ctx.command_path.replace(" ", "-")
+
+
+def _page(ctx: click.Context, names: list[str]) -> str:
+    """One man page in the macros of man(7)."""
+    summary, description, examples = _split_help(ctx.command.help or "")
+    name = _page_name(ctx)
+    lines = [
+        r".\" Made by `neurocal man` from the command's help; edit that instead.",
+        f'.TH "{_escape(name.upper())}" 1 "" "neurocal {__version__}" "neurocal manual"',
+        *_section("NAME", [rf"{_escape(name)} \- {_escape(summary[:1].lower() + summary[1:].rstrip('.'))}"]),
+        *_section("SYNOPSIS", _synopsis(ctx)),
+        *_section("DESCRIPTION", _prose(description) or [_escape(summary)]),
+        *_section("COMMANDS", _terms(_subcommands(ctx))),
+        *_section("ARGUMENTS", _terms(_arguments(ctx))),
+        *_section("OPTIONS", _terms(_options(ctx))),
+        *_section("EXAMPLES", _verbatim(examples)),
+        *_section("EXIT STATUS", _terms(_EXIT_STATUS)),
+        *_section("FILES", _terms(_FILES)),
+        *_section("ENVIRONMENT", _terms(_ENVIRONMENT)),
+        *_section("SEE ALSO", [", ".join(rf"\fB{_escape(n)}\fR(1)" for n in _neighbours(name, names))]),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _split_help(text: str) -> tuple[str, list[str], list[str]]:
+    """Summary, paragraphs and lines of examples of a help text."""
+    paragraphs = [p for p in re.split(r"\n\s*\n", _dedent(text)) if p.strip()]
+    examples = [p for p in paragraphs if p.startswith("\b\nExamples:")]
+    others = [p for p in paragraphs[1:] if p not in examples]
+    lines = [line.strip() for p in examples for line in p.splitlines()[2:]]
+    return " ".join(paragraphs[0].split()), others, lines
+
+
+def _dedent(text: str) -> str:
+    import inspect
+
+    return inspect.cleandoc(text)
+
+
+def _synopsis(ctx: click.Context) -> list[str]:
+    words = [rf"\fB{_escape(ctx.command_path)}\fR", r"[\fIOPTIONS\fR]"]
+    words += [rf"\fI{_escape(name)}\fR" for name, _ in _arguments(ctx)]
+    if isinstance(ctx.command, click.Group):
+        words.append(r"\fICOMMAND\fR ...")
+    return [" ".join(words)]
+
+
+def _subcommands(ctx: click.Context) -> list[tuple[str, str]]:
+    children = list(_walk(ctx))[1:]
+    return [
+        (child.command_path, _split_help(child.command.help or "")[0])
+        for child in children
+        if not isinstance(child.command, click.Group)
+    ]
+
+
+def _arguments(ctx: click.Context) -> list[tuple[str, str]]:
+    return [(str(p.metavar), p.description) for p in ctx.command.params if isinstance(p, Argument)]
+
+
+def _options(ctx: click.Context) -> list[tuple[str, str]]:
+    """Each option with its values, its help and its default."""
+    rows = []
+    for option in ctx.command.get_params(ctx):
+        if isinstance(option, click.Option) and not option.hidden:
+            head = ", ".join(option.opts)
+            values = "" if option.is_flag else f" {option.metavar or _choices(option)}"
+            rows.append((head + values, f"{option.help} {_default(option)}".strip()))
+    return rows
+
+
+def _choices(option: click.Option) -> str:
+    if isinstance(option.type, click.Choice):
+        return "|".join(str(choice) for choice in option.type.choices)
+    return option.type.name.upper()
+
+
+def _default(option: click.Option) -> str:
+    if isinstance(option.show_default, str):
+        return f"Default: {option.show_default}."
+    if option.is_flag or option.default is None:
+        return ""
+    return f"Default: {option.default}."
+
+
+def _neighbours(name: str, names: list[str]) -> list[str]:
+    return [other for other in names if other != name]
+
+
+def _section(title: str, body: list[str]) -> list[str]:
+    return [f".SH {title}", *body] if body else []
+
+
+def _prose(paragraphs: list[str]) -> list[str]:
+    lines: list[str] = []
+    for paragraph in paragraphs:
+        if paragraph.startswith("\b\n"):
+            lines += _verbatim(paragraph.splitlines()[1:])
+        else:
+            lines += [".PP", _escape(" ".join(paragraph.split()))]
+    return lines[1:] if lines[:1] == [".PP"] else lines
+
+
+def _verbatim(text: list[str]) -> list[str]:
+    lines = [_escape(line.rstrip()) for line in text]
+    return [".PP", ".nf", ".RS", *lines, ".RE", ".fi"] if lines else []
+
+
+def _terms(rows: tuple[tuple[str, str], ...] | list[tuple[str, str]]) -> list[str]:
+    return [line for term, text in rows for line in (".TP", rf"\fB{_escape(term)}\fR", _escape(text))]
+
+
+def _escape(text: str) -> str:
+    """Protect what troff would read as its own, and keep `-` a plain minus to copy."""
+    text = text.replace("\\", r"\(rs").replace("-", r"\-").replace("`", r"\(ga").replace("^", r"\(ha")
+    return rf"\&{text}" if text.startswith((".", "'")) else text

@@ -1,0 +1,100 @@
+"""Arguments and options that several commands share, so that they cannot diverge."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import click
+from click.types import FloatParamType
+
+__all__ = [
+    "INPUT",
+    "Argument",
+    "Command",
+    "FiniteNumber",
+    "json_option",
+    "output_option",
+    "points_argument",
+]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+# Existence and readability are the reader's business: a file that cannot be read is exit code 1.
+INPUT = click.Path(readable=False, allow_dash=True)
+
+
+class Argument(click.Argument):
+    """An argument that says what it is, in ``--help`` and in the man page."""
+
+    def __init__(self, *args: Any, description: str, **attributes: Any) -> None:
+        super().__init__(*args, **attributes)
+        self.description = description
+
+
+class Command(click.Command):
+    """A command whose help lists its arguments before its options."""
+
+    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the arguments, then the options."""
+        rows = [(str(p.metavar), p.description) for p in self.params if isinstance(p, Argument)]
+        if rows:
+            with formatter.section("Arguments"):
+                formatter.write_dl(rows)
+        super().format_options(ctx, formatter)
+
+
+class FiniteNumber(FloatParamType):
+    """A number that can be computed with: neither nan nor infinite.
+
+    Parameters
+    ----------
+    positive : bool
+        Whether it must be greater than 0.
+    """
+
+    def __init__(self, positive: bool = False) -> None:
+        self._positive = positive
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Read a number, or fail as click does."""
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value!r} is not a finite number.", param, ctx)
+        if self._positive and number <= 0:
+            self.fail(f"{value!r} is not greater than 0.", param, ctx)
+        return number
+
+
+def points_argument(f: F) -> F:
+    """Add POINTS..., one or more CSV files that are read as one."""
+    return click.argument(
+        "points",
+        nargs=-1,
+        required=True,
+        metavar="POINTS...",
+        type=INPUT,
+        cls=Argument,
+        description="CSV files with columns X,Y,Z,u,v and optionally view, read as one; - is standard input.",
+    )(f)
+
+
+def output_option(metavar: str, what: str) -> Callable[[F], F]:
+    """Add ``-o``, where the result goes; stdout unless it is given."""
+    return click.option(
+        "-o",
+        "--output",
+        metavar=metavar,
+        type=click.Path(writable=False, readable=False, allow_dash=True),
+        default="-",
+        show_default="standard output",
+        help=f"Write {what} to this file, whole or not at all.",
+    )
+
+
+def json_option(f: F) -> F:
+    """Add ``--json``, for programs that read the result."""
+    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")(
+        f
+    )

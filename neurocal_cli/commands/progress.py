@@ -1,0 +1,56 @@
+"""A progress bar for work that takes long enough to wonder, on a terminal only."""
+
+from __future__ import annotations
+
+import sys
+import time
+from contextlib import AbstractContextManager
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from neurocal_cli.commands.streams import is_terminal
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+__all__ = ["ProgressBar"]
+
+_PATIENCE = 0.5  # seconds before the bar appears; shorter work shows nothing
+
+
+class ProgressBar(AbstractContextManager["ProgressBar"]):
+    """Called with a stage and the fraction done, draws a bar on stderr once the work takes long.
+
+    Without a terminal it does nothing, and rich is not imported.
+    """
+
+    def __init__(self) -> None:
+        self._visible = is_terminal(sys.stderr)
+        self._start = time.monotonic()
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+
+    def __call__(self, stage: str, fraction: float) -> None:
+        """Show how far the work is."""
+        if not self._visible or time.monotonic() - self._start < _PATIENCE:
+            return
+        if self._bar is None:
+            self._open()
+        assert self._bar is not None
+        assert self._task is not None
+        self._bar.update(self._task, description=stage, completed=min(max(fraction, 0.0), 1.0))
+
+    def _open(self) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+        columns = TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn()
+        self._bar = Progress(*columns, console=Console(stderr=True), transient=True)
+        self._task = self._bar.add_task("", total=1.0)
+        self._bar.start()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()

@@ -1,0 +1,46 @@
+"""What a command says on stderr, so that stdout holds results only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TextIO
+
+import click
+
+from neurocal_cli.errors import UsageError
+
+__all__ = ["check_one_stdin", "is_terminal", "note", "one_line", "say", "warn"]
+
+
+def one_line(text: str) -> str:
+    """Put a text on one line, without control characters that a file may have put in it."""
+    line = " ".join(text.splitlines())
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
+
+def say(text: str) -> None:
+    """Show a text that is not a result."""
+    click.echo(text, err=True)
+
+
+def note(texts: Iterable[str]) -> None:
+    """Tell what was done with the input that the user may not expect."""
+    for text in texts:
+        say(f"note: {one_line(text)}")
+
+
+def warn(texts: Iterable[str]) -> None:
+    """Tell what may make the result worse than it looks."""
+    for text in texts:
+        say(f"warning: {one_line(text)}")
+
+
+def is_terminal(stream: TextIO | None) -> bool:
+    """Whether a person is looking at the stream."""
+    return stream is not None and not stream.closed and stream.isatty()
+
+
+def check_one_stdin(*names: str | None) -> None:
+    """Refuse a request to read standard input twice."""
+    if names.count("-") > 1:
+        raise UsageError("standard input (-) can be read only once; put the rest in files")

@@ -1,0 +1,214 @@
+"""How well a camera predicts where known points are seen: the reprojection error, paper eq. (3).
+
+Points may be those that the camera was calibrated from or others. A view that the calibration does
+not know has no pose yet: its pose is estimated with the intrinsic parameters held fixed (type 3),
+so that the error left is what the intrinsic parameters cannot explain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera import Pose
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+
+__all__ = ["CameraEvaluation", "ViewEvaluation", "evaluate_camera"]
+
+
+@dataclass(frozen=True)
+class ViewEvaluation:
+    """One view's error.
+
+    Attributes
+    ----------
+    n_points : int
+    n_behind : int
+        Points that lie on or behind the focal plane; they are in no average.
+    rmse_px, max_px : float [px]
+        nan when no point lies in front of the camera.
+    fitted : bool
+        Whether the pose was estimated from these very points.
+    """
+
+    n_points: int
+    n_behind: int
+    rmse_px: float
+    max_px: float
+    fitted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class CameraEvaluation:
+    """A camera's error over all the points.
+
+    Attributes
+    ----------
+    residuals : (N, 2) array [px]
+        Predicted minus observed; nan for points on or behind the focal plane, which are in no
+        average below.
+    n_points, n_behind : int
+    rmse_px : float [px]
+        ``sqrt(mean(du^2 + dv^2))``.
+    max_px : float [px]
+        Longest residual.
+    rms_u, rms_v : float [px]
+        Of each axis; their squares add up to that of `rmse_px`.
+    bias_u, bias_v : float [px]
+        Mean residual.
+    views : dict of ViewEvaluation by view name
+    warnings : tuple of str
+    """
+
+    residuals: Array
+    n_points: int
+    n_behind: int
+    rmse_px: float
+    max_px: float
+    rms_u: float
+    rms_v: float
+    bias_u: float
+    bias_v: float
+    views: Mapping[str, ViewEvaluation]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def fitted_views(self) -> tuple[str, ...]:
+        """Names of the views whose pose was estimated here."""
+        return tuple(name for name, view in self.views.items() if view.fitted)
+
+
+def evaluate_camera(calibration: Calibration, points: Correspondences | None = None) -> CameraEvaluation:
+    """Reprojection error of a calibrated camera.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    points : Correspondences, optional
+        Default: the points it was calibrated from.
+
+    Returns
+    -------
+    evaluation : CameraEvaluation
+
+    Raises
+    ------
+    InputError
+        Points of another image size; a distorted camera.
+    DegenerateGeometryError
+        A new view whose points do not determine its pose.
+    """
+    points = calibration.points if points is None else points
+    _check_comparable(calibration, points)
+    fitted = np.array([name not in calibration.views for name in points.view_names])
+    poses = {name: view.pose for name, view in calibration.views.items()}
+    warnings: list[str] = []
+    if fitted.any():
+        new_poses, problems = _fit_poses(calibration, points.select(fitted[points.view_index]))
+        poses.update(new_poses)
+        warnings += problems
+    if not fitted.all() and points.unit != calibration.unit:
+        warnings.append(
+            f"the points are in {points.unit}, the poses of the calibration in {calibration.unit}; "
+            "the error means nothing unless the two are the same"
+        )
+    predicted, in_front = _predict(calibration.K, [poses[name] for name in points.view_names], points)
+    residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
+    if not in_front.all():
+        warnings.append(
+            f"{np.count_nonzero(~in_front)} of {len(points)} points lie behind the camera and are "
+            "in no average"
+        )
+    return _measure(residuals, points, fitted, tuple(warnings))
+
+
+def _check_comparable(calibration: Calibration, points: Correspondences) -> None:
+    if np.any(calibration.distortion != 0):
+        raise InputError(
+            "the camera has lens distortion, which is not supported yet; undistort the points and "
+            "evaluate with the coefficients set to 0"
+        )
+    sizes = calibration.image_size, points.image_size
+    if None not in sizes and sizes[0] != sizes[1]:
+        raise InputError(
+            f"{points.source}: the points' image_size {_size(sizes[1])} differs from the camera's "
+            f"{_size(sizes[0])}; evaluate on images of the camera's size"
+        )
+
+
+def _size(size: tuple[int, int] | None) -> str:
+    return "unknown" if size is None else f"{size[0]} x {size[1]}"
+
+
+def _fit_poses(calibration: Calibration, points: Correspondences) -> tuple[dict[str, Pose], list[str]]:
+    """Type 3: poses of views that the calibration does not know, and what to warn of."""
+    from neurocal_cli.methods import calibrate  # the trainers: only when there is something to train
+
+    fit = calibrate(points, type=3, intrinsics=calibration.intrinsics, seed=calibration.seed)
+    poses = {name: view.pose for name, view in fit.views.items()}
+    warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
+    if not fit.converged:
+        warnings.append(f"the poses of the new views did not settle: {fit.stop_reason}")
+    return poses, warnings
+
+
+def _predict(A: Array, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:
+    """Pixels of all the points, each through the pose of its view, and which lie in front."""
+    R = np.stack([pose.R for pose in poses])[points.view_index]
+    t = np.stack([pose.t for pose in poses])[points.view_index]
+    camera = np.einsum("nij,nj->ni", R, points.world) + t
+    depth = camera[:, 2]
+    in_front = depth > 0
+    image = camera[:, :2] / np.where(in_front, depth, np.nan)[:, None]
+    return image @ A[:2, :2].T + A[:2, 2], in_front
+
+
+def _measure(
+    residuals: Array, points: Correspondences, fitted: NDArray[np.bool_], warnings: tuple[str, ...]
+) -> CameraEvaluation:
+    """Averages over the points in front of the camera, of each view and of all."""
+    index, n_views = points.view_index, points.n_views
+    in_front = ~np.isnan(residuals[:, 0])
+    squares = (residuals[in_front] ** 2).sum(axis=1)
+    n_points = np.bincount(index, minlength=n_views)
+    n_seen = np.bincount(index[in_front], minlength=n_views)
+    sums = np.bincount(index[in_front], weights=squares, minlength=n_views)
+    largest = np.full(n_views, -1.0)
+    np.maximum.at(largest, index[in_front], squares)
+    views = {
+        name: ViewEvaluation(
+            n_points=int(n_points[k]),
+            n_behind=int(n_points[k] - n_seen[k]),
+            rmse_px=float(np.sqrt(sums[k] / n_seen[k])) if n_seen[k] else np.nan,
+            max_px=float(np.sqrt(largest[k])) if n_seen[k] else np.nan,
+            fitted=bool(fitted[k]),
+        )
+        for k, name in enumerate(points.view_names)
+    }
+    bias, power = _moments(residuals[in_front])
+    return CameraEvaluation(
+        residuals=residuals,
+        n_points=len(points),
+        n_behind=int(np.count_nonzero(~in_front)),
+        rmse_px=float(np.sqrt(power.sum())),
+        max_px=float(np.sqrt(squares.max())) if len(squares) else np.nan,
+        rms_u=float(np.sqrt(power[0])),
+        rms_v=float(np.sqrt(power[1])),
+        bias_u=float(bias[0]),
+        bias_v=float(bias[1]),
+        views=views,
+        warnings=warnings,
+    )
+
+
+def _moments(residuals: Array) -> tuple[Array, Array]:
+    """Mean and mean square of each axis; nan when there is no residual."""
+    if not len(residuals):
+        return np.full(2, np.nan), np.full(2, np.nan)
+    return residuals.mean(axis=0), (residuals**2).mean(axis=0)

@@ -1,0 +1,203 @@
+"""Results as plain text: what a calibration found, how well a camera fits.
+
+A value is rounded by its standard deviation: the deviation keeps two significant digits and the
+value the same decimals, so that no digit is shown that means nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from neurocal_cli.calibration import Calibration, NetworkRecord, ViewResult
+from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
+from neurocal_cli.evaluation import CameraEvaluation
+
+__all__ = [
+    "align",
+    "calibration_report",
+    "evaluation_json",
+    "evaluation_report",
+    "evaluation_tables",
+    "rounded",
+]
+
+_MOST_VIEWS = 20  # rows of a table that still fit on a screen
+_MOST_DECIMALS = 9  # digits beyond these are noise of the arithmetic, not of the data
+_GIVEN = {
+    1: "nothing given",
+    2: "image centre given",
+    3: "intrinsic parameters given",
+    4: "extrinsic parameters given",
+}
+
+
+def rounded(value: float, std: float) -> tuple[str, str]:
+    """Write a value and its standard deviation, both to the deviation's second digit.
+
+    Examples
+    --------
+    >>> rounded(556.01234, 0.4321)
+    ('556.01', '0.43')
+    >>> rounded(5560.1, 432.1)
+    ('5560', '430')
+    """
+    if not (math.isfinite(value) and math.isfinite(std)) or std <= 0:
+        return f"{value:.7g}", "unknown" if not math.isfinite(std) else "0"
+    decimals = 1 - int(f"{std:.1e}".partition("e")[2])
+    if decimals > _MOST_DECIMALS:
+        return f"{value:.{_MOST_DECIMALS}f}", f"{std:.1e}"
+    places = max(decimals, 0)
+    return f"{round(value, decimals):.{places}f}", f"{round(std, decimals):.{places}f}"
+
+
+def align(rows: Iterable[Sequence[str]]) -> list[str]:
+    """Lines of a table: the first column to the left, the others to the right."""
+    rows = list(rows)
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    return [
+        "  ".join(
+            cell.ljust(width) if k == 0 else cell.rjust(width)
+            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
+
+
+def calibration_report(calibration: Calibration) -> str:
+    """Summary of a calibration: parameters, views, fit and how the training went.
+
+    Warnings are not in it.
+    """
+    blocks = [
+        [_headline(calibration)],
+        align(_parameter_rows(calibration)),
+        _view_lines(calibration.views),
+        _training_lines(calibration),
+    ]
+    return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def evaluation_report(evaluation: CameraEvaluation) -> str:
+    """Summary of an evaluation as aligned text."""
+    return "\n\n".join("\n".join(align(table)) for table in evaluation_tables(evaluation))
+
+
+def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], list[list[str]]]:
+    """Rows, the heading first, of the table of all points and of the table of views."""
+    e = evaluation
+    overall = [
+        ["[px]", "rms", "bias", "max"],
+        ["u", _pixels(e.rms_u), _pixels(e.bias_u, "+"), ""],
+        ["v", _pixels(e.rms_v), _pixels(e.bias_v, "+"), ""],
+        ["both", _pixels(e.rmse_px), "", _pixels(e.max_px)],
+    ]
+    views = [["view", "points", "behind", "rms [px]", "max [px]", "pose"]]
+    for name, view in e.views.items():
+        numbers = [str(view.n_points), str(view.n_behind), _pixels(view.rmse_px), _pixels(view.max_px)]
+        views.append([_name(name), *numbers, "fitted" if view.fitted else "calibrated"])
+    return overall, views
+
+
+def evaluation_json(evaluation: CameraEvaluation) -> dict[str, Any]:
+    """Turn an evaluation into values that JSON can hold; a number that does not exist is None."""
+    names = ("rmse_px", "max_px", "rms_u", "rms_v", "bias_u", "bias_v")
+    return {
+        "n_points": evaluation.n_points,
+        "n_behind": evaluation.n_behind,
+        **{name: _number(getattr(evaluation, name)) for name in names},
+        "views": {name: _number(view.rmse_px) for name, view in evaluation.views.items()},
+        "fitted_views": list(evaluation.fitted_views),
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _pixels(value: float, sign: str = "") -> str:
+    """Four significant digits, without an exponent for all but tiny errors."""
+    if not math.isfinite(value):
+        return "-"
+    if value != 0 and abs(value) < 1e-4:
+        return f"{value:{sign}.1e}"
+    whole = len(str(int(abs(value))))
+    return f"{value:{sign}.{max(0, 5 - whole)}f}"
+
+
+def _name(name: str) -> str:
+    """Show a name on one line, whatever characters a file put in it."""
+    return name if name.isprintable() else ascii(name)[1:-1]
+
+
+def _plural(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def _headline(calibration: Calibration) -> str:
+    size = calibration.image_size
+    parts = [
+        f"{_name(calibration.camera_name)}: type {calibration.type} ({_GIVEN[calibration.type]})",
+        f"{_plural(len(calibration.points), 'point')} in {_plural(len(calibration.views), 'view')}",
+        "image size unknown" if size is None else f"{size[0]} x {size[1]} px",
+    ]
+    return ", ".join(parts)
+
+
+def _parameter_rows(calibration: Calibration) -> list[list[str]]:
+    """Intrinsic parameters, and the pose as well when there is only one view."""
+    rows = [["parameter", "value", "std", "relative"]]
+    for name in INTRINSIC_NAMES:
+        unit = "rad" if name == "theta" else "px"
+        value = float(getattr(calibration.intrinsics, name))
+        rows.append(_parameter_row(name, unit, value, calibration.std[name], name in calibration.fixed))
+    if len(calibration.views) == 1:
+        (view,) = calibration.views.values()
+        values = [*view.pose.euler, *view.pose.t]
+        for name, value in zip(POSE_NAMES, values, strict=True):
+            unit = "rad" if name.startswith("R") else calibration.unit
+            rows.append(_parameter_row(name, _name(unit), float(value), view.std[name], view.fixed))
+    return rows
+
+
+def _parameter_row(name: str, unit: str, value: float, std: float, given: bool) -> list[str]:
+    label = f"{name} [{unit}]"
+    if given:
+        return [label, f"{value:.7g}", "given", ""]
+    relative = f"{100 * std / abs(value):.2g} %" if value != 0 and math.isfinite(std) else "-"
+    return [label, *rounded(value, std), relative]
+
+
+def _view_lines(views: Any) -> list[str]:
+    """Each view's error, in the order of the data, or the worst ones when there are many."""
+    if len(views) == 1:
+        return []
+    shown: list[tuple[str, ViewResult]] = list(views.items())
+    if len(shown) > _MOST_VIEWS:
+        shown = sorted(shown, key=lambda item: -item[1].rmse_px)[:_MOST_VIEWS]
+    rows = [["view", "points", "rms [px]"]]
+    rows += [[_name(name), str(view.n_points), _pixels(view.rmse_px)] for name, view in shown]
+    lines = align(rows)
+    if len(views) > _MOST_VIEWS:
+        lines.append(
+            f"the worst {_MOST_VIEWS} of {len(views)} views; {len(views) - _MOST_VIEWS} more are better"
+        )
+    return lines
+
+
+def _training_lines(calibration: Calibration) -> list[str]:
+    fit = f"error: rms {_pixels(calibration.rmse_px)} px, maximum {_pixels(calibration.max_px)} px"
+    if calibration.n_rejected:
+        fit += f", {_plural(calibration.n_rejected, 'point')} rejected"
+    training = [] if calibration.network is None else _network_lines(calibration.network)
+    return [fit, *training, calibration.stop_reason]
+
+
+def _network_lines(network: NetworkRecord) -> list[str]:
+    return [
+        f"network: {network.agreed} of {_plural(network.starts, 'random start')} agreed, "
+        f"{_plural(network.iterations, 'iteration')}, loss {_pixels(network.loss)} px",
+        f"pixel error: {_pixels(network.rmse_before)} px after training, {_pixels(network.rmse_after)} px "
+        f"after {_plural(network.refine_iterations, 'more step')}",
+    ]
