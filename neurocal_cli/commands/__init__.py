@@ -20,10 +20,12 @@ from neurocal_cli.errors import NeurocalError
 
 __all__ = ["neurocal"]
 
-_HOMES = {
-    "calibrate": "calibrate",
-    "evaluate": "evaluate",
-    "man": "man",
+# Each command is the function of this name in the module of this name; None: hidden. The summaries
+# stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
+_SUMMARIES = {
+    "calibrate": "Calibrate a camera from known points and the pixels where they were seen.",
+    "evaluate": "Measure how good a result is.",
+    "man": None,
 }
 
 
@@ -32,24 +34,29 @@ class _LazyGroup(click.Group):
 
     Parameters
     ----------
-    homes : dict
-        Module of each command, relative to this package; it holds the command under its name.
+    summaries : dict
+        What ``--help`` says of each command; None for a hidden one.
     """
 
-    def __init__(self, *args: Any, homes: Mapping[str, str], **kwargs: Any) -> None:
+    def __init__(self, *args: Any, summaries: Mapping[str, str | None], **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self._homes = homes
+        self._summaries = summaries
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return list(self._homes)
+        return list(self._summaries)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        if cmd_name in self._homes:
+        if cmd_name in self._summaries:
             self._load(cmd_name)
         else:
-            for name in self._homes:  # so that click can suggest the nearest name
+            for name in self._summaries:  # so that click can suggest the nearest name
                 self._load(name)
         return self.commands.get(cmd_name)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """Write the table of commands without loading them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, text in self._summaries.items() if text])
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -69,7 +76,7 @@ class _LazyGroup(click.Group):
 
     def _load(self, name: str) -> None:
         if name not in self.commands:
-            self.add_command(getattr(import_module(f"{__name__}.{self._homes[name]}"), name), name)
+            self.add_command(getattr(import_module(f"{__name__}.{name}"), name), name)
 
 
 def _explain(error: Exception) -> str:
@@ -89,7 +96,7 @@ def _explain(error: Exception) -> str:
 
 @click.command(
     cls=_LazyGroup,
-    homes=_HOMES,
+    summaries=_SUMMARIES,
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
 @click.version_option(__version__, message="%(prog)s %(version)s", help="Show the version and exit.")

@@ -1,0 +1,153 @@
+"""Help, man pages and what the command line costs to start."""
+
+from __future__ import annotations
+
+import inspect
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+from click.testing import CliRunner
+
+import neurocal_cli
+from neurocal_cli.commands import neurocal
+from neurocal_cli.commands.man import man_pages
+
+MAN = Path(neurocal_cli.__file__).parents[1] / "man"
+
+
+def commands() -> Iterator[tuple[list[str], click.Command]]:
+    """Every command that a user sees, with the words that call it."""
+
+    def walk(words: list[str], command: click.Command) -> Iterator[tuple[list[str], click.Command]]:
+        yield words, command
+        if isinstance(command, click.Group):
+            context = click.Context(command)
+            for name in command.list_commands(context):
+                child = command.get_command(context, name)
+                if child is not None and not child.hidden:
+                    yield from walk([*words, name], child)
+
+    return walk([], neurocal)
+
+
+COMMANDS = [pytest.param(words, command, id=" ".join(["neurocal", *words])) for words, command in commands()]
+
+
+@pytest.mark.parametrize(("words", "command"), COMMANDS)
+def test_help_ends_with_an_example(words: list[str], command: click.Command) -> None:
+    result = CliRunner().invoke(neurocal, [*words, "--help"])
+    assert result.exit_code == 0
+    assert result.stderr == ""
+    assert command.help is not None
+    last = inspect.cleandoc(command.help).split("\n\n")[-1]
+    assert last.startswith("\b\nExamples:\n  neurocal ")
+    assert "\b" not in result.stdout
+
+
+@pytest.mark.parametrize(("words", "command"), COMMANDS)
+def test_each_option_has_one_sentence_of_help(words: list[str], command: click.Command) -> None:
+    for option in command.params:
+        if isinstance(option, click.Option):
+            assert option.help, option.name
+            assert option.help.endswith("."), option.name
+            assert option.is_flag or option.show_default or option.default is not None, option.name
+
+
+def test_summaries_of_the_group_are_those_of_the_commands() -> None:
+    shown = " ".join(CliRunner().invoke(neurocal, ["--help"]).stdout.split())
+    for words, command in commands():
+        if len(words) == 1:
+            summary = (command.help or "").partition("\n")[0]
+            assert f"{words[0]} {summary}" in shown
+
+
+def test_the_version_is_shown_on_stdout() -> None:
+    result = CliRunner().invoke(neurocal, ["--version"], prog_name="neurocal")
+    assert result.stdout == f"neurocal {neurocal_cli.__version__}\n"
+
+
+def test_a_mistyped_command_is_a_usage_error_with_a_suggestion() -> None:
+    result = CliRunner().invoke(neurocal, ["calibrat"])
+    assert result.exit_code == 2
+    assert "calibrat" in result.stderr
+    assert result.stdout == ""
+
+
+def loaded_modules(*words: str) -> set[str]:
+    code = (
+        "import sys; from neurocal_cli.commands import neurocal; "
+        "neurocal(sys.argv[1:], standalone_mode=False); print(*sys.modules, file=sys.stderr)"
+    )
+    run = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    return set(run.stderr.split())
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["--version"], ["calibrate", "--help"], ["evaluate", "camera", "-h"]]
+)
+def test_help_needs_no_library(words: list[str]) -> None:
+    assert loaded_modules(*words).isdisjoint({"numpy", "yaml", "rich", "matplotlib", "scipy", "cv2", "numba"})
+
+
+def test_the_help_of_the_group_loads_no_command() -> None:
+    own = {name for name in loaded_modules("--help") if name.startswith("neurocal_cli.commands.")}
+    assert own == {"neurocal_cli.commands.streams"}
+
+
+def test_the_package_runs_as_a_module() -> None:
+    run = subprocess.run(
+        [sys.executable, "-m", "neurocal_cli", "--version"], capture_output=True, text=True, check=True
+    )
+    assert run.stdout == f"neurocal {neurocal_cli.__version__}\n"
+
+
+def test_the_committed_man_pages_are_those_of_the_help() -> None:
+    pages = man_pages(neurocal)
+    committed = {path.name: path.read_text("utf-8") for path in MAN.glob("*.1")}
+    assert committed == pages, "run `neurocal man man` and commit the result"
+
+
+def test_there_is_a_man_page_for_each_command() -> None:
+    assert set(man_pages(neurocal)) == {f"{'-'.join(['neurocal', *words])}.1" for words, _ in commands()}
+
+
+def test_the_man_command_writes_the_pages(tmp_path: Path) -> None:
+    result = CliRunner().invoke(neurocal, ["man", str(tmp_path / "pages")])
+    assert result.exit_code == 0, result.stderr
+    assert {path.name for path in (tmp_path / "pages").iterdir()} == set(man_pages(neurocal))
+
+
+@pytest.mark.skipif(shutil.which("groff") is None, reason="groff is not installed")
+@pytest.mark.parametrize("name", man_pages(neurocal))
+def test_groff_has_nothing_to_complain_of(name: str) -> None:
+    page = man_pages(neurocal)[name]
+    run = subprocess.run(
+        ["groff", "-man", "-ww", "-Tutf8", "-P-cbou"],
+        input=page,
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+    )
+    assert (run.returncode, run.stderr) == (0, "")
+    assert "SYNOPSIS" in run.stdout
+
+
+def test_defaults_of_the_options_are_those_of_the_library() -> None:
+    from neurocal_cli.methods import calibrate
+
+    library = inspect.signature(calibrate).parameters
+    command = neurocal.get_command(click.Context(neurocal), "calibrate")
+    assert command is not None
+    options = {option.name: option for option in command.params}
+    for name in ("type", "method", "trainer", "distortion", "outliers", "seed", "starts"):
+        assert str(options[name].default) == str(library[name].default), name
+    assert options["no_skew"].default is not library["skew"].default
+    for name, keyword in {"epochs": "epochs", "rate": "rate_weights", "rate_gamma": "rate_gamma"}.items():
+        option = options[name]
+        assert isinstance(option, click.Option)
+        assert option.show_default == f"{library[keyword].default:g}", name

@@ -1,0 +1,81 @@
+"""Who may import what: the library knows no command line, and one package opens files."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import neurocal_cli
+
+ROOT = Path(neurocal_cli.__file__).parent
+MODULES = {str(path.relative_to(ROOT)): ast.parse(path.read_text("utf-8")) for path in ROOT.rglob("*.py")}
+LIBRARY = [name for name in MODULES if not name.startswith("commands/") and name != "__main__.py"]
+
+# Which modules may import a package, by the beginning of their path.
+HOMES = {
+    "click": ("commands/",),
+    "rich": ("commands/",),
+    "matplotlib": ("plots.py",),
+    "yaml": ("io/",),
+    "cv2": (),
+    "scipy": (),
+}
+METHODS = {"read_text", "read_bytes", "write_text", "write_bytes", "open"}
+NUMPY_FILES = {"load", "save", "savez", "savetxt", "loadtxt", "genfromtxt", "fromfile", "tofile"}
+
+
+def imported(tree: ast.Module) -> Iterator[str]:
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield node.module or ""
+
+
+def calls(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Object (``""`` for a plain name) and name of everything that is called."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            yield "", node.func.id
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            yield ast.unparse(node.func.value), node.func.attr
+
+
+@pytest.mark.parametrize("package", HOMES)
+def test_a_package_is_imported_only_where_it_belongs(package: str) -> None:
+    users = [name for name, tree in MODULES.items() if package in {m.split(".")[0] for m in imported(tree)}]
+    assert [name for name in users if not name.startswith(HOMES[package])] == []
+
+
+def test_the_library_does_not_import_the_commands() -> None:
+    users = [
+        name
+        for name in LIBRARY
+        if any(m.startswith("neurocal_cli.commands") for m in imported(MODULES[name]))
+    ]
+    assert users == []
+
+
+def test_only_io_opens_files() -> None:
+    users = {
+        name
+        for name, tree in MODULES.items()
+        for owner, called in calls(tree)
+        if (called in METHODS if owner else called == "open") or (owner == "np" and called in NUMPY_FILES)
+    }
+    assert {name for name in users if not name.startswith("io/")} == set()
+
+
+@pytest.mark.parametrize("name", LIBRARY)
+def test_the_library_neither_prints_nor_exits(name: str) -> None:
+    forbidden = {("", "print"), ("", "input"), ("", "exit"), ("sys", "exit"), ("os", "_exit")}
+    assert forbidden.isdisjoint(calls(MODULES[name]))
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_a_module_says_what_it_is_for(name: str) -> None:
+    assert ast.get_docstring(MODULES[name])
+    assert not {"utils", "helpers", "manager"} & set(Path(name).with_suffix("").parts)
