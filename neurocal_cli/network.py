@@ -1,0 +1,211 @@
+"""The calibrating network of the paper's section 3: two linear layers and a factor for each pattern.
+
+A pattern is a normalised world point ``Z = (X, Y, Z, 1)`` and its normalised pixel
+``d = (u, v, 1)``. The hidden layer has the weights V (3 x 4, the pose), the output layer W (3 x 3,
+the intrinsic matrix); the paper's fourth hidden neuron is the constant 1 whose output weights are
+the zero column of A, so it is left out. For a flat board the input Z is constantly 0 and its column
+of V goes too: V is then 3 x 3. With o = W V Z the network's outputs are O = gamma o, eq. (7).
+
+    E_2D = 1/2 sum_i w_i |d_i - gamma_i o_i|^2                                    eqs. (5), (8)
+
+Every function takes a stack of networks: a leading axis of G networks, each with N patterns of I
+inputs. A network may be one view of a camera, or one random start of it.
+
+Index conventions: the paper swaps V's indices between (6) and (9)-(10) and W's between (10) and
+(15). Here ``V[j, l]`` goes from input l to hidden neuron j and ``W[k, j]`` from there to output k.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = [
+    "Gradients",
+    "Patterns",
+    "denormalise",
+    "e_2d",
+    "e_orth",
+    "e_orth_gradient",
+    "e_orth_jacobian",
+    "e_pixel",
+    "e_pixel_gradient",
+    "gradients",
+    "optimal_gamma",
+    "output",
+    "random_weights",
+    "residual_jacobian",
+]
+
+
+@dataclass(frozen=True, eq=False)
+class Patterns:
+    """What a stack of networks learns from.
+
+    Parameters
+    ----------
+    inputs : (G, N, I) array
+        Normalised world points, last input 1. G may be 1: shared by all networks.
+    targets : (G, N, 3) array
+        Normalised pixels (u, v, 1).
+    weights : (G, N) array
+        Importance w_i of each pattern; 0 for padding.
+    """
+
+    inputs: Array
+    targets: Array
+    weights: Array
+
+    @property
+    def n_inputs(self) -> int:
+        """I: 4 for points in space, 3 for points of a plane."""
+        return self.inputs.shape[2]
+
+    def take(self, networks: NDArray[np.intp]) -> Patterns:
+        """Patterns of some of the networks."""
+        return Patterns(self.inputs[networks], self.targets[networks], self.weights[networks])
+
+    def rms(self, loss: Array) -> Array:
+        """Root mean square error of each network whose E_2D is `loss`; (G,)."""
+        return np.sqrt(2 * loss / np.maximum(self.weights.sum(axis=1), 1e-300))
+
+
+def random_weights(
+    rng: np.random.Generator, networks: int, n_inputs: int
+) -> tuple[Array, Array]:
+    """Initial weights, uniform in [-1, 1] as the paper has them; W (G, 3, 3) and V (G, 3, I)."""
+    return rng.uniform(-1, 1, (networks, 3, 3)), rng.uniform(-1, 1, (networks, 3, n_inputs))
+
+
+def output(W: Array, V: Array, inputs: Array) -> Array:
+    """o = W V Z before the factor gamma, eqs. (6) and (7); (G, N, 3)."""
+    return inputs @ np.swapaxes(W @ V, -1, -2)
+
+
+def optimal_gamma(o: Array, targets: Array) -> Array:
+    """The factor that minimises |d - gamma o|^2, where (11) comes to rest; (G, N)."""
+    return np.asarray((targets * o).sum(-1) / (o * o).sum(-1))
+
+
+def e_2d(W: Array, V: Array, gamma: Array, patterns: Patterns) -> Array:
+    """E_2D, eq. (8) summed over the patterns; (G,)."""
+    error = patterns.targets - gamma[..., None] * output(W, V, patterns.inputs)
+    return np.asarray(0.5 * (patterns.weights * (error**2).sum(-1)).sum(-1))
+
+
+@dataclass(frozen=True, eq=False)
+class Gradients:
+    """Derivatives of E_2D by W (G, 3, 3), V (G, 3, I) and gamma (G, N)."""
+
+    W: Array
+    V: Array
+    gamma: Array
+
+
+def gradients(W: Array, V: Array, gamma: Array, patterns: Patterns) -> Gradients:
+    """Exact gradient of E_2D; the rules (9)-(11) are its negative, a pattern at a time."""
+    Z, w = patterns.inputs, patterns.weights
+    Y = Z @ np.swapaxes(V, -1, -2)  # hidden outputs, eq. (6)
+    o = Y @ np.swapaxes(W, -1, -2)
+    error = w[..., None] * (patterns.targets - gamma[..., None] * o)
+    scaled = gamma[..., None] * error
+    return Gradients(
+        W=-np.swapaxes(scaled, -1, -2) @ Y,  # eq. (9)
+        V=-np.swapaxes(scaled @ W, -1, -2) @ Z,  # eq. (10)
+        gamma=-(error * o).sum(-1),  # eq. (11)
+    )
+
+
+def residual_jacobian(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Array]:
+    """Residuals d - gamma o with gamma eliminated, and their derivative by the product W V.
+
+    The residual is what the target has perpendicular to the ray o. The derivative of gamma itself
+    points along the ray and is dropped (Kaufman's variable projection): gradient exact, Hessian
+    that of Gauss and Newton.
+
+    Returns
+    -------
+    residuals : (G, N, 3) array
+    jacobian : (G, N, 3, 3, I) array
+        By the entries of the (3, I) product.
+    """
+    Z = patterns.inputs
+    o = output(W, V, Z)
+    gamma = optimal_gamma(o, patterns.targets)
+    ray = o / np.linalg.norm(o, axis=-1, keepdims=True)
+    across = np.eye(3) - ray[..., :, None] * ray[..., None, :]
+    root = np.sqrt(patterns.weights)
+    residuals = root[..., None] * (patterns.targets - gamma[..., None] * o)
+    jacobian = -(root * gamma)[..., None, None, None] * across[..., None] * Z[..., None, None, :]
+    return residuals, jacobian
+
+
+def e_orth(V: Array, a: float = 1.0) -> Array:
+    """E_orth of eq. (14): how far the rows of V's rotation part are from orthonormal times sqrt(a); (G,)."""
+    M = V[..., :, :3]
+    gram = M @ np.swapaxes(M, -1, -2) - a * np.eye(3)
+    upper = np.triu(np.ones((3, 3)))
+    return np.asarray((upper * gram**2).sum((-2, -1)))
+
+
+def e_orth_gradient(V: Array, a: float = 1.0) -> Array:
+    """Exact gradient of E_orth by V, zero in the translation's column; (G, 3, I).
+
+    Erratum of eq. (15): as printed, delta v_1j = (V_2j + V_3j) {(v_1.v_2) + (v_1.v_3)} adds the two
+    products before multiplying. The derivative pairs each row with its own product,
+    2 {(v_1.v_2) V_2j + (v_1.v_3) V_3j}, and likewise for rows 2 and 3.
+    """
+    M = V[..., :, :3]
+    gram = M @ np.swapaxes(M, -1, -2) - a * np.eye(3)
+    # 4 (|v_l|^2 - a) v_l from the diagonal, 2 (v_l . v_m) v_m from the rest.
+    factor = 2.0 * (np.ones((3, 3)) + np.eye(3))
+    gradient = np.zeros_like(V)
+    gradient[..., :, :3] = (factor * gram) @ M
+    return gradient
+
+
+def e_orth_jacobian(V: Array, a: float = 1.0) -> tuple[Array, Array]:
+    """The six terms whose squares make up E_orth, eq. (13), and their derivative by V.
+
+    Returns
+    -------
+    residuals : (G, 6) array
+        v_1.v_1 - a, v_1.v_2, v_1.v_3, v_2.v_2 - a, v_2.v_3, v_3.v_3 - a.
+    jacobian : (G, 6, 3, I) array
+    """
+    M = V[..., :, :3]
+    rows, columns = np.triu_indices(3)
+    residuals = (M @ np.swapaxes(M, -1, -2) - a * np.eye(3))[..., rows, columns]
+    jacobian = np.zeros((*V.shape[:-2], 6, *V.shape[-2:]))
+    for term, (i, j) in enumerate(zip(rows, columns, strict=True)):
+        jacobian[..., term, i, :3] += M[..., j, :]
+        jacobian[..., term, j, :3] += M[..., i, :]
+    return residuals, jacobian
+
+
+def e_pixel(W: Array, V: Array, patterns: Patterns) -> Array:
+    """The literal pixel error, eq. (4), in normalised pixels; (G,)."""
+    o = output(W, V, patterns.inputs)
+    error = o[..., :2] / o[..., 2:] - patterns.targets[..., :2]
+    return np.asarray((patterns.weights * (error**2).sum(-1)).sum(-1))
+
+
+def e_pixel_gradient(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Array]:
+    """Exact gradient of eq. (4) by W (G, 3, 3) and V (G, 3, I)."""
+    Z = patterns.inputs
+    Y = Z @ np.swapaxes(V, -1, -2)
+    o = Y @ np.swapaxes(W, -1, -2)
+    image = o[..., :2] / o[..., 2:]
+    error = 2 * patterns.weights[..., None] * (image - patterns.targets[..., :2])
+    by_o = np.concatenate([error, -(error * image).sum(-1, keepdims=True)], axis=-1) / o[..., 2:]
+    by_o_t = np.swapaxes(by_o, -1, -2)
+    return by_o_t @ Y, np.swapaxes(W, -1, -2) @ (by_o_t @ Z)
+
+
+def denormalise(W: Array, V: Array, S1: Array, S2: Array) -> Array:
+    """P = S1 W V S2, eq. (12), for V of four inputs; (G, 3, 4)."""
+    return S1 @ W @ V @ S2

@@ -1,0 +1,196 @@
+"""From free products W V to a camera: the orthogonality conditions (13) split them.
+
+Every view's network has learnt a product B_k = W V_k up to scale. That W is shared and V_k's
+rotation part orthonormal are conditions on W^-1 B_k: its columns are perpendicular and of equal
+length. A view of a solid target gives five conditions, of a flat board two (Zhang 2000). W's five
+entries learn them from random values, again by Levenberg-Marquardt.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array, nearest_rotation
+
+__all__ = ["SharedIntrinsics", "pose_from_product", "shared_intrinsics"]
+
+_MAX_ITERATIONS = 50
+_TOLERANCE = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class SharedIntrinsics:
+    """Candidates for W's entries, best first.
+
+    Attributes
+    ----------
+    entries : (C, 5) array
+        W11, W12, W22, W13, W23 of each distinct minimum.
+    loss : (C,) array
+        Half the sum of squared conditions.
+    starts : int
+        Random starts used.
+    agreed : int
+        How many of them ended at the best minimum.
+    """
+
+    entries: Array
+    loss: Array
+    starts: int
+    agreed: int
+
+
+def shared_intrinsics(
+    solid: Array,
+    flat: Array,
+    given: Array,
+    free: NDArray[np.bool_],
+    rng: np.random.Generator,
+    starts: int = 16,
+) -> SharedIntrinsics:
+    """Learn W from the products of all views.
+
+    Parameters
+    ----------
+    solid : (K, 3, 3) array
+        First three columns of the products of solid targets.
+    flat : (L, 3, 2) array
+        First two columns of the products of flat boards.
+    given : (5,) array
+        Values of the entries that are not free.
+    free : (5,) bool array
+        Of W11, W12, W22, W13, W23. W11 and W22 stay positive.
+    rng : numpy.random.Generator
+    starts : int
+        Random starts, trained side by side.
+    """
+    conditions = _Conditions(solid, flat, free)
+    p = np.where(free, rng.uniform(-1, 1, (starts, 5)), _to_log(given))
+    p[:, [0, 2]] = np.where(free[[0, 2]], np.log(np.abs(p[:, [0, 2]]) + 1e-3), p[:, [0, 2]])
+    p, loss = _descend(conditions, p)
+    order = np.argsort(loss, kind="stable")
+    p, loss = p[order], loss[order]
+    entries = p.copy()
+    entries[:, [0, 2]] = np.exp(p[:, [0, 2]])
+    tie = 1e-6 * loss[0] + 1e-16
+    agreed = int((np.abs(loss - loss[0]) <= tie).sum())
+    distinct = [0]
+    for n in range(1, starts):
+        gap = np.abs(p[n] - p[distinct]).max(axis=1).min()
+        if np.isfinite(loss[n]) and gap > 1e-3:
+            distinct.append(n)
+    return SharedIntrinsics(entries[distinct], loss[distinct], starts, agreed)
+
+
+def _to_log(entries: Array) -> Array:
+    """W11 and W22 are learnt by their logarithms, which keeps them positive."""
+    p = entries.astype(float).copy()
+    p[[0, 2]] = np.log(np.maximum(p[[0, 2]], 1e-300))
+    return p
+
+
+class _Conditions:
+    """Residuals of the orthogonality conditions and their derivatives by W's free entries."""
+
+    def __init__(self, solid: Array, flat: Array, free: NDArray[np.bool_]) -> None:
+        self.free = np.flatnonzero(free)
+        columns, pairs = [], []
+        for group, which in ((solid, ((0, 1), (0, 2), (1, 2))), (flat, ((0, 1),))):
+            if len(group):
+                unit = group / np.linalg.norm(group, axis=(1, 2))[:, None, None]
+                columns.append(np.swapaxes(unit, 1, 2))
+                pairs.append(which)
+        self.columns, self.pairs = columns, pairs
+
+    def __call__(self, p: Array) -> tuple[Array, Array]:
+        """Residuals (B, m) and derivatives (B, m, f) of B parameter sets (B, 5)."""
+        residuals, derivatives = [], []
+        for columns, pairs in zip(self.columns, self.pairs, strict=True):
+            y, dy = _through_inverse(p, columns)
+            norm = (y * y).sum(-1)  # (B, K, c)
+            slope = (y[..., None, :] @ np.swapaxes(dy, -1, -2))[..., 0, :] / norm[..., None]
+            for i, j in pairs:
+                length = np.sqrt(norm[:, :, i] * norm[:, :, j])
+                cosine = (y[:, :, i] * y[:, :, j]).sum(-1) / length
+                by = (dy[:, :, i] @ y[:, :, j, :, None])[..., 0] + (dy[:, :, j] @ y[:, :, i, :, None])[..., 0]
+                residuals += [cosine, 0.5 * np.log(norm[:, :, i] / norm[:, :, j])]
+                derivatives += [
+                    by / length[..., None] - cosine[..., None] * (slope[:, :, i] + slope[:, :, j]),
+                    slope[:, :, i] - slope[:, :, j],
+                ]
+        return np.concatenate(residuals, axis=1), np.concatenate(derivatives, axis=1)[..., self.free]
+
+
+def _through_inverse(p: Array, h: Array) -> tuple[Array, Array]:
+    """y = W^-1 h and its derivatives; p (B, 5), h (K, c, 3) -> (B, K, c, 3) and (B, K, c, 5, 3)."""
+    la, s, lb, u, v = (p[:, n, None, None] for n in range(5))
+    a, b = np.exp(la), np.exp(lb)
+    y = np.empty((len(p), *h.shape))
+    y[..., 2] = h[..., 2]
+    y[..., 1] = (h[..., 1] - v * y[..., 2]) / b
+    y[..., 0] = (h[..., 0] - s * y[..., 1] - u * y[..., 2]) / a
+    dy = np.zeros((*y.shape[:-1], 5, 3))
+    dy[..., 0, 0] = -y[..., 0]  # by log W11
+    dy[..., 1, 0] = -y[..., 1] / a
+    dy[..., 2, 1] = -y[..., 1]  # by log W22
+    dy[..., 2, 0] = s * y[..., 1] / a
+    dy[..., 3, 0] = -y[..., 2] / a
+    dy[..., 4, 1] = -y[..., 2] / b
+    dy[..., 4, 0] = s * y[..., 2] / (a * b)
+    return y, dy
+
+
+def _descend(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
+    """Levenberg-Marquardt on B parameter sets at once; parameters (B, 5) and loss (B,)."""
+    f = conditions.free
+    damping, growth = np.full(len(p), 1e-2), np.full(len(p), 2.0)
+    done = np.zeros(len(p), dtype=bool)
+    with np.errstate(all="ignore"):
+        r, J = conditions(p)
+        loss = 0.5 * (r * r).sum(axis=1)
+        for _ in range(_MAX_ITERATIONS):
+            H = np.swapaxes(J, 1, 2) @ J
+            g = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
+            scale = np.trace(H, axis1=1, axis2=2) / len(f) + 1e-12
+            step = -np.linalg.solve(H + (damping * scale)[:, None, None] * np.eye(len(f)), g[..., None])[..., 0]
+            trial = p.copy()
+            trial[:, f] += np.clip(step, -2.0, 2.0)  # two in the logarithm is a factor of 7
+            r_new, J_new = conditions(trial)
+            new = 0.5 * (r_new * r_new).sum(axis=1)
+            better = (new < loss) & ~done
+            done |= (better & (loss - new <= _TOLERANCE * loss)) | (loss < 1e-28) | (damping > 1e8)
+            for old, fresh in ((p, trial), (r, r_new), (J, J_new), (loss, new)):
+                old[better] = fresh[better]
+            damping = np.where(better, np.maximum(damping * 0.1, 1e-12), damping * growth)
+            growth = np.where(better, 2.0, growth * 2)
+            if done.all():
+                break
+    return p, np.where(np.isfinite(loss), loss, np.inf)
+
+
+def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
+    """Poses whose D = [R | t] is nearest to W^-1 times the products.
+
+    Parameters
+    ----------
+    W : (3, 3) array
+    product : (K, 3, I) array
+        Of solid targets (I = 4) or flat boards (I = 3; the third column of R is not observed and
+        is r1 x r2), up to scale and sign.
+
+    Returns
+    -------
+    R : (K, 3, 3) array
+    t : (K, 3) array
+        With t_z > 0: the normalised origin is the points' centroid, which is in front.
+    """
+    D = np.linalg.solve(W, product)
+    D = D * np.where(D[:, 2, -1] < 0, -1.0, 1.0)[:, None, None]
+    M = D[:, :, :-1]
+    scale = np.sqrt((M**2).sum((1, 2)) / M.shape[2])
+    if M.shape[2] == 2:
+        M = np.concatenate([M, np.cross(M[:, :, 0], M[:, :, 1])[:, :, None] / scale[:, None, None]], axis=2)
+    return nearest_rotation(M), D[:, :, -1] / scale[:, None]

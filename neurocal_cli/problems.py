@@ -1,0 +1,140 @@
+"""The four calibration problems of the paper's section 4.1: which weights are given.
+
+Type 1: none. Type 2: the image centre, W13 and W23. Type 3: the intrinsics, all of W.
+Type 4: the extrinsics, V.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera import INTRINSIC_NAMES, Intrinsics, Pose
+from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+from neurocal_cli.refine import ENTRIES
+from neurocal_cli.views import Views
+
+__all__ = ["Known", "known_for"]
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is given.
+
+    Attributes
+    ----------
+    type : int
+    entries : (5,) array
+        A11, A12, A22, A13, A23 [px]; only the given ones mean something.
+    free : (5,) bool array
+        Entries to estimate.
+    poses : dict of Pose by view, or None
+    fixed : frozenset of str
+        Names of the given intrinsic parameters.
+    intrinsics : Intrinsics or None
+        All of them, for type 3: returned as they are.
+    """
+
+    type: int
+    entries: Array
+    free: NDArray[np.bool_]
+    poses: Mapping[str, Pose] | None
+    fixed: frozenset[str]
+    intrinsics: Intrinsics | None
+
+    @property
+    def free_poses(self) -> bool:
+        """Whether the poses are estimated."""
+        return self.poses is None
+
+    def normalised_entries(self, views: Views) -> Array:
+        """The given entries in normalised pixels, ``S1^-1 A``; (5,)."""
+        scaled = self.entries.copy()
+        scaled[3:] -= views.pixel_centre
+        return scaled / views.pixel_scale
+
+    def matrix(self, entries: Array, views: Views) -> Array:
+        """A [px] from normalised entries; given entries come back exactly as given."""
+        pixels = entries * views.pixel_scale
+        pixels[3:] += views.pixel_centre
+        A = np.eye(3)
+        A[ENTRIES] = np.where(self.free, pixels, self.entries)
+        return A
+
+
+def known_for(
+    points: Correspondences,
+    type: int,
+    image_center: tuple[float, float] | None,
+    intrinsics: Intrinsics | None,
+    extrinsics: Mapping[str, Pose] | None,
+    skew: bool,
+) -> Known:
+    """Check what is given against what the problem type needs.
+
+    Raises
+    ------
+    UsageError
+        A type that does not exist, something missing for the type, or given but of no use to it.
+    InputError
+        Values that are not finite, extrinsics without one of the views.
+    """
+    if type not in (1, 2, 3, 4):
+        raise UsageError(f"type must be 1, 2, 3 or 4, not {type!r}")
+    for name, value, wanted in (
+        ("image_center", image_center, 2),
+        ("intrinsics", intrinsics, 3),
+        ("extrinsics", extrinsics, 4),
+    ):
+        if value is not None and type != wanted:
+            raise UsageError(f"{name} belongs to type {wanted}, not to type {type}; give type={wanted}")
+    entries, free = np.zeros(5), np.ones(5, dtype=bool)
+    fixed: set[str] = set()
+    poses: dict[str, Pose] | None = None
+    if not skew:
+        free[1] = False
+        fixed.add("theta")
+    if type == 2:
+        entries[3:] = _centre(points, image_center)
+        free[3:] = False
+        fixed |= {"u0", "v0"}
+    elif type == 3:
+        if intrinsics is None:
+            raise UsageError("type 3 needs the intrinsics of the camera")
+        entries = intrinsics.A[ENTRIES]
+        free[:] = False
+        fixed = set(INTRINSIC_NAMES)
+    elif type == 4:
+        poses = _poses(points, extrinsics)
+    return Known(type, entries, free, poses, frozenset(fixed), intrinsics)
+
+
+def _centre(points: Correspondences, image_center: tuple[float, float] | None) -> Array:
+    centre = image_center if image_center is not None else points.image_center
+    if centre is None and points.image_size is not None:
+        # The first pixel's centre is 0, the last one's is the size less 1.
+        centre = ((points.image_size[0] - 1) / 2, (points.image_size[1] - 1) / 2)
+    if centre is None:
+        raise UsageError("type 2 needs the image centre; give it, or put image_center into the points file")
+    values = np.array(centre, dtype=float)
+    if values.shape != (2,) or not np.isfinite(values).all():
+        raise InputError("the image centre must be two finite numbers")
+    return values
+
+
+def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
+    if extrinsics is None:
+        raise UsageError("type 4 needs the extrinsics of each view")
+    missing = [name for name in points.view_names if name not in extrinsics]
+    if missing:
+        more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
+        raise InputError(
+            f"the extrinsics have no view named {missing[0]!r}{more}; they have "
+            f"{', '.join(repr(name) for name in list(extrinsics)[:5])}"
+        )
+    return {name: extrinsics[name] for name in points.view_names}

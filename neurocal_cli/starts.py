@@ -1,0 +1,185 @@
+"""Random starts, repeated until two of them agree.
+
+A single training from random weights may end in the wrong place. Two that end at the same lowest
+loss, with all points on the same side of the camera, are a cheap certificate that they found it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.network import Patterns, output, random_weights
+from neurocal_cli.training import Task, Trained, Trainer
+
+__all__ = ["Agreement", "FixedWeights", "Learnt", "learn"]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """When two losses are the same.
+
+    Parameters
+    ----------
+    relative : float
+        Difference in rms error, as a share of it.
+    absolute : float
+        The same in normalised pixels: what the trainer cannot resolve.
+    """
+
+    relative: float = 1e-6
+    absolute: float = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class FixedWeights:
+    """Weights that are given; nan in W where they are not.
+
+    Parameters
+    ----------
+    W : (3, 3) array or None
+    V : (1, 3, I) array or None
+    """
+
+    W: Array | None = None
+    V: Array | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Learnt:
+    """The best network of each view.
+
+    Attributes
+    ----------
+    W : (K, 3, 3) array
+    V : (K, 3, I) array
+    rms : (K,) array
+        Network error in normalised pixels.
+    starts, agreed : (K,) int arrays
+        Starts used and how many of them ended at the best.
+    iterations : int
+        Of all the starts together.
+    in_front : (K,) bool array
+        Whether all points lie on one side of the camera.
+    curve : (J,) array
+        Rms error of the best start of the first view along its training.
+    """
+
+    W: Array
+    V: Array
+    rms: Array
+    starts: NDArray[np.int64]
+    agreed: NDArray[np.int64]
+    iterations: int
+    in_front: NDArray[np.bool_]
+    curve: Array
+
+    @property
+    def product(self) -> Array:
+        """W V of each view; (K, 3, I)."""
+        return self.W @ self.V
+
+
+def learn(
+    patterns: Patterns,
+    trainer: Trainer,
+    rng: np.random.Generator,
+    limit: int,
+    fixed: FixedWeights | None = None,
+    agreement: Agreement | None = None,
+) -> Learnt:
+    """Train each network from random weights until two starts agree or `limit` are spent.
+
+    Parameters
+    ----------
+    patterns : Patterns
+        Of K networks.
+    trainer : Trainer
+    rng : numpy.random.Generator
+    limit : int
+        Most starts for each network, at least 2.
+    fixed : FixedWeights, optional
+    agreement : Agreement, optional
+    """
+    search = _Search(patterns, fixed or FixedWeights(), agreement or Agreement())
+    open_views = np.arange(len(patterns.weights))
+    round_size = 2
+    while open_views.size:
+        used = int(search.starts[open_views[0]])
+        count = min(round_size, limit - used)
+        if count <= 0:
+            break
+        search.train(open_views, count, trainer, rng)
+        open_views = open_views[search.agreed[open_views] < 2]
+        round_size = 4
+    return search.result()
+
+
+class _Search:
+    def __init__(self, patterns: Patterns, fixed: FixedWeights, agreement: Agreement) -> None:
+        K = len(patterns.weights)
+        self.patterns, self.fixed, self.agreement = patterns, fixed, agreement
+        self.W = np.zeros((K, 3, 3))
+        self.V = np.zeros((K, 3, patterns.n_inputs))
+        self.rms = np.full(K, np.inf)
+        self.in_front = np.zeros(K, dtype=bool)
+        self.starts = np.zeros(K, dtype=np.int64)
+        self.agreed = np.zeros(K, dtype=np.int64)
+        self.iterations = 0
+        self.curve = np.zeros(0)
+
+    def train(self, views: NDArray[np.intp], count: int, trainer: Trainer, rng: np.random.Generator) -> None:
+        """`count` more starts for each of these views."""
+        networks = np.repeat(views, count)
+        patterns = self.patterns.take(networks)
+        W, V = random_weights(rng, len(networks), patterns.n_inputs)
+        free_W, free_V = np.ones((3, 3), dtype=bool), np.ones((3, patterns.n_inputs), dtype=bool)
+        if self.fixed.W is not None:
+            free_W = np.isnan(self.fixed.W)
+            W = np.where(free_W, W, self.fixed.W)
+        if self.fixed.V is not None:
+            free_V[:] = False
+            V = np.repeat(self.fixed.V, len(networks), axis=0)
+        trained = trainer(Task(patterns, W, V, free_W, free_V))
+        self.iterations += int(trained.iterations.sum())
+        self.starts[views] += count
+        depth = output(trained.W, trained.V, patterns.inputs)[..., 2]
+        real = patterns.weights > 0
+        in_front = np.where(real, depth > 0, True).all(1) | np.where(real, depth < 0, True).all(1)
+        rms = patterns.rms(trained.loss)
+        for start in range(count):
+            self._keep(views, slice(start, None, count), trained, rms, in_front, start)
+
+    def _keep(
+        self,
+        views: NDArray[np.intp],
+        which: slice,
+        trained: Trained,
+        rms: Array,
+        in_front: NDArray[np.bool_],
+        start: int,
+    ) -> None:
+        """Enter one start of each view into the record; points on both sides of a camera lose."""
+        rms, in_front = rms[which], in_front[which]
+        old, old_front = self.rms[views], self.in_front[views]
+        close = self.agreement.relative * np.minimum(rms, old) + self.agreement.absolute
+        with np.errstate(invalid="ignore"):
+            same = in_front & old_front & (np.abs(rms - old) <= close)
+        wins = ~same & ((in_front & ~old_front) | ((in_front == old_front) & (rms < old)))
+        self.agreed[views] = np.where(same, self.agreed[views] + 1, self.agreed[views])
+        won = views[wins]
+        self.agreed[won] = in_front[wins]
+        self.W[won], self.V[won] = trained.W[which][wins], trained.V[which][wins]
+        self.rms[won], self.in_front[won] = rms[wins], in_front[wins]
+        if won.size and won[0] == 0:
+            self.curve = self.patterns.take(np.zeros(len(trained.curve), dtype=np.intp)).rms(
+                trained.curve[:, start]
+            )
+
+    def result(self) -> Learnt:
+        return Learnt(
+            self.W, self.V, self.rms, self.starts, self.agreed, self.iterations, self.in_front, self.curve
+        )

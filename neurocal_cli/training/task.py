@@ -1,0 +1,79 @@
+"""The one interface between the calibrating network and whatever trains it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.network import Patterns
+
+__all__ = ["Task", "Trained", "Trainer"]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A stack of networks to train on E_2D from given initial weights.
+
+    Parameters
+    ----------
+    patterns : Patterns
+        Of G networks.
+    W : (G, 3, 3) array
+        Initial output weights.
+    V : (G, 3, I) array
+        Initial hidden weights.
+    free_W, free_V : bool arrays (3, 3) and (3, I)
+        Which weights may move; the others keep their initial values.
+    """
+
+    patterns: Patterns
+    W: Array
+    V: Array
+    free_W: NDArray[np.bool_]
+    free_V: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Trained:
+    """Networks after training.
+
+    Attributes
+    ----------
+    W : (G, 3, 3) array
+    V : (G, 3, I) array
+    gamma : (G, N) array
+        Factor of each pattern.
+    loss : (G,) array
+        E_2D.
+    iterations : (G,) int array
+        Steps (epochs for backprop) that each network took.
+    settled : (G,) bool array
+        Whether training stopped by itself, not at its limit.
+    curve : (K, G) array
+        Loss of each network along its training.
+    """
+
+    W: Array
+    V: Array
+    gamma: Array
+    loss: Array
+    iterations: NDArray[np.int64]
+    settled: NDArray[np.bool_]
+    curve: Array
+
+    @property
+    def product(self) -> Array:
+        """W V, all that the network's output depends on; (G, 3, I)."""
+        return self.W @ self.V
+
+
+class Trainer(Protocol):
+    """Anything that trains a stack of networks."""
+
+    def __call__(self, task: Task) -> Trained:
+        """Lower E_2D from the task's initial weights."""
+        ...

@@ -1,0 +1,84 @@
+"""Covariance of the estimated parameters: the inverse normal matrix times the residual variance.
+
+For Gaussian noise this is the Cramer-Rao bound at the estimate. The intrinsics' block comes from
+the Schur complement over the views, each pose's block from its own view plus what the intrinsics'
+uncertainty adds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["Covariance", "covariance"]
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Covariances in normalised units.
+
+    Attributes
+    ----------
+    entries : (f, f) array
+        Of A's free entries.
+    poses : (V, 6, 6) array
+        Of omega and tau of each view; zero where poses are given.
+    smallest : float
+        Smallest eigenvalue of the normal matrices scaled to a unit diagonal, 0 when singular.
+    """
+
+    entries: Array
+    poses: Array
+    smallest: float
+
+
+def covariance(
+    normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: int
+) -> Covariance:
+    """Invert the normal matrix of a refined calibration.
+
+    Parameters
+    ----------
+    normal : (V, 12, 12) array
+        From `refine`.
+    free : (5,) bool array
+    free_pose : bool
+    n_residuals : int
+        Twice the number of points.
+    """
+    f = np.flatnonzero(free)
+    V = len(normal)
+    unknowns = len(f) + (6 * V if free_pose else 0)
+    variance = float(normal[:, 11, 11].sum()) / max(n_residuals - unknowns, 1)
+    U = normal[:, f[:, None], f].sum(axis=0)
+    if not free_pose:
+        inverse, smallest = _inverse(U, U)
+        return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
+    B = normal[:, 5:11, 5:11]
+    B_inverse, smallest = _inverse(B, B)
+    if not f.size:
+        return Covariance(np.zeros((0, 0)), variance * B_inverse, smallest)
+    C = normal[:, f[:, None], range(5, 11)]  # (V, f, 6)
+    gain = C @ B_inverse
+    S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
+    S_inverse, smallest_shared = _inverse(S, U)
+    poses = B_inverse + np.swapaxes(gain, 1, 2) @ S_inverse @ gain
+    return Covariance(variance * S_inverse, variance * poses, min(smallest, smallest_shared))
+
+
+def _inverse(H: Array, reference: Array) -> tuple[Array, float]:
+    """Inverse of symmetric matrices, and their smallest eigenvalue relative to `reference`'s diagonal."""
+    scale = 1.0 / np.sqrt(np.diagonal(reference, axis1=-2, axis2=-1) + 1e-300)
+    outer = scale[..., :, None] * scale[..., None, :]
+    scaled = H * outer
+    if not np.isfinite(scaled).all():
+        return np.full_like(H, np.nan), 0.0
+    values, vectors = np.linalg.eigh(scaled)
+    smallest = float(values.min(initial=1.0))
+    safe = np.maximum(values, 1e-300)
+    inverse = (vectors / safe[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return inverse * outer, max(smallest, 0.0)
