@@ -1,0 +1,219 @@
+"""Points from the tables of one or several files: what fits together becomes one data set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.table import Table
+from neurocal_cli.points import Correspondences
+
+__all__ = ["COVARIANCE", "SETTINGS", "correspondences"]
+
+COVARIANCE = ("suu", "suv", "svv")
+SETTINGS = ("zoom", "focus")
+
+
+def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
+    """Make one set of points out of tables, one of each file.
+
+    Parameters
+    ----------
+    tables : list of Table
+        At least one.
+    notes : list of str
+        Remarks about what was left out are appended.
+
+    Raises
+    ------
+    FormatError, InputError
+        Tables that contradict each other or themselves.
+    """
+    for table in tables:
+        _note_unknown(table, notes)
+    _check_settings(tables, notes)
+    return _single(tables[0]) if len(tables) == 1 else _joined(tables, notes)
+
+
+def _single(table: Table) -> Correspondences:
+    return Correspondences(
+        *_numbers(table),
+        view=table.labels.get("view"),
+        point=_distinct(table),
+        covariance=_covariance(table),
+        image_size=table.metadata.image_size,
+        image_center=table.metadata.image_center,
+        unit=table.metadata.unit or "mm",
+        source=table.source,
+        lines=table.lines,
+    )
+
+
+def _joined(tables: list[Table], notes: list[str]) -> Correspondences:
+    views = [_views_of_file(table) for table in tables]
+    owners = _owners(tables, views)
+    with_point = [table.source for table in tables if "point" in table.labels]
+    points = None
+    if len(with_point) == len(tables):
+        points = np.concatenate([_distinct(table) for table in tables])
+    elif with_point:
+        without = next(table.source for table in tables if table.source not in with_point)
+        notes.append(f"{without}: has no column point, so the point ids of the other files are not used")
+    world, pixels = (np.vstack(blocks) for blocks in zip(*map(_numbers, tables), strict=True))
+    return Correspondences(
+        world,
+        pixels,
+        view=np.concatenate(views),
+        point=points,
+        covariance=_joined_covariance(tables),
+        image_size=_agreed("image_size", tables),
+        image_center=_agreed("image_center", tables),
+        unit=_agreed("unit", tables) or "mm",
+        source=tables[0].source,
+        lines=np.concatenate([table.lines for table in tables]),
+        sources=owners,
+    )
+
+
+def _numbers(table: Table) -> tuple[Array, Array]:
+    return table.stack(("X", "Y", "Z")), table.stack(("u", "v"))
+
+
+def _views_of_file(table: Table) -> NDArray[Any]:
+    if "view" in table.labels:
+        return table.labels["view"]
+    name = "stdin" if table.source == "<stdin>" else Path(table.source).stem
+    return np.full(len(table), name)
+
+
+def _owners(tables: list[Table], views: list[NDArray[Any]]) -> dict[str, str]:
+    """Tell which file each view is in."""
+    owners: dict[str, str] = {}
+    for table, labels in zip(tables, views, strict=True):
+        first_of_run = np.concatenate([[True], labels[1:] != labels[:-1]])
+        mine: dict[str, int] = {}
+        for first in np.flatnonzero(first_of_run).tolist():
+            mine.setdefault(str(labels[first]), first)
+        for name, row in mine.items():
+            if name in owners:
+                raise InputError(
+                    f"{table.source}:{table.lines[row]}: the view {name[:60]!r} is also in {owners[name]}; "
+                    "give each view of the camera a name of its own"
+                )
+            owners[name] = table.source
+    return owners
+
+
+def _agreed(key: str, tables: list[Table]) -> Any:
+    """Take the value of a metadata key, on which all the files that give it must agree."""
+    given = [(getattr(table.metadata, key), table.source) for table in tables]
+    given = [(value, source) for value, source in given if value is not None]
+    for value, source in given:
+        first, first_source = given[0]
+        if value != first:
+            raise FormatError(
+                f"{key} is {_plain(value)} but {_plain(first)} in {first_source}; "
+                "files of one camera must agree",
+                source,
+            )
+    return given[0][0] if given else None
+
+
+def _plain(value: Any) -> str:
+    return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def _note_unknown(table: Table, notes: list[str]) -> None:
+    if table.unknown:
+        names = ", ".join(repr(name[:40]) for name in table.unknown)
+        notes.append(f"{table.source}: column{'s' * (len(table.unknown) > 1)} not used: {names}")
+
+
+def _check_settings(tables: list[Table], notes: list[str]) -> None:
+    """Refuse points at several zoom or focus settings: one camera has one."""
+    for name in SETTINGS:
+        setting: float | None = None
+        for table in tables:
+            column = table.numbers.get(name)
+            if column is None:
+                continue
+            setting = float(column[0]) if setting is None else setting
+            differs = column != setting
+            if differs.any():
+                row = int(np.argmax(differs))
+                raise InputError(
+                    f"{table.source}:{table.lines[row]}: {name} changes from {setting:g} to {column[row]:g}: "
+                    "points at several zoom/focus settings; calibrate one setting at a time"
+                )
+        if setting is not None:
+            notes.append(f"{tables[0].source}: {name} is {setting:g} throughout; the column is not used")
+
+
+def _covariance(table: Table) -> Array | None:
+    """(N, 3) covariance from the columns sigma or suu, suv, svv, if there."""
+    given = [name for name in COVARIANCE if name in table.numbers]
+    if "sigma" in table.numbers:
+        if given:
+            raise FormatError("has both sigma and suu,suv,svv; keep one", table.source)
+        sigma = table.numbers["sigma"]
+        if not (sigma > 0).all():
+            row = int(np.argmin(sigma > 0))
+            raise InputError(
+                f"{table.source}:{table.lines[row]}: sigma is {sigma[row]:g}, but must be positive; "
+                "correct or remove the row"
+            )
+        with np.errstate(over="ignore", under="ignore"):  # Correspondences refuses what comes out
+            return np.column_stack([sigma * sigma, np.zeros_like(sigma), sigma * sigma])
+    if given and len(given) < len(COVARIANCE):
+        raise FormatError(f"has {', '.join(given)} only; give all of suu,suv,svv", table.source)
+    return table.stack(COVARIANCE) if given else None
+
+
+def _joined_covariance(tables: list[Table]) -> Array | None:
+    blocks = [_covariance(table) for table in tables]
+    present = [block for block in blocks if block is not None]
+    if present and len(present) < len(blocks):
+        without = next(table.source for table, block in zip(tables, blocks, strict=True) if block is None)
+        raise FormatError("has no sigma (or suu,suv,svv) as other files do; give it in all or none", without)
+    return np.vstack(present) if present else None
+
+
+def _distinct(table: Table) -> NDArray[Any] | None:
+    """Check that no view has a point id twice and return the ids."""
+    points = table.labels.get("point")
+    if points is None:
+        return None
+    views = table.labels.get("view")
+    labels = [points] if views is None else [points, views]
+    hashes = _hashes(labels)
+    ordered = np.sort(hashes)
+    repeated = ordered[1:][ordered[1:] == ordered[:-1]]
+    if len(repeated) == 0:  # nearly always: comparing a million labels themselves takes seconds
+        return points
+    seen: dict[tuple[str, ...], int] = {}
+    for row in np.flatnonzero(np.isin(hashes, repeated)):
+        key = tuple(str(column[row]) for column in labels)
+        if key in seen:
+            place = "" if views is None else f" in the view {key[1][:60]!r}"
+            raise InputError(
+                f"{table.source}:{table.lines[row]}: the point {key[0][:60]!r} is already on line "
+                f"{seen[key]}{place}; remove one of the rows"
+            )
+        seen[key] = int(table.lines[row])
+    return points
+
+
+def _hashes(columns: list[NDArray[Any]]) -> NDArray[np.uint64]:
+    """Hash each row of labels to 64 bits, FNV-1a over their characters."""
+    hashes = np.full(len(columns[0]), 0xCBF29CE484222325, dtype=np.uint64)
+    for column in columns:
+        characters = np.ascontiguousarray(column).view(np.uint32).reshape(len(column), -1)
+        for k in range(characters.shape[1]):
+            hashes ^= characters[:, k]
+            hashes *= np.uint64(0x100000001B3)
+    return hashes

@@ -1,0 +1,275 @@
+"""How a table is laid out: its metadata, its separator and the names of its columns."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import FormatError
+from neurocal_cli.geometry import Array
+
+__all__ = ["Columns", "Layout", "Metadata", "Schema", "find_layout", "is_number", "split_fields"]
+
+# What a number looks like in our files; Python's float() would also take 1_0 and other alphabets.
+is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
+
+_METADATA = re.compile(r"#\s*(image_size|image_center|unit)\s*:(.*)", re.DOTALL)
+_QUOTED = re.compile(r'"(?:[^"]|"")*"')
+
+
+@dataclass(frozen=True)
+class Schema:
+    """Which columns a kind of table has.
+
+    Attributes
+    ----------
+    kind : str
+        What a row is, in the plural.
+    required, optional : tuple of str
+    labels : frozenset of str
+        The columns that hold text; all others hold numbers.
+    headerless : tuple of str
+        Columns of a file without a header; empty: the header is required.
+    """
+
+    kind: str
+    required: tuple[str, ...]
+    optional: tuple[str, ...] = ()
+    labels: frozenset[str] = frozenset()
+    headerless: tuple[str, ...] = ()
+
+    @property
+    def known(self) -> tuple[str, ...]:
+        """All column names, required ones first."""
+        return self.required + self.optional
+
+
+@dataclass
+class Metadata:
+    """What the ``#`` lines of a file say, gathered line by line.
+
+    Attributes
+    ----------
+    image_size : (width, height), optional [px]
+    image_center : (u0, v0), optional [px]
+    unit : str, optional
+    """
+
+    image_size: tuple[int, int] | None = None
+    image_center: tuple[float, float] | None = None
+    unit: str | None = None
+
+    def take(self, line: str, source: str, number: int) -> None:
+        """Note a ``# key: value`` line; other comments are passed over."""
+        match = _METADATA.fullmatch(line.strip(" \t"))
+        if match is None:
+            return
+        key, text = match[1], match[2].strip(" \t,;")  # spreadsheets pad lines with separators
+        value = _METADATA_READERS[key](text)
+        if value is None:
+            raise FormatError(f"{key} is {text[:40]!r}; {_METADATA_HINTS[key]}", source, number)
+        if getattr(self, key) not in (None, value):
+            raise FormatError(f"{key} is given twice and differs; keep one", source, number)
+        setattr(self, key, value)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """What a reader found below the header; see `table.Table`."""
+
+    numbers: dict[str, Array]
+    labels: dict[str, NDArray[Any]]
+    lines: NDArray[np.int64]
+    metadata: Metadata
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where a table's rows begin and how to split them.
+
+    Attributes
+    ----------
+    separator : str or None
+        None: blanks.
+    names : tuple of str
+        Of the columns, in the file's order.
+    offset : int
+        Of the first byte below the header.
+    line : int
+        Number of the last line above that byte.
+    metadata : Metadata
+        From the lines above.
+    """
+
+    separator: str | None
+    names: tuple[str, ...]
+    offset: int
+    line: int
+    metadata: Metadata = field(default_factory=Metadata)
+
+    def unknown(self, schema: Schema) -> tuple[str, ...]:
+        """Names of columns that the schema doesn't know."""
+        return tuple(name for name in self.names if name not in schema.known)
+
+
+def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
+    r"""Read the metadata and the header at the top of a file.
+
+    Parameters
+    ----------
+    data : bytes
+        UTF-8 with ``\\n`` line ends.
+
+    Raises
+    ------
+    FormatError
+        No content, columns missing or twice, malformed metadata.
+    """
+    metadata = Metadata()
+    comments: list[str] = []
+    for number, start, end, line in _lines(data):
+        if line.startswith("#"):
+            metadata.take(line, source, number)
+            comments.append(line)
+        elif line:
+            separator = _find_separator(line)
+            fields = split_fields(line, separator)
+            if fields is None:
+                raise FormatError('a quote (") is not closed; close it', source, number)
+            if all(is_number(text) for text in fields):
+                names = _headerless_names(fields, comments, source, number, schema)
+                return Layout(separator, names, start, number - 1, metadata)
+            _check_names(fields, source, number, schema)
+            return Layout(separator, tuple(fields), end, number, metadata)
+    raise FormatError(
+        f"is empty: there are no {schema.kind}; give a header {','.join(schema.required)} and rows", source
+    )
+
+
+def split_fields(line: str, separator: str | None) -> list[str] | None:
+    """Split a line at its separators, outside quotes; None where a quote is not closed.
+
+    Blanks around a field are dropped, unless they are inside quotes; ``""`` in quotes is a quote.
+    """
+    line = line.strip(" \t") if separator != "\t" else line.strip(" ")
+    if '"' not in line:
+        return (
+            re.split(r"[ \t]+", line)
+            if separator is None
+            else [s.strip(" \t") for s in line.split(separator)]
+        )
+    return _split_quoted(line, separator)
+
+
+def _split_quoted(line: str, separator: str | None) -> list[str] | None:
+    end = r"[ \t]+" if separator is None else re.escape(separator)
+    plain = r"[^ \t]*" if separator is None else f"[^{re.escape(separator)}]*"
+    token = re.compile(rf'[ \t]*?(?:"((?:[^"]|"")*)"[ \t]*?|({plain}))(?:({end})|$)')
+    fields: list[str] = []
+    position = 0
+    while True:
+        match = token.match(line, position)
+        if match is None or (match[2] or "").startswith('"'):
+            return None
+        fields.append(match[2].strip(" \t") if match[1] is None else match[1].replace('""', '"'))
+        if match[3] is None:
+            return fields
+        position = match.end()
+
+
+def _lines(data: bytes) -> Iterator[tuple[int, int, int, str]]:
+    """Go through the lines: number, first byte, byte after the end and stripped text."""
+    start, number = 0, 1
+    while start < len(data):
+        end = data.find(b"\n", start) + 1 or len(data)
+        yield number, start, end, data[start:end].decode("utf-8").strip(" \t\n")
+        start, number = end, number + 1
+
+
+def _find_separator(line: str) -> str | None:
+    """Find what separates the fields of the first line; None: blanks."""
+    line = _QUOTED.sub("q", line)
+    # In 1,5;2,5;... the commas are decimal ones, so semicolons go first where there are enough.
+    semicolons = line.count(";") >= min(line.count(","), 4)
+    separators = ";\t," if semicolons else ",\t;"
+    for separator in separators:
+        if separator in line and not (separator == "\t" and "" in line.split("\t")):
+            return separator
+    return None
+
+
+def _headerless_names(
+    fields: list[str], comments: list[str], source: str, number: int, schema: Schema
+) -> tuple[str, ...]:
+    expected = schema.headerless
+    if not expected:
+        raise FormatError(f"the header is missing; begin with {','.join(schema.required)}", source, number)
+    if len(fields) != len(expected):
+        raise FormatError(
+            f"there is no header, so {len(expected)} columns {','.join(expected)} are expected, found "
+            f"{len(fields)}; add a header that names the columns",
+            source,
+            number,
+        )
+    for comment in comments:  # numpy.savetxt puts its header into a comment
+        words = re.split(r"[\s,;]+", comment.strip("# \t"))
+        if sorted(words) == sorted(expected) and words != list(expected):
+            raise FormatError(f"the header {','.join(words)} is a comment; remove its #", source, number)
+    return expected
+
+
+def _check_names(names: list[str], source: str, number: int, schema: Schema) -> None:
+    for name in names:
+        if name and names.count(name) > 1:
+            raise FormatError(f"the column {name[:40]} appears twice; rename or remove one", source, number)
+    missing = [name for name in schema.required if name not in names]
+    if not missing:
+        return
+    lower = {name.lower(): name for name in names}
+    similar = [f"{lower[name.lower()]} as {name}" for name in missing if name.lower() in lower]
+    hint = f"write {', '.join(similar)}" if similar else f"name the columns {','.join(schema.required)}"
+    found = ",".join(names)
+    raise FormatError(
+        f"column{'s' * (len(missing) > 1)} {', '.join(missing)} missing from the header "
+        f"{found[:60]!r}; {hint}",
+        source,
+        number,
+    )
+
+
+def _read_size(text: str) -> tuple[int, int] | None:
+    words = re.split(r"[ \t,]+", text)
+    if len(words) != 2 or not all(re.fullmatch("[0-9]{1,9}", word) for word in words):
+        return None
+    width, height = int(words[0]), int(words[1])
+    return (width, height) if width > 0 and height > 0 else None
+
+
+def _read_center(text: str) -> tuple[float, float] | None:
+    words = re.split(r"[ \t,]+", text)
+    if len(words) != 2 or not all(is_number(word) for word in words):
+        return None
+    u0, v0 = float(words[0]), float(words[1])
+    return (u0, v0) if math.isfinite(u0) and math.isfinite(v0) else None
+
+
+def _read_unit(text: str) -> str | None:
+    return text or None
+
+
+_METADATA_READERS: dict[str, Any] = {
+    "image_size": _read_size,
+    "image_center": _read_center,
+    "unit": _read_unit,
+}
+_METADATA_HINTS = {
+    "image_size": "write two whole numbers as in `# image_size: 640 480`",
+    "image_center": "write two numbers as in `# image_center: 320 240`",
+    "unit": "write a name as in `# unit: mm`",
+}
