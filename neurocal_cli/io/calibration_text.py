@@ -1,0 +1,159 @@
+"""A calibration as YAML text: a ROS camera_info file with one more block.
+
+Everything is written as block text with flow collections inside and no long lines are folded, so
+the text can be indented to become a part of another file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from neurocal_cli import __version__
+from neurocal_cli.calibration import Calibration, NetworkRecord
+from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
+from neurocal_cli.geometry import Array, rotation_to_euler
+from neurocal_cli.io.distortion_names import coefficient_names, to_ros
+from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
+from neurocal_cli.points import Correspondences
+
+__all__ = ["FORMAT", "calibration_lines"]
+
+FORMAT = 1  # of the neurocal block; a change that older readers cannot follow makes it 2
+
+
+def calibration_lines(cal: Calibration) -> Iterator[str]:
+    """Lines of the file, without line ends."""
+    yield from _ros_lines(cal)
+    yield "neurocal:"
+    for lines in (_record_lines(cal), _parameter_lines(cal), _view_lines(cal), _network_lines(cal.network)):
+        yield from (f"  {line}" for line in lines)
+    yield from _observation_lines(cal.points)
+
+
+def _ros_lines(cal: Calibration) -> Iterator[str]:
+    width, height = cal.image_size or (0, 0)  # ROS's readers want numbers
+    model, coefficients = to_ros(cal.distortion_model, cal.distortion)
+    yield f"camera_name: {text(cal.camera_name)}"
+    yield f"image_width: {width}"
+    yield f"image_height: {height}"
+    yield f"camera_matrix: {_ros_matrix(cal.K)}"
+    yield f"distortion_model: {model}"
+    yield f"distortion_coefficients: {_ros_matrix(coefficients[None])}"
+    yield f"rectification_matrix: {_ros_matrix(np.eye(3))}"
+    yield f"projection_matrix: {_ros_matrix(np.column_stack([cal.K, np.zeros(3)]))}"
+
+
+def _ros_matrix(matrix: Array) -> str:
+    rows, cols = matrix.shape
+    return mapping(rows=str(rows), cols=str(cols), data=flow(matrix.ravel()))
+
+
+def _record_lines(cal: Calibration) -> Iterator[str]:
+    yield f"format: {FORMAT}"
+    yield f"version: {text(__version__)}"
+    yield f"type: {cal.type}"
+    yield f"method: {text(cal.method)}"
+    yield f"trainer: {text(cal.trainer)}"
+    yield f"seed: {cal.seed}"
+    yield f"converged: {str(bool(cal.converged)).lower()}"
+    yield f"stop_reason: {text(str(cal.stop_reason))}"
+    yield f"unit: {text(cal.unit)}"
+    yield f"distortion: {text(cal.distortion_model)}"
+    if cal.points.image_center is not None:
+        yield f"image_center: {flow(np.array(cal.points.image_center))}"
+
+
+def _parameter_lines(cal: Calibration) -> Iterator[str]:
+    values: dict[str, float] = dict(zip(INTRINSIC_NAMES, cal.intrinsics.values().tolist(), strict=True))
+    # Distortion is no parameter of the paper's, but where its accuracy is known, it stands here too.
+    lens = dict(zip(coefficient_names(cal.distortion_model), cal.distortion.tolist(), strict=False))
+    values.update({name: value for name, value in lens.items() if name in cal.std})
+    yield "parameters:"
+    for name, value in values.items():
+        entry = {"value": number(value)}
+        if name in cal.fixed:
+            entry["std"], entry["fixed"] = "0", "true"
+        elif name in cal.std:
+            entry["std"] = number(cal.std[name])
+        yield f"  {name}: {mapping(**entry)}"
+    names = f"[{', '.join(map(text, cal.covariance_names))}]"
+    yield f"covariance: {mapping(names=names, data=flow(cal.covariance))}"
+    yield "fit: " + mapping(
+        n_points=str(len(cal.points)),
+        n_rejected=str(cal.n_rejected),
+        rmse_px=number(cal.rmse_px),
+        max_px=number(cal.max_px),
+    )
+    yield "warnings:" if cal.warnings else "warnings: []"
+    for warning in cal.warnings:
+        yield f"  - {quoted(warning)}"
+
+
+def _view_lines(cal: Calibration) -> Iterator[str]:
+    views = list(cal.views.values())
+    if not views:
+        yield "views: []"
+        return
+    rotations = np.stack([view.pose.R for view in views])
+    translations = np.stack([view.pose.t for view in views])
+    values = np.hstack([rotation_to_euler(rotations), translations]).tolist()
+    projections = cal.K @ np.concatenate([rotations, translations[:, :, None]], axis=2)
+    yield "views:"
+    for (name, view), pose, P in zip(cal.views.items(), values, projections, strict=True):
+        entries = {key: _estimate(key, value, view.std) for key, value in zip(POSE_NAMES, pose, strict=True)}
+        yield f"  - name: {text(name)}"
+        yield f"    rotation: {mapping(**{key: entries[key] for key in POSE_NAMES[:3]})}"
+        yield f"    translation: {mapping(**{key: entries[key] for key in POSE_NAMES[3:]})}"
+        yield f"    projection_matrix: {flow(P)}"
+        yield f"    rmse_px: {number(view.rmse_px)}"
+        yield f"    n_points: {view.n_points}"
+        yield f"    R: {flow(view.pose.R)}"  # the angles give it back but for the last bit
+        if view.fixed:
+            yield "    fixed: true"
+
+
+def _estimate(name: str, value: float, std: Mapping[str, float]) -> str:
+    if name in std:
+        return mapping(value=number(value), std=number(std[name]))
+    return mapping(value=number(value))
+
+
+def _network_lines(network: NetworkRecord | None) -> Iterator[str]:
+    if network is None:
+        yield "network: null"
+        return
+    yield "network:"
+    for name, weights in (("V", network.V), ("S2", network.S2)):
+        yield f"  {name}:" if weights else f"  {name}: {{}}"
+        for view, matrix in weights.items():
+            yield f"    {text(view)}: {flow(matrix)}"
+    yield f"  W: {flow(network.W)}"
+    yield f"  S1: {flow(network.S1)}"
+    for name in ("starts", "agreed", "iterations", "refine_iterations"):
+        yield f"  {name}: {int(getattr(network, name))}"
+    for name in ("loss", "rmse_before", "rmse_after"):
+        yield f"  {name}: {number(getattr(network, name))}"
+    yield f"  curve: {flow(np.array(network.curve, dtype=float))}"
+
+
+def _observation_lines(points: Correspondences) -> Iterator[str]:
+    columns = ["view", "X", "Y", "Z", "u", "v"]
+    blocks = [points.world, points.pixels]
+    names = [quoted(name) for name in points.view_names]
+    heads = [f"    - [{names[k]}, " for k in points.view_index.tolist()]
+    if points.point is not None:
+        columns.insert(1, "point")
+        heads = [
+            f"{head}{quoted(str(p))}, "
+            for head, p in zip(heads, np.asarray(points.point).tolist(), strict=True)
+        ]
+    if points.covariance is not None:
+        columns += ["suu", "suv", "svv"]
+        blocks.append(points.covariance)
+    yield "  observations:"
+    yield f"    columns: [{', '.join(columns)}]"
+    yield "    rows:"
+    numbers = flow(np.hstack(blocks))[2:-2].split("], [")
+    yield "\n".join([f"{head}{row}]" for head, row in zip(heads, numbers, strict=True)])

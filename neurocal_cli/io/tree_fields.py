@@ -1,0 +1,177 @@
+"""Checked access to what a file's tree holds: each failure names the file, the key and the remedy."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from typing import Any, NoReturn
+
+import numpy as np
+
+from neurocal_cli.errors import FormatError
+from neurocal_cli.geometry import Array
+
+__all__ = ["Field"]
+
+# YAML 1.1 takes 1e-05 for text, as it has no point; other programs write it for a number.
+_NUMBER_TEXT = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?").fullmatch
+
+
+class Field:
+    """A value in a tree, with the way that leads to it.
+
+    Parameters
+    ----------
+    value : object
+        What `yaml_tree.parse_yaml` or a JSON parser returned.
+    source : str
+        The file's name.
+    path : str
+        Keys from the root, with dots between them.
+    """
+
+    __slots__ = ("path", "source", "value")
+
+    def __init__(self, value: Any, source: str, path: str = "") -> None:
+        self.value = value
+        self.source = source
+        self.path = path
+
+    def fail(self, expected: str) -> NoReturn:
+        """Raise the FormatError for a value that is not what was expected."""
+        found = _described(self.value)
+        raise FormatError(
+            f"{self.path or 'the file'} must be {expected}, found {found}; correct it", self.source
+        )
+
+    def __contains__(self, key: str) -> bool:
+        return isinstance(self.value, dict) and self.value.get(key) is not None
+
+    def __getitem__(self, key: str) -> Field:
+        """Take the value under a key that must be there."""
+        if not isinstance(self.value, dict):
+            self.fail("a mapping (key: value)")
+        if key not in self.value:
+            path = self._below(key)
+            raise FormatError(f"the key {path} is missing; add it or write the file again", self.source)
+        return Field(self.value[key], self.source, self._below(key))
+
+    def get(self, key: str) -> Field | None:
+        """Take the value under a key, None where the key or its value is missing."""
+        if not isinstance(self.value, dict):
+            self.fail("a mapping (key: value)")
+        if key not in self:
+            return None
+        return self[key]
+
+    def keys(self) -> list[str]:
+        """List the keys of a mapping, as text."""
+        if not isinstance(self.value, dict):
+            self.fail("a mapping (key: value)")
+        return list(self.value)
+
+    def items(self) -> Iterator[Field]:
+        """Go through the entries of a list."""
+        if not isinstance(self.value, list):
+            self.fail("a list")
+        for k, value in enumerate(self.value):
+            yield Field(value, self.source, f"{self.path}[{k}]")
+
+    def number(self) -> float:
+        """Take a finite number."""
+        number = _as_float(self.value)
+        if not math.isfinite(number):
+            self.fail("a finite number")
+        return number
+
+    def number_or_nan(self) -> float:
+        """Take a finite number; NaN for null, which stands for what is not known."""
+        return math.nan if self.value is None else self.number()
+
+    def integer(self, least: int = 0) -> int:
+        """Take a whole number, not below `least`."""
+        number = self.value
+        if isinstance(number, float) and number.is_integer():
+            number = int(number)
+        if not isinstance(number, int) or isinstance(number, bool) or not least <= number < 2**63:
+            self.fail(f"a whole number, {least} or more")
+        return int(number)
+
+    def boolean(self) -> bool:
+        """Take true or false."""
+        if not isinstance(self.value, bool):
+            self.fail("true or false")
+        return self.value
+
+    def text(self) -> str:
+        """Take text; a whole number counts as the text that it was written as."""
+        if isinstance(self.value, int) and not isinstance(self.value, bool):
+            return str(self.value)
+        if not isinstance(self.value, str):
+            self.fail("text (in quotes, if need be)")
+        return self.value
+
+    def array(self, *shape: int, unknown: bool = False) -> Array:
+        """Take nested lists of finite numbers; -1 in the shape allows any length.
+
+        Parameters
+        ----------
+        *shape : int
+        unknown : bool
+            Whether null may stand in for a number; it becomes NaN.
+        """
+        words = " x ".join("n" if s < 0 else str(s) for s in shape)
+        expected = f"{words} finite numbers{' or null' * unknown}"
+        try:
+            array = np.array(self.value)
+        except (ValueError, OverflowError, RecursionError):  # ragged
+            self.fail(expected)
+        if array.dtype.kind not in "iuf":  # text that looks like numbers, null or what is no number
+            array = self._converted(array, expected, unknown)
+        array = array.astype(float)
+        if array.size == 0 and any(s < 0 for s in shape):
+            array = array.reshape([max(s, 0) for s in shape])
+        fits = array.ndim == len(shape) and all(s in (-1, n) for s, n in zip(shape, array.shape, strict=True))
+        if not fits or not (unknown or np.isfinite(array).all()):
+            self.fail(expected)
+        return array
+
+    def _converted(self, array: np.ndarray[Any, Any], expected: str, unknown: bool) -> Array:
+        objects = np.array(self.value, dtype=object)
+        if objects.shape != array.shape:
+            self.fail(expected)
+        flat = [math.nan if unknown and x is None else _as_float(x) for x in objects.ravel().tolist()]
+        if not all(
+            math.isfinite(x) or (unknown and y is None) for x, y in zip(flat, objects.ravel(), strict=True)
+        ):
+            self.fail(expected)
+        return np.array(flat, dtype=float).reshape(objects.shape)
+
+    def _below(self, key: str) -> str:
+        shown = key if re.fullmatch(r"[\w.-]{1,60}", key) else repr(key[:60])
+        return f"{self.path}.{shown}" if self.path else shown
+
+
+def _as_float(value: Any) -> float:
+    """Find the number that a scalar stands for; NaN if it stands for none."""
+    if isinstance(value, bool):
+        return math.nan
+    if isinstance(value, (int, float)):
+        try:
+            return float(value)
+        except OverflowError:
+            return math.nan
+    if isinstance(value, str) and _NUMBER_TEXT(value):
+        return float(value)
+    return math.nan
+
+
+def _described(value: Any) -> str:
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    if value is None:
+        return "nothing"
+    return repr(value) if len(repr(value)) <= 40 else repr(value)[:37] + "..."

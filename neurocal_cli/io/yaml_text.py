@@ -1,0 +1,77 @@
+"""YAML text of numbers, names and matrices, written so that it reads back exactly everywhere."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = ["flow", "mapping", "number", "quoted", "text"]
+
+_PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*").fullmatch
+_RESERVED = frozenset(("null", "true", "false", "yes", "no", "on", "off", "y", "n"))
+
+# Shortest repr writes 1e-05; YAML 1.1 wants a point in a number.
+_NO_POINT = re.compile(r"(?<![\d.])(\d+)e")
+
+# What YAML would fold, refuse or show wrongly; \uXXXX means the same to YAML and JSON.
+_UNSAFE = re.compile("[\x7f-\xa0\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff0-\uffff]")
+_SURROGATE = re.compile("[\ud800-\udfff]")
+
+
+def number(value: float) -> str:
+    """Write a number to the last bit; ``null`` for what is not finite, as it stands for unknown."""
+    value = float(value)
+    if not math.isfinite(value):
+        return "null"
+    return _with_point(repr(value))
+
+
+def flow(values: Array) -> str:
+    """Write an array as nested flow sequences on one line, ``[[1.0, 2.0], [3.0, 4.0]]``."""
+    array = np.asarray(values, dtype=float)
+    entries: Any = array
+    if not np.isfinite(array).all():
+        entries = array.astype(object)
+        entries[~np.isfinite(array)] = None
+    return _with_point(json.dumps(entries.tolist()))
+
+
+def mapping(**entries: str) -> str:
+    """Write entries, already as text, as a flow mapping ``{a: 1, b: 2}``."""
+    return "{" + ", ".join(f"{key}: {value}" for key, value in entries.items()) + "}"
+
+
+def text(value: str) -> str:
+    """Write text, in quotes where it could be taken for something else."""
+    if _PLAIN(value) and value.lower() not in _RESERVED:
+        return value
+    return quoted(value)
+
+
+def quoted(value: str) -> str:
+    """Write text in double quotes, on one line, valid as YAML and as JSON.
+
+    Raises
+    ------
+    InputError
+        Half of a surrogate pair: no UTF-8 file can hold it.
+    """
+    if _SURROGATE.search(value):
+        raise InputError(f"the name {value[:40]!a} cannot be written as UTF-8; rename it")
+    quoted = json.dumps(value, ensure_ascii=False)
+    return quoted if quoted.isascii() and "\x7f" not in quoted else _UNSAFE.sub(_escaped, quoted)
+
+
+def _escaped(match: re.Match[str]) -> str:
+    return f"\\u{ord(match[0]):04x}"
+
+
+def _with_point(numbers: str) -> str:
+    return _NO_POINT.sub(r"\1.0e", numbers) if "e" in numbers else numbers

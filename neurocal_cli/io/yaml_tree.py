@@ -1,0 +1,185 @@
+"""YAML text to plain dicts, lists, strings and numbers, whatever the text does.
+
+The events of PyYAML (of libyaml, where it is there) are put together here and not by its loaders:
+that is several times faster on calibration files, and it is the place to refuse aliases (a few
+lines of them can ask for gigabytes), doubled keys and absurd nesting. Tags are passed over, so
+OpenCV's ``!!opencv-matrix`` reads like any mapping. Mapping keys stay text: a view called ``1e5``
+or ``null`` keeps its name.
+
+A long table of JSON-compatible rows, which is how observations are written, goes to the JSON
+parser, 50 times faster.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NoReturn
+
+import yaml
+
+from neurocal_cli.errors import FormatError
+from neurocal_cli.io.files import read_text
+
+__all__ = ["parse_yaml", "read_yaml"]
+
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DEEPEST = 40
+
+_INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]{0,4000})").fullmatch
+_FLOAT = re.compile(r"[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?").fullmatch
+_WORDS: dict[str, Any] = {
+    "": None,
+    "~": None,
+    **dict.fromkeys(("null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".inf", ".Inf", ".INF", "+.inf", "+.Inf", "+.INF"), float("inf")),
+    **dict.fromkeys(("-.inf", "-.Inf", "-.INF"), float("-inf")),
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
+}
+
+# The table as `calibration_text` writes it, at any depth of indentation.
+_ROWS = re.compile(
+    r"^( *)observations:\n\1  columns: \[[^\n]*\]\n\1  rows:\n((?:\1  - \[[^\n]*\]\n)+)", re.MULTILINE
+)
+_PLACEHOLDER = "\0rows"  # no file can hold it plainly: NUL is refused on reading
+
+
+def read_yaml(path: str | Path) -> tuple[Any, str]:
+    """Read a YAML file; see `parse_yaml`. Returns the tree and the file's name for messages."""
+    text, source = read_text(path, "a YAML file")
+    return parse_yaml(text, source), source
+
+
+def parse_yaml(text: str, source: str) -> Any:
+    """Turn YAML text into dicts with text keys, lists, str, int, float, bool and None.
+
+    Parameters
+    ----------
+    text : str
+    source : str
+        Name for messages.
+
+    Raises
+    ------
+    FormatError
+        Text that is not YAML, aliases, a key twice, more than one document.
+    """
+    text = text.replace("\r\n", "\n")
+    # OpenCV writes %YAML:1.0, which no YAML parser takes.
+    text = re.sub(r"\A%YAML:[^\n]*", "", text)
+    text, tables = _cut_rows(text)
+    try:
+        return _assemble(text, tables, source)
+    except yaml.YAMLError as error:
+        raise _syntax_error(error, text, source) from error
+    except (RecursionError, UnicodeError) as error:
+        raise FormatError("is not readable YAML; write it again", source) from error
+
+
+def _cut_rows(text: str) -> tuple[str, list[Any]]:
+    """Take tables of rows out of the text, leaving as many lines as there were."""
+    tables: list[Any] = []
+
+    def cut(match: re.Match[str]) -> str:
+        rows, separator = match[2], f"\n{match[1]}  - "
+        try:
+            table = json.loads(
+                "[" + rows[len(separator) - 1 : -1].replace(separator, ",\n") + "]", parse_constant=_refuse
+            )
+        except (ValueError, RecursionError):
+            return match[0]
+        tables.append(table)
+        head = match[0][: match.start(2) - match.start() - 1]
+        return f'{head} "\\0rows{len(tables) - 1}"' + "\n" * (len(table) + 1)
+
+    return _ROWS.sub(cut, text), tables
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(constant)  # NaN is a number to JSON and a string to YAML
+
+
+def _assemble(text: str, tables: list[Any], source: str) -> Any:
+    """Build the tree from the parser's events, without recursion."""
+    root: list[Any] = []
+    containers: list[Any] = [root]  # innermost last
+    keys: list[str | None] = [None]  # the key that waits for its value, for each container
+    events: Iterator[Any] = yaml.parse(text, Loader=_LOADER)
+    for event in events:
+        kind = type(event)
+        if kind is yaml.ScalarEvent:
+            value: Any = event.value
+            if type(containers[-1]) is dict and keys[-1] is None:
+                keys[-1] = _new_key(value, containers[-1], event, source)
+                continue
+            if not event.style:
+                value = _resolve(value, event.tag)
+            elif value.startswith(_PLACEHOLDER):
+                value = _table(value, tables, event, source)
+        elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
+            if type(containers[-1]) is dict and keys[-1] is None:
+                _fail("a key must be a word, not a list or mapping; correct it", event, source)
+            if len(containers) > _DEEPEST:
+                _fail("is nested too deeply to be a camera file; give another", event, source)
+            containers.append({} if kind is yaml.MappingStartEvent else [])
+            keys.append(None)
+            continue
+        elif kind is yaml.MappingEndEvent or kind is yaml.SequenceEndEvent:
+            value = containers.pop()
+            keys.pop()
+        elif kind is yaml.AliasEvent:
+            _fail("aliases (*name) are not read; write the value out", event, source)
+        elif kind is yaml.DocumentStartEvent and root:
+            _fail("a second YAML document begins; keep one", event, source)
+        else:
+            continue
+        container = containers[-1]
+        if type(container) is list:
+            container.append(value)
+        else:
+            container[keys[-1]] = value
+            keys[-1] = None
+    return root[0] if root else None
+
+
+def _resolve(text: str, tag: str | None) -> Any:
+    """Find the value of a plain scalar: as PyYAML reads it, without its dates and odd number bases."""
+    if tag is not None and tag.endswith(":str"):
+        return text
+    if text[:1] in "+-.0123456789":  # also true of no text at all
+        if _FLOAT(text):
+            return float(text)
+        if _INTEGER(text):
+            return int(text)
+    return _WORDS.get(text, text)
+
+
+def _new_key(key: str, container: dict[str, Any], event: Any, source: str) -> str:
+    if key in container:
+        _fail(f"the key {key[:60]!r} appears twice; remove one", event, source)
+    return key
+
+
+def _table(value: str, tables: list[Any], event: Any, source: str) -> Any:
+    number = value.removeprefix(_PLACEHOLDER)
+    if number.isascii() and number.isdigit() and len(number) < 10 and int(number) < len(tables):
+        return tables[int(number)]
+    return _fail("holds a NUL character; remove it", event, source)
+
+
+def _fail(problem: str, event: Any, source: str) -> NoReturn:
+    raise FormatError(problem, source, event.start_mark.line + 1)
+
+
+def _syntax_error(error: yaml.YAMLError, text: str, source: str) -> FormatError:
+    mark = getattr(error, "problem_mark", None)
+    if mark is not None:
+        problem = str(getattr(error, "problem", "")) or "it cannot be parsed"
+        return FormatError(f"is not valid YAML ({problem}); correct it", source, mark.line + 1)
+    position = getattr(error, "position", None)  # a character that YAML does not allow
+    line = None if position is None else text.count("\n", 0, position) + 1
+    return FormatError("holds a character that YAML does not allow; remove it", source, line)
