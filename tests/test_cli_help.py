@@ -138,7 +138,8 @@ def test_groff_has_nothing_to_complain_of(name: str) -> None:
 
 
 def test_defaults_of_the_options_are_those_of_the_library() -> None:
-    from neurocal_cli.methods import calibrate
+    from neurocal_cli.methods import DISTORTIONS, METHODS, OUTLIERS, TRAINERS, calibrate
+    from neurocal_cli.training.backprop import BackpropOptions
 
     library = inspect.signature(calibrate).parameters
     command = neurocal.get_command(click.Context(neurocal), "calibrate")
@@ -150,4 +151,13 @@ def test_defaults_of_the_options_are_those_of_the_library() -> None:
     for name, keyword in {"epochs": "epochs", "rate": "rate_weights", "rate_gamma": "rate_gamma"}.items():
         option = options[name]
         assert isinstance(option, click.Option)
-        assert option.show_default == f"{library[keyword].default:g}", name
+        assert option.show_default == f"{getattr(BackpropOptions(), keyword):g}", name
+    for name, values in {
+        "method": METHODS,
+        "trainer": TRAINERS,
+        "distortion": DISTORTIONS,
+        "outliers": OUTLIERS,
+    }.items():
+        choice = options[name].type
+        assert isinstance(choice, click.Choice)
+        assert tuple(choice.choices) == values

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -75,7 +74,7 @@ def calibrate(
     estimation.check()
     check_one_stdin(*points, *estimation.stdin_candidates)
     _check_outputs(output, plot, camera_name)
-    calibration = replace(_estimate(points, estimation), camera_name=camera_name)
+    calibration = _estimate(points, estimation, camera_name)
     _write(calibration, output, plot)
     _report(calibration)
     if not calibration.converged:
@@ -96,7 +95,7 @@ def _check_outputs(output: str, plot: str | None, camera_name: str) -> None:
     check_available()
 
 
-def _estimate(names: tuple[str, ...], estimation: Estimation) -> Calibration:
+def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) -> Calibration:
     from neurocal_cli.io.points_csv import read_points
 
     notes: list[str] = []
@@ -107,7 +106,7 @@ def _estimate(names: tuple[str, ...], estimation: Estimation) -> Calibration:
     from neurocal_cli.methods import calibrate as learn
 
     with ProgressBar() as progress:
-        return learn(points, **arguments, progress=progress)
+        return learn(points, **arguments, camera_name=camera_name, progress=progress)
 
 
 def _write(calibration: Calibration, output: str, plot: str | None) -> None:

@@ -16,6 +16,7 @@ from neurocal_cli.errors import InputError, UsageError
 if TYPE_CHECKING:
     from neurocal_cli.camera import Intrinsics
     from neurocal_cli.points import Correspondences
+    from neurocal_cli.training.backprop import BackpropOptions
 
 __all__ = ["Estimation", "estimation_options"]
 
@@ -92,7 +93,7 @@ class Estimation:
             "outliers": self.outliers,
             "seed": self.seed,
             "starts": self.starts,
-            **self._backprop(),
+            "backprop": self._backprop(),
         }
         if self.type == "2":
             arguments["image_center"] = self._center(points)
@@ -104,9 +105,14 @@ class Estimation:
             arguments["extrinsics"] = read_extrinsics(self.extrinsics)
         return points, arguments
 
-    def _backprop(self) -> dict[str, Any]:
+    def _backprop(self) -> BackpropOptions | None:
         values = {"epochs": self.epochs, "rate_weights": self.rate, "rate_gamma": self.rate_gamma}
-        return {name: value for name, value in values.items() if value is not None}
+        given: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+        if not given:
+            return None
+        from neurocal_cli.training.backprop import BackpropOptions
+
+        return BackpropOptions(**given)
 
     def _center(self, points: Correspondences) -> tuple[float, float]:
         """Choose the image centre of type 2: as asked for, as in the points' header, or of the image."""
@@ -218,7 +224,7 @@ _OPTIONS = [
     ),
     click.option(
         "--starts",
-        type=click.IntRange(min=1),
+        type=click.IntRange(min=2),
         metavar="N",
         default=20,
         help="Try at most this many random starts until two of them agree.",
@@ -234,21 +240,21 @@ _OPTIONS = [
         "--epochs",
         type=click.IntRange(min=1),
         metavar="N",
-        show_default="EPOCHS",
+        show_default="50000",
         help="Backprop: pass over the points at most this many times.",
     ),
     click.option(
         "--rate",
         type=FiniteNumber(positive=True),
         metavar="RATE",
-        show_default="RATE",
+        show_default="0.05",
         help="Backprop: learning rate of the weights.",
     ),
     click.option(
         "--rate-gamma",
         type=FiniteNumber(positive=True),
         metavar="RATE",
-        show_default="RATE",
+        show_default="0.4",
         help="Backprop: learning rate of the factors gamma.",
     ),
     click.option(

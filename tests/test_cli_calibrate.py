@@ -1,0 +1,364 @@
+"""``neurocal calibrate``: streams, exit codes, what is refused, what is written."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from made_calibration import CAMERA, made_calibration, made_points
+
+from neurocal_cli import read_calibration, read_points, write_calibration, write_points
+from neurocal_cli.commands import neurocal
+from neurocal_cli.io.calibration_yaml import format_calibration
+
+
+def run(*words: object, **kwargs: object) -> Result:
+    return CliRunner().invoke(neurocal, [str(word) for word in words], **kwargs)  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def points(tmp_path: Path) -> Path:
+    path = tmp_path / "points.csv"
+    write_points(made_points(1), path)
+    return path
+
+
+@pytest.fixture
+def camera(tmp_path: Path) -> Path:
+    """A file with the true camera and pose of the points."""
+    path = tmp_path / "given.yaml"
+    write_calibration(made_calibration(1), path)
+    return path
+
+
+def refuse_to_work(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> None:
+    def fail(*args: object, **kwargs: object) -> None:
+        raise error
+
+    monkeypatch.setattr("neurocal_cli.methods.calibrate", fail)
+
+
+def test_the_calibration_goes_to_stdout_and_the_summary_to_stderr(points: Path) -> None:
+    result = run("calibrate", points)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith("camera_name: camera\n")
+    assert "alpha_u [px]" in result.stderr
+    assert "random start" in result.stderr
+
+
+def test_the_command_gives_what_the_library_gives(points: Path) -> None:
+    from neurocal_cli import calibrate
+
+    assert run("calibrate", points).stdout == format_calibration(
+        calibrate(read_points(str(points)), distortion="none", outliers="keep")
+    )
+
+
+def test_the_file_of_o_is_what_would_go_to_stdout(points: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.yaml"
+    result = run("calibrate", points, "-o", out)
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert out.read_text() == run("calibrate", points).stdout == run("calibrate", points, "-o", "-").stdout
+
+
+def test_the_camera_is_found(points: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.yaml"
+    run("calibrate", points, "-o", out)
+    found = read_calibration(out)
+    for name in ("alpha_u", "alpha_v", "u0", "v0", "theta"):
+        assert abs(getattr(found.intrinsics, name) - getattr(CAMERA, name)) < 5 * found.std[name]
+
+
+def test_points_are_read_from_stdin(points: Path) -> None:
+    assert run("calibrate", "-", input=points.read_bytes()).stdout == run("calibrate", points).stdout
+
+
+def test_several_files_are_calibrated_as_one(tmp_path: Path) -> None:
+    both = made_points(2)
+    files = []
+    for k in range(2):
+        files.append(tmp_path / f"{k}.csv")
+        write_points(both.select(both.view_index == k), files[-1])
+    out = tmp_path / "camera.yaml"
+    assert run("calibrate", *files, "-o", out).exit_code == 0
+    assert list(read_calibration(out).views) == ["view00", "view01"]
+
+
+def test_no_skew_holds_theta_at_a_right_angle(points: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.yaml"
+    assert run("calibrate", points, "--no-skew", "-o", out).exit_code == 0
+    found = read_calibration(out)
+    assert not found.intrinsics.skewed
+    assert "theta" in found.fixed
+
+
+def test_the_name_and_the_image_size_are_written(points: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.yaml"
+    run("calibrate", points, "--camera-name", "left", "--image-size", 800, 600, "-o", out)
+    found = read_calibration(out)
+    assert (found.camera_name, found.image_size) == ("left", (800, 600))
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (["--image-center", "1", "2"], "--image-center belongs to --type 2"),
+        (["--intrinsics", "x.yaml"], "--intrinsics belongs to --type 3"),
+        (["--extrinsics", "x.yaml"], "--extrinsics belongs to --type 4"),
+        (["--type", "3"], "give --intrinsics"),
+        (["--type", "4"], "give --extrinsics"),
+        (["--type", "3", "--intrinsics", "x.yaml", "--no-skew"], "--no-skew"),
+        (["--epochs", "5"], "--epochs belongs to --trainer backprop"),
+        (["--rate", "0.1"], "--rate belongs to --trainer backprop"),
+        (["--rate-gamma", "0.1"], "--rate-gamma belongs to --trainer backprop"),
+        (["--type", "5"], "'5' is not one of"),
+        (["--type", "2", "--image-center", "nan", "2"], "not a finite number"),
+        (["--trainer", "backprop", "--rate", "0"], "not greater than 0"),
+        (["--starts", "1"], "--starts"),
+        (["--method", "guess"], "--method"),
+        (["--plot", "picture.gif"], ".png"),
+        (["--plot", "out.png", "-o", "out.png"], "same file"),
+        (["--camera-name", " "], "--camera-name"),
+        (["-", "-"], "only once"),
+        (["-", "--type", "3", "--intrinsics", "-"], "only once"),
+        (["--nonsense"], "--nonsense"),
+    ],
+)
+def test_contradictions_are_usage_errors_before_any_file_is_read(
+    words: list[str], hint: str, tmp_path: Path
+) -> None:
+    result = run("calibrate", tmp_path / "missing.csv", *words)
+    assert result.exit_code == 2
+    assert hint in result.stderr
+    assert result.stdout == ""
+
+
+def test_no_points_is_a_usage_error() -> None:
+    assert run("calibrate").exit_code == 2
+
+
+def test_type_2_takes_the_centre_of_the_option(points: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.yaml"
+    result = run("calibrate", points, "--type", 2, "--image-center", 320, 240, "-o", out)
+    assert result.exit_code == 0, result.stderr
+    found = read_calibration(out)
+    assert (found.intrinsics.u0, found.intrinsics.v0) == (320, 240)
+    assert found.fixed >= {"u0", "v0"}
+    assert "warning" not in result.stderr
+
+
+def test_type_2_takes_the_centre_of_the_header(tmp_path: Path) -> None:
+    write_points(replace(made_points(), image_center=(321.0, 239.0)), tmp_path / "p.csv")
+    out = tmp_path / "camera.yaml"
+    result = run("calibrate", tmp_path / "p.csv", "--type", 2, "-o", out)
+    assert (read_calibration(out).intrinsics.u0, read_calibration(out).intrinsics.v0) == (321, 239)
+    assert "warning" not in result.stderr
+
+
+def test_type_2_takes_the_middle_of_the_image_with_a_warning(points: Path, tmp_path: Path) -> None:
+    out = tmp_path / "camera.yaml"
+    result = run("calibrate", points, "--type", 2, "-o", out)
+    assert (read_calibration(out).intrinsics.u0, read_calibration(out).intrinsics.v0) == (319.5, 239.5)
+    assert result.stderr.count("warning: no image centre is given") == 1
+
+
+def test_type_2_without_any_centre_is_a_usage_error(tmp_path: Path) -> None:
+    write_points(replace(made_points(), image_size=None), tmp_path / "p.csv")
+    result = run("calibrate", tmp_path / "p.csv", "--type", 2)
+    assert result.exit_code == 2
+    assert "--image-center U V" in result.stderr
+
+
+def test_type_3_finds_the_pose_of_a_known_camera(tmp_path: Path, camera: Path) -> None:
+    write_points(replace(made_points(1, first=3), image_size=None), tmp_path / "moved.csv")
+    out = tmp_path / "camera.yaml"
+    result = run("calibrate", tmp_path / "moved.csv", "--type", 3, "--intrinsics", camera, "-o", out)
+    assert result.exit_code == 0, result.stderr
+    found = read_calibration(out)
+    assert found.intrinsics == CAMERA
+    assert found.image_size == (640, 480)
+    assert sum(line.endswith("given") for line in result.stderr.splitlines()) == 5
+
+
+def test_type_4_finds_the_camera_of_a_known_pose(tmp_path: Path, points: Path, camera: Path) -> None:
+    out = tmp_path / "camera.yaml"
+    result = run("calibrate", points, "--type", 4, "--extrinsics", camera, "-o", out)
+    assert result.exit_code == 0, result.stderr
+    assert read_calibration(out).views["view00"].fixed
+    assert sum(line.endswith("given") for line in result.stderr.splitlines()) == 6
+
+
+def test_a_given_camera_with_distortion_is_refused(tmp_path: Path, points: Path) -> None:
+    ros = tmp_path / "ros.yaml"
+    ros.write_text(
+        "image_width: 640\nimage_height: 480\ncamera_name: c\ncamera_matrix: {rows: 3, cols: 3, "
+        "data: [600, 0, 320, 0, 600, 240, 0, 0, 1]}\ndistortion_model: plumb_bob\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [-0.2, 0, 0, 0, 0]}\n"
+    )
+    result = run("calibrate", points, "--type", 3, "--intrinsics", ros)
+    assert result.exit_code == 1
+    assert "undistort the points first" in result.stderr
+
+
+def test_a_given_camera_of_another_image_size_is_refused(tmp_path: Path, camera: Path) -> None:
+    write_points(replace(made_points(), image_size=(1280, 960)), tmp_path / "p.csv")
+    result = run("calibrate", tmp_path / "p.csv", "--type", 3, "--intrinsics", camera)
+    assert result.exit_code == 1
+    assert "640 x 480" in result.stderr
+    assert "1280 x 960" in result.stderr
+
+
+def break_row(text: str) -> str:
+    lines = text.splitlines()
+    lines[9] = "view00,1,2,three,4,5"
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [break_row, lambda text: "", lambda text: "\0\1", lambda text: "\n".join(text.splitlines()[:6])],
+    ids=["a bad row", "empty", "binary", "too few points"],
+)
+def test_bad_points_give_one_line_and_leave_the_output_as_it_was(
+    spoil: Callable[[str], str], points: Path, tmp_path: Path
+) -> None:
+    points.write_text(spoil(points.read_text()))
+    out = tmp_path / "camera.yaml"
+    out.write_bytes(b"former content\r\n")
+    result = run("calibrate", points, "-o", out)
+    assert result.exit_code == 1
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stderr.startswith("Error: ")
+    assert out.read_bytes() == b"former content\r\n"
+    assert {path.name for path in tmp_path.iterdir()} == {"points.csv", "camera.yaml"}
+
+
+def test_a_missing_file_is_not_a_usage_error(tmp_path: Path) -> None:
+    result = run("calibrate", tmp_path / "missing.csv")
+    assert result.exit_code == 1
+    assert "missing.csv" in result.stderr
+
+
+def test_a_bad_row_is_named_with_file_and_line(points: Path) -> None:
+    points.write_text(break_row(points.read_text()))
+    assert f"Error: {points}:10: " in run("calibrate", points).stderr
+
+
+def test_an_output_that_cannot_be_written_is_said_in_one_line(points: Path, tmp_path: Path) -> None:
+    result = run("calibrate", points, "-o", tmp_path / "no" / "camera.yaml")
+    assert result.exit_code == 1
+    assert "folder does not exist" in result.stderr
+
+
+def test_an_answer_that_did_not_converge_is_written_with_exit_code_3(
+    points: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unfinished = replace(made_calibration(), converged=False, warnings=("careful",))
+    monkeypatch.setattr("neurocal_cli.methods.calibrate", lambda *args, **kwargs: unfinished)
+    out = tmp_path / "camera.yaml"
+    result = run("calibrate", points, "-o", out)
+    assert result.exit_code == 3
+    assert not read_calibration(out).converged
+    assert "warning: careful" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("error", "exit_code", "line"),
+    [
+        (MemoryError(), 1, "Error: not enough memory; use fewer points"),
+        (RecursionError("deep"), 1, "Error: the input is nested too deeply to be read"),
+        (PermissionError(13, "Permission denied", "f"), 1, "Error: f: Permission denied"),
+        (KeyboardInterrupt(), 130, "Error: interrupted"),
+        (
+            ZeroDivisionError("a\nb"),
+            1,
+            "Error: internal error: ZeroDivisionError: a b; run with NEUROCAL_DEBUG=1",
+        ),
+    ],
+    ids=["memory", "recursion", "file", "interrupt", "unexpected"],
+)
+def test_any_error_becomes_one_line(
+    error: BaseException, exit_code: int, line: str, points: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_to_work(monkeypatch, error)
+    result = run("calibrate", points)
+    assert result.exit_code == exit_code
+    assert result.stderr.startswith(line)
+    assert len(result.stderr.splitlines()) == 1
+    assert result.stdout == ""
+
+
+def test_debugging_shows_where_an_unexpected_error_arose(
+    points: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refuse_to_work(monkeypatch, ZeroDivisionError())
+    result = run("calibrate", points, env={"NEUROCAL_DEBUG": "1"})
+    assert isinstance(result.exception, ZeroDivisionError)
+
+
+def test_the_plot_is_drawn(points: Path, tmp_path: Path) -> None:
+    picture = tmp_path / "picture.png"
+    assert run("calibrate", points, "--plot", picture).exit_code == 0
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_plot_that_cannot_be_drawn_leaves_no_file(
+    points: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    result = run("calibrate", points, "--plot", tmp_path / "p.png", "-o", tmp_path / "c.yaml")
+    assert result.exit_code == 1
+    assert "pip install 'neurocal[plot]'" in result.stderr
+    assert {path.name for path in tmp_path.iterdir()} == {"points.csv"}
+
+
+def neurocal_process(*words: object, **kwargs: object) -> subprocess.CompletedProcess[bytes]:
+    command = [sys.executable, "-m", "neurocal_cli", *map(str, words)]
+    return subprocess.run(command, capture_output=True, **kwargs)  # type: ignore[call-overload, no-any-return]
+
+
+def test_commands_chain_in_a_pipe(points: Path) -> None:
+    with points.open("rb") as stdin:
+        first = neurocal_process("calibrate", "-", stdin=stdin)
+    second = neurocal_process("evaluate", "camera", "-", input=first.stdout)
+    assert (first.returncode, second.returncode) == (0, 0)
+    assert b"view00" in second.stdout
+    assert second.stderr == b""
+
+
+def test_processes_give_the_same_bytes_each_time(points: Path) -> None:
+    runs = {neurocal_process("calibrate", points, "--seed", 5).stdout for _ in range(2)}
+    assert len(runs) == 1
+
+
+def test_a_failed_process_shows_no_traceback(tmp_path: Path) -> None:
+    result = neurocal_process("calibrate", tmp_path / "missing.csv")
+    assert result.returncode == 1
+    assert result.stdout == b""
+    assert result.stderr.startswith(b"Error: ")
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_reader_that_has_seen_enough_ends_the_command_quietly(points: Path) -> None:
+    command = [sys.executable, "-m", "neurocal_cli", "calibrate", str(points)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert b"Traceback" not in process.stderr.read()
+
+
+def test_calibrating_loads_nothing_that_it_does_not_use(points: Path) -> None:
+    code = (
+        "import sys; from neurocal_cli.commands import neurocal; "
+        "neurocal(sys.argv[1:], standalone_mode=False); print('LOADED', *sys.modules, file=sys.stderr)"
+    )
+    command = [sys.executable, "-c", code, "calibrate", str(points)]
+    stderr = subprocess.run(command, capture_output=True, text=True, check=True).stderr
+    loaded = set(stderr.partition("LOADED")[2].split())
+    assert loaded.isdisjoint({"rich", "scipy", "matplotlib", "cv2", "numba", "numpy.testing"})
