@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -44,6 +44,8 @@ class Correspondences:
         Where the rows come from, for messages.
     lines : (N,) int array, optional
         Line of each row in its file, for messages.
+    sources : dict of str by view, optional
+        The file of each view where several files were read, for messages.
 
     Attributes
     ----------
@@ -69,6 +71,7 @@ class Correspondences:
     unit: str = "mm"
     source: str = "points"
     lines: NDArray[np.int64] | None = None
+    sources: Mapping[str, str] | None = None
     view_names: tuple[str, ...] = field(init=False)
     view_index: NDArray[np.int64] = field(init=False)
 
@@ -122,7 +125,10 @@ class Correspondences:
     def place(self, row: int) -> str:
         """Where a row came from, ``file:line`` or ``points, row 7``."""
         if self.lines is not None:
-            return f"{self.source}:{int(self.lines[row])}"
+            source = self.source
+            if self.sources is not None and self.view is not None:
+                source = self.sources.get(str(self.view[row]), source)
+            return f"{source}:{int(self.lines[row])}"
         return f"{self.source}, row {row + 1}"
 
     def select(self, rows: NDArray[Any] | slice) -> Correspondences:
