@@ -1,0 +1,279 @@
+"""The paper's trainer: the back-propagation rule of section 3, eqs. (9)-(11), a pattern at a time.
+
+Every pattern in turn moves W, V and its own factor gamma, which starts at 1. Patterns come in a
+shuffled order, the same in every epoch: neighbours in space pull the weights the same way, and in
+their order on the target training takes twice as long.
+
+What the rates do. gamma is the slow part: the weights follow it within an epoch, so rate_gamma
+sets the pace, up to 2 / |o|^2 where it overshoots; hence 0.4 beside 0.05 for the weights. On exact
+data a constant rate converges to the exact camera. On noisy data it ends on a small cycle about the
+optimum, 2-40 % above its loss; the excess goes with the square of the rate, so the rates are halved
+whenever the loss has come to rest. From random weights the paper's Table 1 scene (440 points) takes
+400-800 epochs to 1e-7 px; boxes and corners with 0.3 px of noise take 800-4,000. Slower are nearly
+flat targets (20,000 and more) and views so close that the gammas differ by a factor of 14 (8,000).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.network import Patterns, e_2d, e_orth, optimal_gamma, output
+from neurocal_cli.training.task import Task, Trained
+
+__all__ = ["BackpropOptions", "BackpropTrained", "train_backprop"]
+
+# Checkpoints come every 10 epochs at first, later every 1/40 of the epochs so far: some 230 in 50,000.
+_FIRST_CHECK = 10
+_CHECKS_PER_LIFE = 40
+# The loss is compared over 10 of them, a quarter of the training so far.
+_WINDOW = 10
+# A network whose loss exceeds 10 times that of the silent network, W V = 0, has diverged.
+_DIVERGED = 10.0
+
+
+@dataclass(frozen=True)
+class BackpropOptions:
+    """Constants of the rule.
+
+    Parameters
+    ----------
+    epochs : int
+        Presentations of all patterns after which training is given up.
+    rate_weights, rate_gamma : float
+        The paper's learning constants alpha_1 and alpha_2, for patterns of order 1.
+    beta : float
+        Weight of E_orth beside each pattern's E_2D, eq. (14).
+    a : float
+        Squared length of V's rows in E_orth.
+    resting_gamma : bool
+        Start each gamma where (11) comes to rest for the initial weights, instead of at 1: to go on
+        from weights that are trained, which gammas of 1 would lead astray first.
+    tolerance : float
+        Relative change of the loss that no longer counts.
+    floor : float
+        Rms error, in normalised pixels, below which there is nothing left to learn.
+    halvings : int
+        How often a network that diverges starts again, at half its rates.
+    method : {"auto", "patterns", "blocks"}
+        Pattern by pattern, as the paper has it, or in small blocks; "auto" takes blocks only where
+        numba is missing.
+    """
+
+    epochs: int = 50_000
+    rate_weights: float = 0.05
+    rate_gamma: float = 0.4
+    beta: float = 0.0
+    a: float = 1.0
+    resting_gamma: bool = False
+    tolerance: float = 1e-3
+    floor: float = 1e-9
+    halvings: int = 6
+    method: Literal["auto", "patterns", "blocks"] = "auto"
+
+    def __post_init__(self) -> None:
+        if min(self.epochs, self.rate_weights, self.rate_gamma, self.a) <= 0:
+            raise InputError("epochs, rate_weights, rate_gamma and a must be positive")
+        if min(self.beta, self.tolerance, self.floor, self.halvings) < 0:
+            raise InputError("beta, tolerance, floor and halvings must not be negative")
+
+
+@dataclass(frozen=True, eq=False)
+class BackpropTrained(Trained):
+    """Networks after training by the rule.
+
+    Attributes
+    ----------
+    restarts : (G,) int array
+        How often each network diverged and started again.
+    rate_weights : (G,) array
+        Rate of W and V at which each network ended.
+    """
+
+    restarts: NDArray[np.int64] = field(kw_only=True)
+    rate_weights: Array = field(kw_only=True)
+
+
+def train_backprop(
+    task: Task,
+    options: BackpropOptions | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> BackpropTrained:
+    """Train a stack of networks by eqs. (9)-(11), with E_orth of eq. (14) where beta > 0.
+
+    The rates of a network are halved whenever its loss has come to rest: a constant rate ends on a
+    small cycle about the optimum, whose excess goes with the rate's square. It has settled when
+    half the rates no longer lower the loss, or when the loss is below the floor.
+
+    Parameters
+    ----------
+    task : Task
+    options : BackpropOptions, optional
+    progress : callable, optional
+        Called with the share of the epochs that is done, 0 to 1.
+
+    Returns
+    -------
+    BackpropTrained
+        Its curve is the loss that is minimised: E_2D, plus beta E_orth for each pattern. A network
+        that diverges at all rates comes back with its initial weights, not settled.
+
+    Raises
+    ------
+    InputError
+        Weights or patterns that are not finite; E_orth asked of networks for a flat board, whose V
+        lacks the column that makes it a rotation.
+    """
+    run = _Run(task, options or BackpropOptions())
+    while run.active.any() and run.epoch < run.options.epochs:
+        run.advance()
+        if progress is not None:
+            progress(1.0 if not run.active.any() else run.epoch / run.options.epochs)
+    return run.trained()
+
+
+_Present = Callable[..., None]
+_Entry = TypeVar("_Entry", bound=np.generic)
+
+
+def _presenter(method: str) -> _Present:
+    """Choose what presents the patterns; numba is imported here and nowhere else."""
+    if method != "blocks":
+        from neurocal_cli.training import rule
+
+        if rule.COMPILING or method == "patterns":
+            return rule.present
+    from neurocal_cli.training import blocks
+
+    return blocks.present
+
+
+class _Run:
+    """A stack in training: its weights, and what decides each network's rates and end."""
+
+    def __init__(self, task: Task, options: BackpropOptions) -> None:
+        self.task, self.options = task, options
+        networks = len(task.W)
+        self._order(task.patterns)
+        self.W, self.V = _contiguous(task.W), _four_inputs(task.V)
+        self.gamma = np.ones(self.w.shape)
+        if options.resting_gamma:
+            self.gamma = optimal_gamma(output(self.W, self.V, self.Z), self.d)
+        self.start = self.W.copy(), self.V.copy(), self.gamma.copy()
+        self.present = _presenter(options.method)
+        self.epoch = 0
+        self.active = np.ones(networks, dtype=bool)
+        self.settled = np.zeros(networks, dtype=bool)
+        self.iterations = np.zeros(networks, dtype=np.int64)
+        self.restarts = np.zeros(networks, dtype=np.int64)
+        self.scale = np.ones(networks)
+        # When the present rates began, and the loss to which those before them had led.
+        self.since = np.zeros(networks, dtype=np.int64)
+        self.before = np.full(networks, np.inf)
+        self.curve = [self.loss()]
+        if not np.isfinite(self.curve[0]).all():
+            raise InputError("the patterns and the initial weights must be finite numbers")
+        if options.beta > 0 and task.V.shape[2] != 4:
+            raise InputError("the orthogonality term needs networks of four inputs")
+        silent = 0.5 * (self.w * (self.d**2).sum(-1)).sum(-1)
+        self.limit = _DIVERGED * np.maximum(self.curve[0], silent)
+        self.floor = 0.5 * options.floor**2 * self.w.sum(-1)
+
+    def _order(self, patterns: Patterns) -> None:
+        """Put the patterns in the order of presentation; those of weight 0 last, never presented."""
+        weights = patterns.weights
+        self.used = np.count_nonzero(weights > 0, axis=1).astype(np.int64)
+        shuffled = np.random.default_rng(0).permutation(weights.shape[1])
+        self.order = shuffled[np.argsort(weights[:, shuffled] <= 0, axis=1, kind="stable")]
+        inputs = np.broadcast_to(patterns.inputs, (len(weights), *patterns.inputs.shape[1:]))
+        self.Z = _four_inputs(np.take_along_axis(inputs, self.order[..., None], axis=1))
+        self.d = _contiguous(np.take_along_axis(patterns.targets, self.order[..., None], axis=1))
+        # The largest weight is 1, or the rates would mean something else in each task.
+        largest = np.maximum(weights.max(axis=1, keepdims=True), 1e-300)
+        self.w = _contiguous(np.take_along_axis(weights / largest, self.order, axis=1))
+
+    def loss(self) -> Array:
+        """Sum what is minimised, eq. (14), over the patterns; (G,)."""
+        with np.errstate(all="ignore"):
+            loss = e_2d(self.W, self.V, self.gamma, Patterns(self.Z, self.d, self.w))
+            if self.options.beta > 0:
+                loss = loss + self.options.beta * self.used * e_orth(self.V, self.options.a)
+        return loss
+
+    def advance(self) -> None:
+        """Train to the next checkpoint and judge every network there."""
+        options = self.options
+        epochs = min(max(_FIRST_CHECK, self.epoch // _CHECKS_PER_LIFE), options.epochs - self.epoch)
+        with np.errstate(all="ignore"):
+            self.present(
+                self.Z, self.d, self.w, self.W, self.V, self.gamma,
+                np.ascontiguousarray(self.task.free_W), _four_inputs(self.task.free_V),
+                self.scale * options.rate_weights, self.scale * options.rate_gamma,
+                options.beta, options.a, epochs, self.used, self.active,
+            )  # fmt: skip
+        self.epoch += epochs
+        self.iterations[self.active] += epochs
+        loss = self.loss()
+        self._restart(self.active & ~(loss <= self.limit), loss)
+        self.curve.append(loss)
+        self._judge(loss)
+
+    def _restart(self, diverged: NDArray[np.bool_], loss: Array) -> None:
+        """Send networks that diverged back to their initial weights, at half the rates."""
+        for weights, initial in zip((self.W, self.V, self.gamma), self.start, strict=True):
+            weights[diverged] = initial[diverged]
+        loss[diverged] = self.curve[0][diverged]
+        self.restarts[diverged] += 1
+        self.scale[diverged] /= 2
+        self.since[diverged] = len(self.curve)
+        self.before[diverged] = np.inf
+        self.active &= self.restarts <= self.options.halvings
+
+    def _judge(self, loss: Array) -> None:
+        """Halve the rates of networks that have come to rest; end those that gain nothing by it."""
+        checkpoint = len(self.curve) - 1
+        past = self.curve[max(checkpoint - _WINDOW, 0)]
+        least = self.options.tolerance * loss
+        resting = self.active & (checkpoint - self.since >= _WINDOW) & (past - loss <= least)
+        done = (resting & (np.abs(self.before - loss) <= least)) | (self.active & (loss <= self.floor))
+        self.settled |= done
+        self.active &= ~done
+        slower = resting & ~done
+        self.before[slower] = loss[slower]
+        self.since[slower] = checkpoint
+        self.scale[slower] /= 2
+
+    def trained(self) -> BackpropTrained:
+        """Put the result in the caller's order of patterns."""
+        n_inputs = self.task.V.shape[2]
+        gamma = np.ones_like(self.gamma)
+        np.put_along_axis(gamma, self.order, self.gamma, axis=1)
+        V = self.V[..., :n_inputs].copy()
+        return BackpropTrained(
+            W=self.W,
+            V=V,
+            gamma=gamma,
+            loss=e_2d(self.W, V, gamma, self.task.patterns),
+            iterations=self.iterations,
+            settled=self.settled,
+            curve=np.array(self.curve),
+            restarts=self.restarts,
+            rate_weights=self.scale * self.options.rate_weights,
+        )
+
+
+def _contiguous(array: Array) -> Array:
+    """Copy an array that the kernel will change, in the one layout for which it is compiled."""
+    return np.array(array, dtype=np.float64, order="C")
+
+
+def _four_inputs(array: NDArray[_Entry]) -> NDArray[_Entry]:
+    """Complete the four inputs of the kernel: the one that a flat board's network lacks is 0 and fixed."""
+    missing = 4 - array.shape[-1]
+    return np.ascontiguousarray(np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)]))
