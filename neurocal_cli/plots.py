@@ -125,7 +125,7 @@ def _draw_arrows(axes: Axes, calibration: Calibration, evaluation: CameraEvaluat
     shown = np.random.default_rng(0).permutation(seen)[:_MOST_ARROWS]
     pixels, residuals = calibration.points.pixels[shown], evaluation.residuals[shown]
     spacing = np.sqrt(np.prod(np.ptp(pixels, axis=0)) / len(pixels)) if len(pixels) else 0.0
-    length = min(_LONGEST_ARROW * (right - left), max(1.5 * spacing, 0.01 * (right - left)))
+    length = min(_LONGEST_ARROW * (right - left), max(1.5 * spacing, 0.015 * (right - left)))
     scale = _round_scale(length / max(evaluation.rmse_px, 1e-300))
     axes.quiver(
         *pixels.T, *residuals.T, color=_INK, angles="xy", scale_units="xy", scale=1 / scale, width=0.0025

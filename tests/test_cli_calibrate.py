@@ -9,16 +9,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from click.testing import CliRunner, Result
+from command_line import run
 from made_calibration import CAMERA, made_calibration, made_points
 
 from neurocal_cli import read_calibration, read_points, write_calibration, write_points
-from neurocal_cli.commands import neurocal
 from neurocal_cli.io.calibration_yaml import format_calibration
-
-
-def run(*words: object, **kwargs: object) -> Result:
-    return CliRunner().invoke(neurocal, [str(word) for word in words], **kwargs)  # type: ignore[arg-type]
 
 
 @pytest.fixture
@@ -75,7 +70,7 @@ def test_the_camera_is_found(points: Path, tmp_path: Path) -> None:
 
 
 def test_points_are_read_from_stdin(points: Path) -> None:
-    assert run("calibrate", "-", input=points.read_bytes()).stdout == run("calibrate", points).stdout
+    assert run("calibrate", "-", stdin=points.read_bytes()).stdout == run("calibrate", points).stdout
 
 
 def test_several_files_are_calibrated_as_one(tmp_path: Path) -> None:

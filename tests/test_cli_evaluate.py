@@ -11,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner, Result
+from click.testing import Result
+from command_line import run
 from made_calibration import made_calibration, made_points, pose_of
 
 from neurocal_cli import Correspondences, evaluate_camera, read_calibration, write_calibration, write_points
-from neurocal_cli.commands import neurocal
 
 
-def run(*words: object, **kwargs: object) -> Result:
-    return CliRunner().invoke(neurocal, ["evaluate", "camera", *map(str, words)], **kwargs)  # type: ignore[arg-type]
+def evaluate(*words: object, stdin: bytes | None = None) -> Result:
+    return run("evaluate", "camera", *words, stdin=stdin)
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def camera(tmp_path: Path) -> Path:
 
 
 def test_json_holds_what_the_library_gives(camera: Path) -> None:
-    result = run(camera, "--json")
+    result = evaluate(camera, "--json")
     assert (result.exit_code, result.stderr) == (0, "")
     values = json.loads(result.stdout)
     expected = evaluate_camera(read_calibration(camera))
@@ -41,7 +41,7 @@ def test_json_holds_what_the_library_gives(camera: Path) -> None:
 
 
 def test_the_table_is_plain_text_when_piped(camera: Path) -> None:
-    result = run(camera)
+    result = evaluate(camera)
     assert result.exit_code == 0
     assert result.stdout.isascii()
     assert "\x1b" not in result.stdout
@@ -53,32 +53,32 @@ def test_the_table_is_plain_text_when_piped(camera: Path) -> None:
 
 
 def test_the_calibration_is_read_from_stdin(camera: Path) -> None:
-    assert run("-", input=camera.read_bytes()).stdout == run(camera).stdout
+    assert evaluate("-", stdin=camera.read_bytes()).stdout == evaluate(camera).stdout
 
 
 def test_other_points_of_known_views_use_the_calibrated_poses(camera: Path, tmp_path: Path) -> None:
     write_points(made_points(2, noise=1.0), tmp_path / "p.csv")
-    values = json.loads(run(camera, tmp_path / "p.csv", "--json").stdout)
+    values = json.loads(evaluate(camera, tmp_path / "p.csv", "--json").stdout)
     assert values["rmse_px"] == pytest.approx(np.sqrt(2), rel=0.1)
     assert values["fitted_views"] == []
 
 
 def test_new_views_are_fitted_marked_and_told(camera: Path, tmp_path: Path) -> None:
     write_points(made_points(2, first=1), tmp_path / "p.csv")
-    result = run(camera, tmp_path / "p.csv")
+    result = evaluate(camera, tmp_path / "p.csv")
     assert result.exit_code == 0, result.stderr
     pose = {
         line.split()[0]: line.split()[-1] for line in result.stdout.splitlines() if line.startswith("view0")
     }
     assert pose == {"view01": "calibrated", "view02": "fitted"}
     assert "note: view02: not in the calibration" in result.stderr
-    assert json.loads(run(camera, tmp_path / "p.csv", "--json").stdout)["fitted_views"] == ["view02"]
+    assert json.loads(evaluate(camera, tmp_path / "p.csv", "--json").stdout)["fitted_views"] == ["view02"]
 
 
 def test_points_behind_the_camera_are_warned_of_and_null_in_json(camera: Path, tmp_path: Path) -> None:
     behind = -pose_of(0).R.T @ pose_of(0).t - 50 * pose_of(0).R[2]
     write_points(Correspondences(behind[None], np.zeros((1, 2)), ["view00"]), tmp_path / "p.csv")
-    result = run(camera, tmp_path / "p.csv", "--json")
+    result = evaluate(camera, tmp_path / "p.csv", "--json")
     assert result.exit_code == 0
     assert "warning: 1 of 1 points lie behind the camera" in result.stderr
     assert json.loads(result.stdout)["rmse_px"] is None
@@ -89,7 +89,7 @@ def test_points_behind_the_camera_are_warned_of_and_null_in_json(camera: Path, t
 def test_a_file_that_is_no_calibration_is_said_in_one_line(content: str, tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(content)
-    result = run(path)
+    result = evaluate(path)
     assert result.exit_code == 1
     assert result.stdout == ""
     assert result.stderr.startswith(f"Error: {path}")
@@ -99,7 +99,7 @@ def test_a_file_that_is_no_calibration_is_said_in_one_line(content: str, tmp_pat
 def test_a_file_without_points_says_what_to_do(camera: Path) -> None:
     text = camera.read_text()
     camera.write_text(text[: text.index("  observations:")])
-    result = run(camera)
+    result = evaluate(camera)
     assert result.exit_code == 1
     assert "observations" in result.stderr
     assert "; " in result.stderr
@@ -107,13 +107,13 @@ def test_a_file_without_points_says_what_to_do(camera: Path) -> None:
 
 def test_images_of_another_size_are_refused(camera: Path, tmp_path: Path) -> None:
     write_points(replace(made_points(), image_size=(320, 240)), tmp_path / "p.csv")
-    result = run(camera, tmp_path / "p.csv")
+    result = evaluate(camera, tmp_path / "p.csv")
     assert result.exit_code == 1
     assert "320 x 240" in result.stderr
 
 
 def test_stdin_is_not_read_twice() -> None:
-    result = run("-", "-")
+    result = evaluate("-", "-")
     assert result.exit_code == 2
     assert "only once" in result.stderr
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 import pytest
-from click.testing import CliRunner
+from command_line import run
 
 import neurocal_cli
 from neurocal_cli.commands import neurocal
@@ -40,7 +40,7 @@ COMMANDS = [pytest.param(words, command, id=" ".join(["neurocal", *words])) for 
 
 @pytest.mark.parametrize(("words", "command"), COMMANDS)
 def test_help_ends_with_an_example(words: list[str], command: click.Command) -> None:
-    result = CliRunner().invoke(neurocal, [*words, "--help"])
+    result = run(*words, "--help")
     assert result.exit_code == 0
     assert result.stderr == ""
     assert command.help is not None
@@ -59,7 +59,7 @@ def test_each_option_has_one_sentence_of_help(words: list[str], command: click.C
 
 
 def test_summaries_of_the_group_are_those_of_the_commands() -> None:
-    shown = " ".join(CliRunner().invoke(neurocal, ["--help"]).stdout.split())
+    shown = " ".join(run("--help").stdout.split())
     for words, command in commands():
         if len(words) == 1:
             summary = (command.help or "").partition("\n")[0]
@@ -67,12 +67,12 @@ def test_summaries_of_the_group_are_those_of_the_commands() -> None:
 
 
 def test_the_version_is_shown_on_stdout() -> None:
-    result = CliRunner().invoke(neurocal, ["--version"], prog_name="neurocal")
+    result = run("--version")
     assert result.stdout == f"neurocal {neurocal_cli.__version__}\n"
 
 
 def test_a_mistyped_command_is_a_usage_error_with_a_suggestion() -> None:
-    result = CliRunner().invoke(neurocal, ["calibrat"])
+    result = run("calibrat")
     assert result.exit_code == 2
     assert "calibrat" in result.stderr
     assert result.stdout == ""
@@ -117,7 +117,7 @@ def test_there_is_a_man_page_for_each_command() -> None:
 
 
 def test_the_man_command_writes_the_pages(tmp_path: Path) -> None:
-    result = CliRunner().invoke(neurocal, ["man", str(tmp_path / "pages")])
+    result = run("man", tmp_path / "pages")
     assert result.exit_code == 0, result.stderr
     assert {path.name for path in (tmp_path / "pages").iterdir()} == set(man_pages(neurocal))
 

@@ -8,7 +8,8 @@ but click at their top, so that ``--help`` needs no numpy.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any
 
@@ -58,25 +59,39 @@ class _LazyGroup(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, text in self._summaries.items() if text])
 
+    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
+        """Parse; ``--help`` is shown here."""
+        with _one_line_errors():
+            return super().make_context(*args, **kwargs)
+
     def invoke(self, ctx: click.Context) -> Any:
-        try:
+        """Run the command."""
+        with _one_line_errors():
             return super().invoke(ctx)
-        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
-            raise  # click's own, and a reader that has seen enough
-        except KeyboardInterrupt:
-            message, exit_code = "interrupted", 130
-        except NeurocalError as error:
-            message, exit_code = str(error), error.exit_code
-        except Exception as error:
-            if os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0"):
-                raise
-            message, exit_code = _explain(error), 1
-        say(f"Error: {one_line(message)}")
-        raise click.exceptions.Exit(exit_code)
 
     def _load(self, name: str) -> None:
         if name not in self.commands:
             self.add_command(getattr(import_module(f"{__name__}.{name}"), name), name)
+
+
+@contextmanager
+def _one_line_errors() -> Iterator[None]:
+    """Turn errors into a line on stderr and an exit code; click does so with its own."""
+    try:
+        yield
+        return
+    except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
+        raise  # click's own, and a reader that has seen enough
+    except KeyboardInterrupt:
+        message, exit_code = "interrupted", 130
+    except NeurocalError as error:
+        message, exit_code = str(error), error.exit_code
+    except Exception as error:
+        if os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0"):
+            raise
+        message, exit_code = _explain(error), 1
+    say(f"Error: {one_line(message)}")
+    raise click.exceptions.Exit(exit_code)
 
 
 def _explain(error: Exception) -> str:
