@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import Pose
+from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -84,14 +84,17 @@ class CameraEvaluation:
         return tuple(name for name, view in self.views.items() if view.fitted)
 
 
-def evaluate_camera(calibration: Calibration, points: Correspondences | None = None) -> CameraEvaluation:
+def evaluate_camera(
+    calibration: Calibration | Intrinsics, points: Correspondences | None = None
+) -> CameraEvaluation:
     """Reprojection error of a calibrated camera.
 
     Parameters
     ----------
-    calibration : Calibration
+    calibration : Calibration or Intrinsics
+        With intrinsic parameters alone, the pose of every view is fitted.
     points : Correspondences, optional
-        Default: the points it was calibrated from.
+        Default: the points that the camera was calibrated from.
 
     Returns
     -------
@@ -100,57 +103,61 @@ def evaluate_camera(calibration: Calibration, points: Correspondences | None = N
     Raises
     ------
     InputError
-        Points of another image size; a distorted camera.
+        Points of another image size, or none; a distorted camera.
     DegenerateGeometryError
         A new view whose points do not determine its pose.
     """
-    points = calibration.points if points is None else points
-    _check_comparable(calibration, points)
-    fitted = np.array([name not in calibration.views for name in points.view_names])
-    poses = {name: view.pose for name, view in calibration.views.items()}
     warnings: list[str] = []
+    if isinstance(calibration, Intrinsics):
+        intrinsics, poses, seed = calibration, {}, 0
+        if points is None:
+            raise InputError("intrinsic parameters hold no points; give the points to judge them by")
+    else:
+        points = calibration.points if points is None else points
+        warnings += _compare(calibration, points)
+        intrinsics, seed = calibration.intrinsics, calibration.seed
+        poses = {name: view.pose for name, view in calibration.views.items()}
+    fitted = np.array([name not in poses for name in points.view_names])
     if fitted.any():
-        new_poses, problems = _fit_poses(calibration, points.select(fitted[points.view_index]))
+        new_poses, problems = _fit_poses(intrinsics, points.select(fitted[points.view_index]), seed)
         poses.update(new_poses)
         warnings += problems
-    if not fitted.all() and points.unit != calibration.unit:
-        warnings.append(
-            f"the points are in {points.unit}, the poses of the calibration in {calibration.unit}; "
-            "the error means nothing unless the two are the same"
-        )
-    predicted, in_front = _predict(calibration.K, [poses[name] for name in points.view_names], points)
+    predicted, in_front = _predict(intrinsics.A, [poses[name] for name in points.view_names], points)
     residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
     if not in_front.all():
-        warnings.append(
-            f"{np.count_nonzero(~in_front)} of {len(points)} points lie behind the camera and are "
-            "in no average"
-        )
+        n_behind = np.count_nonzero(~in_front)
+        warnings.append(f"{n_behind} of {len(points)} points lie behind the camera and are in no average")
     return _measure(residuals, points, fitted, tuple(warnings))
 
 
-def _check_comparable(calibration: Calibration, points: Correspondences) -> None:
+def _compare(calibration: Calibration, points: Correspondences) -> list[str]:
+    """Refuse points that the calibration does not apply to; return what to warn of."""
     if np.any(calibration.distortion != 0):
         raise InputError(
             "the camera has lens distortion, which is not supported yet; undistort the points and "
             "evaluate with the coefficients set to 0"
         )
-    sizes = calibration.image_size, points.image_size
-    if None not in sizes and sizes[0] != sizes[1]:
+    here, there = points.image_size, calibration.image_size
+    if here is not None and there is not None and here != there:
         raise InputError(
-            f"{points.source}: the points' image_size {_size(sizes[1])} differs from the camera's "
-            f"{_size(sizes[0])}; evaluate on images of the camera's size"
+            f"{points.source}: the points' image_size {here[0]} x {here[1]} differs from the camera's "
+            f"{there[0]} x {there[1]}; evaluate on images of the camera's size"
         )
+    if points.unit == calibration.unit or calibration.views.keys().isdisjoint(points.view_names):
+        return []
+    return [
+        f"the points are in {points.unit}, the poses of the calibration in {calibration.unit}; "
+        "the error means nothing unless the two are the same"
+    ]
 
 
-def _size(size: tuple[int, int] | None) -> str:
-    return "unknown" if size is None else f"{size[0]} x {size[1]}"
-
-
-def _fit_poses(calibration: Calibration, points: Correspondences) -> tuple[dict[str, Pose], list[str]]:
+def _fit_poses(
+    intrinsics: Intrinsics, points: Correspondences, seed: int
+) -> tuple[dict[str, Pose], list[str]]:
     """Type 3: poses of views that the calibration does not know, and what to warn of."""
     from neurocal_cli.methods import calibrate  # the trainers: only when there is something to train
 
-    fit = calibrate(points, type=3, intrinsics=calibration.intrinsics, seed=calibration.seed)
+    fit = calibrate(points, type=3, intrinsics=intrinsics, seed=seed)
     poses = {name: view.pose for name, view in fit.views.items()}
     warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
     if not fit.converged:

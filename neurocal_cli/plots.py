@@ -198,5 +198,5 @@ def _draw_curve(axes: Axes, calibration: Calibration) -> None:
         linewidth=1.2,
         label=f"pixel error after the last steps, {network.rmse_after:.4g} px",
     )
-    axes.set(xlabel="iteration" if calibration.trainer == "lm" else "epoch", ylabel="rms [px]")
+    axes.set(xlabel="iteration" if calibration.trainer == "lm" else "checkpoint", ylabel="rms [px]")
     axes.legend(loc="upper right", frameon=False)

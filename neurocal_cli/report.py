@@ -195,9 +195,12 @@ def _training_lines(calibration: Calibration) -> list[str]:
 
 
 def _network_lines(network: NetworkRecord) -> list[str]:
+    agreed = f"network: {network.agreed} of {_plural(network.starts, 'random start')} agreed"
+    if len(network.V) > 1:
+        starts = _plural(network.starts, "random start")
+        agreed = f"networks: {starts} for {len(network.V)} views, at least {network.agreed} agreed in each"
     return [
-        f"network: {network.agreed} of {_plural(network.starts, 'random start')} agreed, "
-        f"{_plural(network.iterations, 'iteration')}, loss {_pixels(network.loss)} px",
+        f"{agreed}, {_plural(network.iterations, 'iteration')}, loss {_pixels(network.loss)} px",
         f"pixel error: {_pixels(network.rmse_before)} px after training, {_pixels(network.rmse_after)} px "
         f"after {_plural(network.refine_iterations, 'more step')}",
     ]

@@ -13,6 +13,7 @@ from command_line import run
 from made_calibration import CAMERA, made_calibration, made_points
 
 from neurocal_cli import read_calibration, read_points, write_calibration, write_points
+from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.io.calibration_yaml import format_calibration
 
 
@@ -94,7 +95,8 @@ def test_no_skew_holds_theta_at_a_right_angle(points: Path, tmp_path: Path) -> N
 
 def test_the_name_and_the_image_size_are_written(points: Path, tmp_path: Path) -> None:
     out = tmp_path / "camera.yaml"
-    run("calibrate", points, "--camera-name", "left", "--image-size", 800, 600, "-o", out)
+    result = run("calibrate", points, "--camera-name", "left", "--image-size", 800, 600, "-o", out)
+    assert f"note: --image-size replaces the image_size of {points}" in result.stderr
     found = read_calibration(out)
     assert (found.camera_name, found.image_size) == ("left", (800, 600))
 
@@ -357,3 +359,20 @@ def test_calibrating_loads_nothing_that_it_does_not_use(points: Path) -> None:
     stderr = subprocess.run(command, capture_output=True, text=True, check=True).stderr
     loaded = set(stderr.partition("LOADED")[2].split())
     assert loaded.isdisjoint({"rich", "scipy", "matplotlib", "cv2", "numba", "numpy.testing"})
+
+
+def test_long_work_shows_a_bar_on_a_terminal_only(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("neurocal_cli.commands.progress._PATIENCE", 0.0)
+    with ProgressBar() as bar:
+        bar("training", 0.5)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr("neurocal_cli.commands.progress.is_terminal", lambda stream: True)
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    with ProgressBar() as bar:
+        bar("training", 0.25)
+        bar("polishing [1/2]", 2.0)
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "polishing [1/2]" in shown.err

@@ -134,3 +134,28 @@ def test_a_terminal_gets_a_drawn_table(camera: Path) -> None:
     assert process.returncode == 0
     assert "│" in shown.decode()
     assert b"view01" in shown
+
+
+def test_a_camera_file_of_ros_is_judged_by_points_with_fitted_poses(tmp_path: Path) -> None:
+    ros = tmp_path / "ros.yaml"
+    ros.write_text(
+        "image_width: 640\nimage_height: 480\ncamera_name: c\ncamera_matrix: {rows: 3, cols: 3, "
+        "data: [600, 0, 320, 0, 610, 240, 0, 0, 1]}\ndistortion_model: plumb_bob\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n"
+    )
+    write_points(made_points(2), tmp_path / "p.csv")
+    result = evaluate(ros, tmp_path / "p.csv", "--json")
+    assert result.exit_code == 0, result.stderr
+    values = json.loads(result.stdout)
+    assert values["fitted_views"] == ["view00", "view01"]
+    assert values["rmse_px"] < 0.5
+    assert "note: only the intrinsic parameters are used" in result.stderr
+    assert evaluate(ros).exit_code == 1
+
+
+def test_a_file_that_is_no_camera_is_refused_with_points_too(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text("a: 1\n")
+    write_points(made_points(1), tmp_path / "p.csv")
+    result = evaluate(tmp_path / "c.yaml", tmp_path / "p.csv")
+    assert result.exit_code == 1
+    assert len(result.stderr.splitlines()) == 1

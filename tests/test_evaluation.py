@@ -124,3 +124,12 @@ def test_ten_thousand_views_are_evaluated_at_once() -> None:
     )
     evaluation = evaluate_camera(replace(one, views=views, points=points))
     assert len(evaluation.views) == 10_000
+
+
+def test_intrinsic_parameters_alone_are_judged_with_all_poses_fitted() -> None:
+    points = made_points(2)
+    evaluation = evaluate_camera(CAMERA, points)
+    assert evaluation.fitted_views == points.view_names
+    assert evaluation.rmse_px < evaluate_camera(made_calibration(2)).rmse_px
+    with pytest.raises(NeurocalError, match="give the points"):
+        evaluate_camera(CAMERA)

@@ -112,3 +112,8 @@ def test_json_has_null_for_an_error_that_does_not_exist() -> None:
 def test_names_cannot_break_the_table() -> None:
     calibration = replace(made_calibration(), camera_name="a\nb\x1b[31m")
     assert calibration_report(calibration).splitlines()[0].startswith("a\\nb\\x1b[31m: type 1")
+
+
+def test_starts_of_several_views_are_told_apart() -> None:
+    text = calibration_report(made_calibration(2))
+    assert "networks: 3 random starts for 2 views, at least 2 agreed in each, 33 iterations" in text

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands.options import INPUT, FiniteNumber
-from neurocal_cli.commands.streams import warn
+from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
     from neurocal_cli.training.backprop import BackpropOptions
 
-__all__ = ["Estimation", "estimation_options"]
+__all__ = ["Estimation", "estimation_options", "given_intrinsics"]
 
 _BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
 
@@ -83,6 +83,8 @@ class Estimation:
             Type 2 without any image centre.
         """
         if self.image_size is not None:
+            if points.image_size not in (None, self.image_size):
+                note([f"--image-size replaces the image_size of {points.source}"])
             points = replace(points, image_size=self.image_size)
         arguments: dict[str, Any] = {
             "type": int(self.type),
@@ -98,7 +100,7 @@ class Estimation:
         if self.type == "2":
             arguments["image_center"] = self._center(points)
         elif self.intrinsics is not None:
-            points, arguments["intrinsics"] = _given_intrinsics(self.intrinsics, points)
+            points, arguments["intrinsics"] = given_intrinsics(self.intrinsics, points)
         elif self.extrinsics is not None:
             from neurocal_cli.io.camera_files import read_extrinsics
 
@@ -136,8 +138,14 @@ class Estimation:
         return center
 
 
-def _given_intrinsics(path: str, points: Correspondences) -> tuple[Correspondences, Intrinsics]:
-    """Read the known camera of type 3; give the points its image size if they have none."""
+def given_intrinsics(path: str, points: Correspondences) -> tuple[Correspondences, Intrinsics]:
+    """Read a known camera; give the points its image size if they have none.
+
+    Raises
+    ------
+    InputError
+        A camera with distortion, or of another image size.
+    """
     from neurocal_cli.io.camera_files import read_intrinsics
 
     camera = read_intrinsics(path)

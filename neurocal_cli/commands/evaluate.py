@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands.estimation import given_intrinsics
 from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
 from neurocal_cli.commands.streams import check_one_stdin, is_terminal, note, warn
+from neurocal_cli.errors import FormatError
 
 if TYPE_CHECKING:
     from neurocal_cli.evaluation import CameraEvaluation
@@ -36,7 +38,8 @@ def evaluate() -> None:
     metavar="CAMERA.yaml",
     type=INPUT,
     cls=Argument,
-    description="A calibration written by neurocal; - is standard input.",
+    description="A calibration written by neurocal; with POINTS.csv also a ROS or OpenCV camera; - is "
+    "standard input.",
 )
 @click.argument(
     "points",
@@ -67,10 +70,7 @@ def camera(calibration: str, points: str | None, as_json: bool) -> None:
       cat points.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
     check_one_stdin(calibration, points)
-    from neurocal_cli.evaluation import evaluate_camera
-    from neurocal_cli.io.calibration_yaml import read_calibration
-
-    evaluation = evaluate_camera(read_calibration(calibration), _read_points(points))
+    evaluation = _evaluate(calibration, _read_points(points))
     _tell(evaluation)
     _show(evaluation, as_json)
 
@@ -84,6 +84,24 @@ def _read_points(name: str | None) -> Correspondences | None:
     points = read_points([name], notes=notes)
     note(notes)
     return points
+
+
+def _evaluate(name: str, points: Correspondences | None) -> CameraEvaluation:
+    """Evaluate a calibration or, given points, any camera file: then all poses are fitted."""
+    from neurocal_cli.evaluation import evaluate_camera
+    from neurocal_cli.io.calibration_yaml import read_calibration
+
+    try:
+        return evaluate_camera(read_calibration(name), points)
+    except FormatError as error:
+        if points is None or name == "-":
+            raise
+        try:
+            points, intrinsics = given_intrinsics(name, points)
+        except FormatError:
+            raise error from None  # no camera file of any kind: tell why it is no calibration
+        note([f"only the intrinsic parameters are used: {error}"])
+    return evaluate_camera(intrinsics, points)
 
 
 def _tell(evaluation: CameraEvaluation) -> None:
