@@ -15,7 +15,13 @@ from neurocal_cli.io.distortion_names import own_length
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.points import Correspondences
 
-__all__ = ["calibration_from_field", "intrinsics_from_field", "poses_from_field"]
+__all__ = [
+    "calibration_from_field",
+    "distortion_from_field",
+    "intrinsics_from_field",
+    "neurocal_block",
+    "poses_from_field",
+]
 
 _NUMBER_COLUMNS = ("X", "Y", "Z", "u", "v")
 _COVARIANCE_COLUMNS = ("suu", "suv", "svv")
@@ -48,7 +54,7 @@ def calibration_from_field(root: Field) -> Calibration:
             root.source,
         )
     names, covariance = _covariance(block)
-    model, coefficients = _distortion(root, block)
+    model, coefficients = distortion_from_field(root)
     intrinsics, std, fixed = intrinsics_from_field(root)
     return Calibration(
         intrinsics=intrinsics,
@@ -180,7 +186,9 @@ def _covariance(block: Field) -> tuple[tuple[str, ...], Array]:
     return names, field["data"].array(len(names), len(names), unknown=True)
 
 
-def _distortion(root: Field, block: Field) -> tuple[str, Array]:
+def distortion_from_field(root: Field) -> tuple[str, Array]:
+    """Read the distortion model of a neurocal file, by our name, and its coefficients."""
+    block = neurocal_block(root)
     model = block["distortion"].text() if "distortion" in block else "none"
     try:
         length = own_length(model)
@@ -239,7 +247,7 @@ def _points(root: Field, block: Field, views: set[str]) -> Correspondences:
             source=root.source,
         )
     except InputError as error:
-        raise FormatError(f"{observations.path}: {error}") from error
+        raise FormatError(str(error)) from error
 
 
 def _columns(observations: Field) -> dict[str, list[Any]]:

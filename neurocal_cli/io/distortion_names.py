@@ -79,5 +79,5 @@ def own_length(model: str) -> int:
 
 def _entry(model: str) -> tuple[str, int, int]:
     if model not in _MODELS:
-        raise InputError(f"the distortion model {model[:40]!r} is not known; use one of {', '.join(_MODELS)}")
+        raise InputError(f"distortion model {model[:40]!r} is unknown; use one of {', '.join(_MODELS)}")
     return _MODELS[model]

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
 
-__all__ = ["decode", "read_bytes", "read_text", "write_whole"]
+__all__ = ["decode", "one_line", "read_bytes", "read_text", "write_whole"]
 
 # Opening these anew would truncate what the shell appends to, so they are written as stdout is.
 _STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
@@ -48,7 +48,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
     """
     if str(path) == "-":
         return _read_stdin(), "<stdin>"
-    source = _shown(path)
+    source = one_line(path)
     try:
         with open(path, "rb") as file:
             return file.read(), source
@@ -125,7 +125,7 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
     if str(path) in _STDOUT_NAMES:
         _write_stdout(data)
         return
-    shown = _shown(path)
+    shown = one_line(path)
     try:
         former = _status(path)
         if former is not None and not stat.S_ISREG(former.st_mode):
@@ -220,8 +220,8 @@ def _reason(error: BaseException) -> str:
     return (getattr(error, "strerror", None) or str(error)).lower()
 
 
-def _shown(path: str | Path) -> str:
-    """Put the path on one printable line."""
+def one_line(path: str | Path) -> str:
+    """Put a path, or any text, on one printable line."""
     text = str(path)
     return text if text.isprintable() else repr(text)[1:-1]
 

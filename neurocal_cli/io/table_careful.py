@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator
 
 import numpy as np
 
 from neurocal_cli.errors import FormatError
-from neurocal_cli.io.table_layout import Columns, Layout, Schema, is_number, split_fields
+from neurocal_cli.io.files import one_line
+from neurocal_cli.io.table_layout import Columns, Layout, Schema, is_decimal_comma, is_number, split_fields
 
 __all__ = ["read_carefully"]
-
-_DECIMAL_COMMA = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch
 
 
 def read_carefully(data: bytes, layout: Layout, schema: Schema, source: str) -> Columns:
@@ -68,7 +66,7 @@ def _rows(data: bytes, layout: Layout, source: str) -> Iterator[tuple[int, list[
             raise FormatError('a quote (") is not closed; close it', source, number)
         if len(fields) != expected:
             raise FormatError(
-                f"expected {expected} values ({','.join(layout.names)[:80]}), found {len(fields)}; "
+                f"expected {expected} values ({one_line(','.join(layout.names)[:80])}), found {len(fields)}; "
                 "complete or remove the row",
                 source,
                 number,
@@ -93,7 +91,7 @@ def _number(text: str, name: str, source: str, line: int) -> float:
 def _complaint(text: str, name: str) -> str:
     if not text:
         return f"{name} is empty; fill it in or remove the row"
-    if _DECIMAL_COMMA(text):
+    if is_decimal_comma(text):
         return f"{name} is {text[:40]!r}, with a decimal comma; write {text[:40].replace(',', '.')}"
     if is_number(text) or text.lower().lstrip("+-") in ("nan", "inf", "infinity"):
         return f"{name} is {text[:40]}, but must be a finite number; correct or remove the row"

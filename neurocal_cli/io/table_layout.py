@@ -13,11 +13,24 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.files import one_line
 
-__all__ = ["Columns", "Layout", "Metadata", "Schema", "find_layout", "is_number", "split_fields"]
+__all__ = [
+    "Columns",
+    "Layout",
+    "Metadata",
+    "Schema",
+    "find_layout",
+    "is_decimal_comma",
+    "is_number",
+    "split_fields",
+]
 
 # What a number looks like in our files; Python's float() would also take 1_0 and other alphabets.
 is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
+
+# 1,5 for 1.5, as spreadsheets of half of Europe write it.
+is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch
 
 _METADATA = re.compile(r"#\s*(image_size|image_center|unit)\s*:(.*)", re.DOTALL)
 _QUOTED = re.compile(r'"(?:[^"]|"")*"')
@@ -145,6 +158,10 @@ def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
             if all(is_number(text) for text in fields):
                 names = _headerless_names(fields, comments, source, number, schema)
                 return Layout(separator, names, start, number - 1, metadata)
+            for text in fields:
+                if is_decimal_comma(text):
+                    problem = f"{text[:40]!r} has a decimal comma; write {text[:40].replace(',', '.')}"
+                    raise FormatError(problem, source, number)
             _check_names(fields, source, number, schema)
             return Layout(separator, tuple(fields), end, number, metadata)
     raise FormatError(
@@ -227,7 +244,9 @@ def _headerless_names(
 def _check_names(names: list[str], source: str, number: int, schema: Schema) -> None:
     for name in names:
         if name and names.count(name) > 1:
-            raise FormatError(f"the column {name[:40]} appears twice; rename or remove one", source, number)
+            raise FormatError(
+                f"the column {one_line(name[:40])} appears twice; rename or remove one", source, number
+            )
     missing = [name for name in schema.required if name not in names]
     if not missing:
         return

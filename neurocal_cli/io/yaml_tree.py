@@ -23,13 +23,14 @@ import yaml
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.files import read_text
 
-__all__ = ["parse_yaml", "read_yaml"]
+__all__ = ["parse_yaml", "plain_value", "read_yaml"]
 
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DEEPEST = 40
 
 _INTEGER = re.compile(r"[-+]?(?:0|[1-9][0-9]{0,4000})").fullmatch
-_FLOAT = re.compile(r"[-+]?(?:[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?").fullmatch
+# PyYAML's notion, so that the names which it leaves without quotes (1e5, 1.5e5, -.5) stay names.
+_FLOAT = re.compile(r"(?:[-+]?[0-9]+\.[0-9]*|\.[0-9]+)(?:[eE][-+][0-9]+)?").fullmatch
 _WORDS: dict[str, Any] = {
     "": None,
     "~": None,
@@ -43,8 +44,9 @@ _WORDS: dict[str, Any] = {
 
 # The table as `calibration_text` writes it, at any depth of indentation.
 _ROWS = re.compile(
-    r"^( *)observations:\n\1  columns: \[[^\n]*\]\n\1  rows:\n((?:\1  - \[[^\n]*\]\n)+)", re.MULTILINE
+    r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n((?:\1  - \[[^\n]*\]\n)+)", re.MULTILINE
 )
+_LABELS = frozenset(("view", "point"))
 _PLACEHOLDER = "\0rows"  # no file can hold it plainly: NUL is refused on reading
 
 
@@ -69,8 +71,7 @@ def parse_yaml(text: str, source: str) -> Any:
         Text that is not YAML, aliases, a key twice, more than one document.
     """
     text = text.replace("\r\n", "\n")
-    # OpenCV writes %YAML:1.0, which no YAML parser takes.
-    text = re.sub(r"\A%YAML:[^\n]*", "", text)
+    text = re.sub(r"\A%YAML[: ][^\n]*", "", text)  # OpenCV writes %YAML:1.0, which no YAML parser takes
     text, tables = _cut_rows(text)
     try:
         return _assemble(text, tables, source)
@@ -85,15 +86,20 @@ def _cut_rows(text: str) -> tuple[str, list[Any]]:
     tables: list[Any] = []
 
     def cut(match: re.Match[str]) -> str:
-        rows, separator = match[2], f"\n{match[1]}  - "
+        rows, separator = match[3], f"\n{match[1]}  - "
         try:
             table = json.loads(
                 "[" + rows[len(separator) - 1 : -1].replace(separator, ",\n") + "]", parse_constant=_refuse
             )
         except (ValueError, RecursionError):
             return match[0]
+        labels = [k for k, name in enumerate(match[2].split(", ")) if name in _LABELS]
+        if len(table) != rows.count("\n") or not all(type(row) is list for row in table):
+            return match[0]  # brackets that do not pair up line by line
+        if not all(len(row) > k and type(row[k]) is str for k in labels for row in table):
+            return match[0]  # a name such as 1e5 without quotes is a number to JSON alone
         tables.append(table)
-        head = match[0][: match.start(2) - match.start() - 1]
+        head = match[0][: match.start(3) - match.start() - 1]
         return f'{head} "\\0rows{len(tables) - 1}"' + "\n" * (len(table) + 1)
 
     return _ROWS.sub(cut, text), tables
@@ -117,7 +123,7 @@ def _assemble(text: str, tables: list[Any], source: str) -> Any:
                 keys[-1] = _new_key(value, containers[-1], event, source)
                 continue
             if not event.style:
-                value = _resolve(value, event.tag)
+                value = value if str(event.tag).endswith(":str") else plain_value(value)
             elif value.startswith(_PLACEHOLDER):
                 value = _table(value, tables, event, source)
         elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
@@ -146,10 +152,8 @@ def _assemble(text: str, tables: list[Any], source: str) -> Any:
     return root[0] if root else None
 
 
-def _resolve(text: str, tag: str | None) -> Any:
+def plain_value(text: str) -> Any:
     """Find the value of a plain scalar: as PyYAML reads it, without its dates and odd number bases."""
-    if tag is not None and tag.endswith(":str"):
-        return text
     if text[:1] in "+-.0123456789":  # also true of no text at all
         if _FLOAT(text):
             return float(text)
