@@ -1,0 +1,87 @@
+"""Trees from YAML, JSON or XML text: the three faces of OpenCV's FileStorage."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, NoReturn
+from xml.etree import ElementTree
+
+from neurocal_cli.errors import FormatError
+from neurocal_cli.io.files import read_text
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_tree import parse_yaml, plain_value
+
+__all__ = ["read_tree"]
+
+_DEEPEST = 40
+
+
+def read_tree(path: str | Path) -> Field:
+    """Read a YAML, JSON or XML file; its content tells which.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read or has a syntax error.
+    """
+    text, source = read_text(path, "a camera file")
+    start = text.lstrip()[:1]
+    if start == "<":
+        return Field(_parse_xml(text, source), source)
+    if start == "{":
+        return Field(_parse_json(text, source), source)
+    return Field(parse_yaml(text, source), source)
+
+
+def _parse_json(text: str, source: str) -> Any:
+    try:
+        return json.loads(text, object_pairs_hook=_distinct, parse_constant=_refuse)
+    except json.JSONDecodeError:
+        return parse_yaml(text, source)  # a flow mapping may be YAML; its parser names the line
+    except (ValueError, RecursionError) as error:
+        problem = "it is nested too deeply" if isinstance(error, RecursionError) else str(error)
+        raise FormatError(f"is not valid JSON ({problem}); correct it", source) from error
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    tree = dict(pairs)
+    if len(tree) < len(pairs):
+        raise ValueError("a key appears twice")
+    return tree
+
+
+def _refuse(constant: str) -> NoReturn:
+    raise ValueError(f"{constant} is no number")
+
+
+def _parse_xml(text: str, source: str) -> Any:
+    if "<!" in text.replace("<!--", ""):  # entities can ask for gigabytes; cameras need none
+        raise FormatError("has a DOCTYPE, ENTITY or CDATA section, which is not read; remove it", source)
+    try:
+        root = ElementTree.fromstring(text.encode("utf-8"))
+    except ElementTree.ParseError as error:
+        raise FormatError(f"is not valid XML ({error.msg}); correct it", source, error.position[0]) from error
+    except (ValueError, LookupError) as error:  # an encoding that is unknown or another than UTF-8
+        raise FormatError("is not XML in UTF-8; save it as UTF-8", source) from error
+    if root.tag != "opencv_storage":
+        raise FormatError(
+            f"is <{root.tag[:40]}> and not OpenCV's <opencv_storage>; give another file", source
+        )
+    return _element_value(root, source, _DEEPEST)
+
+
+def _element_value(element: ElementTree.Element, source: str, depth: int) -> Any:
+    if depth == 0:
+        raise FormatError("is nested too deeply to be a camera file; give another", source)
+    if len(element) == 0:
+        words = (element.text or "").split()
+        if element.tag == "data" or len(words) > 1:
+            return [plain_value(word) for word in words]
+        return plain_value(words[0]) if words else None
+    tree: dict[str, Any] = {}
+    for child in element:
+        if child.tag != "_" and child.tag in tree:
+            raise FormatError(f"the element <{child.tag[:40]}> appears twice; remove one", source)
+        tree[child.tag] = _element_value(child, source, depth - 1)
+    return tree
