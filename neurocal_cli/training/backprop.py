@@ -62,8 +62,8 @@ class BackpropOptions:
     halvings : int
         How often a network that diverges starts again, at half its rates.
     method : {"auto", "patterns", "blocks"}
-        Pattern by pattern, as the paper has it, or in small blocks; "auto" takes blocks only where
-        numba is missing.
+        Pattern by pattern, as the paper has it, or in small blocks, at rates bounded so that they stay
+        stable; "auto" takes blocks only where numba is missing.
     """
 
     epochs: int = 50_000
@@ -93,7 +93,7 @@ class BackpropTrained(Trained):
     restarts : (G,) int array
         How often each network diverged and started again.
     rate_weights : (G,) array
-        Rate of W and V at which each network ended.
+        Rate of W and V that each network had last.
     """
 
     restarts: NDArray[np.int64] = field(kw_only=True)
@@ -139,19 +139,20 @@ def train_backprop(
 
 
 _Present = Callable[..., None]
+_Bound = Callable[..., Array]
 _Entry = TypeVar("_Entry", bound=np.generic)
 
 
-def _presenter(method: str) -> _Present:
-    """Choose what presents the patterns; numba is imported here and nowhere else."""
+def _presenter(method: str) -> tuple[_Present, _Bound | None]:
+    """Choose what presents the patterns and bounds the rates; numba is imported here and nowhere else."""
     if method != "blocks":
         from neurocal_cli.training import rule
 
         if rule.COMPILING or method == "patterns":
-            return rule.present
+            return rule.present, None
     from neurocal_cli.training import blocks
 
-    return blocks.present
+    return blocks.present, blocks.stable_rate
 
 
 class _Run:
@@ -166,13 +167,14 @@ class _Run:
         if options.resting_gamma:
             self.gamma = optimal_gamma(output(self.W, self.V, self.Z), self.d)
         self.start = self.W.copy(), self.V.copy(), self.gamma.copy()
-        self.present = _presenter(options.method)
+        self.present, self.bound = _presenter(options.method)
         self.epoch = 0
         self.active = np.ones(networks, dtype=bool)
         self.settled = np.zeros(networks, dtype=bool)
         self.iterations = np.zeros(networks, dtype=np.int64)
         self.restarts = np.zeros(networks, dtype=np.int64)
         self.scale = np.ones(networks)
+        self.rate = np.full(networks, options.rate_weights)
         # When the present rates began, and the loss to which those before them had led.
         self.since = np.zeros(networks, dtype=np.int64)
         self.before = np.full(networks, np.inf)
@@ -214,7 +216,7 @@ class _Run:
             self.present(
                 self.Z, self.d, self.w, self.W, self.V, self.gamma,
                 np.ascontiguousarray(self.task.free_W), _four_inputs(self.task.free_V),
-                self.scale * options.rate_weights, self.scale * options.rate_gamma,
+                self._rates(), self.scale * options.rate_gamma,
                 options.beta, options.a, epochs, self.used, self.active,
             )  # fmt: skip
         self.epoch += epochs
@@ -223,6 +225,14 @@ class _Run:
         self._restart(self.active & ~(loss <= self.limit), loss)
         self.curve.append(loss)
         self._judge(loss)
+
+    def _rates(self) -> Array:
+        """Rate of W and V in each network; halving the scale halves it, bounded or not."""
+        rate = np.full(len(self.W), self.options.rate_weights)
+        if self.bound is not None:
+            rate = np.fmin(rate, self.bound(self.Z, self.w, self.W, self.V, self.gamma, self.used))
+        self.rate[self.active] = (self.scale * rate)[self.active]
+        return self.rate
 
     def _restart(self, diverged: NDArray[np.bool_], loss: Array) -> None:
         """Send networks that diverged back to their initial weights, at half the rates."""
@@ -264,7 +274,7 @@ class _Run:
             settled=self.settled,
             curve=np.array(self.curve),
             restarts=self.restarts,
-            rate_weights=self.scale * self.options.rate_weights,
+            rate_weights=self.rate,
         )
 
 
