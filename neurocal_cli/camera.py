@@ -146,6 +146,14 @@ class Pose:
             object.__setattr__(self, name, array)
 
     @classmethod
+    def exact(cls, R: Array, t: Array) -> Pose:
+        """Pose from an R that is known to be a rotation; a thousand views need no thousand checks."""
+        pose = object.__new__(cls)
+        object.__setattr__(pose, "R", R)
+        object.__setattr__(pose, "t", t)
+        return pose
+
+    @classmethod
     def from_euler(cls, R_x: float, R_y: float, R_z: float, t: Array) -> Pose:
         """Pose from Euler angles [rad] and a translation."""
         return cls(euler_to_rotation(R_x, R_y, R_z), t)

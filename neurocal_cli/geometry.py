@@ -25,8 +25,9 @@ __all__ = [
     "euler_jacobian",
     "euler_to_rotation",
     "nearest_rotation",
+    "orthonormalised",
     "plane_basis",
-    "rotation_exp",
+    "rotation_step",
     "rotation_to_euler",
     "rq",
     "similarity",
@@ -120,15 +121,21 @@ def cross_matrix(w: Array) -> Array:
     return K
 
 
-def rotation_exp(w: Array) -> Array:
-    """Rotation by the angle |w| about the axis w (Rodrigues); (..., 3) -> (..., 3, 3)."""
-    K = cross_matrix(w)
-    angle2 = (np.asarray(w, dtype=float) ** 2).sum(-1)[..., None, None]
-    angle = np.sqrt(angle2)
-    # sinc stays accurate at angle 0: sin(x)/x and (1 - cos x)/x^2 without a branch.
-    sine = np.sinc(angle / np.pi)
-    versine = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    return np.eye(3) + sine * K + versine * (K @ K)
+def rotation_step(w: Array) -> Array:
+    """Rotation by Cayley's formula, ``(I - K/2)^-1 (I + K/2)`` with K the cross matrix of w.
+
+    Equal to the rotation by |w| about w up to the third order, exactly a rotation for any w, and
+    a good deal cheaper than Rodrigues' formula. (..., 3) -> (..., 3, 3)
+    """
+    half = 0.5 * np.asarray(w, dtype=float)
+    K = cross_matrix(half)
+    factor = 2.0 / (1.0 + (half * half).sum(-1))
+    return np.eye(3) + factor[..., None, None] * (K + K @ K)
+
+
+def orthonormalised(R: Array) -> Array:
+    """Take the rounding off rotations: one step of Newton and Schulz; (..., 3, 3)."""
+    return np.asarray(R @ (1.5 * np.eye(3) - 0.5 * (np.swapaxes(R, -1, -2) @ R)))
 
 
 def nearest_rotation(M: Array) -> Array:

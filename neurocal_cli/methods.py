@@ -126,7 +126,119 @@ def _strategy(
 ) -> Strategy:
     if trainer == "lm":
         # Starts see a few points of each view; the best one goes on to (nearly) all of them.
-        finish = LMOptions(stiffness=(0.0,), tolerance=1e-6, damping=1e-8)
+        begin, finish = LMOptions(tolerance=1e-4), LMOptions(stiffness=(0.0,), tolerance=1e-2, damping=1e-8)
+        return Strategy(
+            lambda task: train_lm(task, begin),
+            Agreement(),
+            (16, 40),
+            lambda task: train_lm(task, finish),
+            1024,
+            starts,
+        )
+    from neurocal_cli.training.backprop import BackpropOptions
+
+__all__ = ["DISTORTIONS", "METHODS", "OUTLIERS", "TRAINERS", "calibrate"]
+
+METHODS = ("neuro",)
+TRAINERS = ("lm", "backprop")
+DISTORTIONS = ("none",)
+OUTLIERS = ("keep",)
+
+# A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
+_POOR = 0.05
+_POOR_THETA = 0.02  # rad
+
+Progress = Callable[[str, float], None]
+
+
+def calibrate(
+    points: Correspondences,
+    type: int = 1,
+    image_center: tuple[float, float] | None = None,
+    intrinsics: Intrinsics | Array | None = None,
+    extrinsics: Mapping[str, Pose] | None = None,
+    method: str = "neuro",
+    trainer: str = "lm",
+    distortion: str = "none",
+    skew: bool = True,
+    outliers: str = "keep",
+    seed: int = 0,
+    *,
+    starts: int = 20,
+    backprop: BackpropOptions | None = None,
+    camera_name: str = "camera",
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrate a camera from known points, from random weights.
+
+    Parameters
+    ----------
+    points : Correspondences
+        One view of a target that is not flat, or several views of any target.
+    type : {1, 2, 3, 4}
+        What is given (paper, section 4.1): 1 nothing, 2 the image centre, 3 the intrinsics,
+        4 the extrinsics.
+    image_center : (u0, v0), optional [px]
+        Type 2; else the one with the points, else the centre of their image size.
+    intrinsics : Intrinsics or (3, 3) array, optional
+        Type 3.
+    extrinsics : dict of Pose by view name, optional
+        Type 4.
+    method : {"neuro"}
+    trainer : {"lm", "backprop"}
+    distortion : {"none"}
+    skew : bool
+        False: theta is pi/2.
+    outliers : {"keep"}
+    seed : int
+        Of the random weights; the same seed gives the same result.
+    starts : int
+        Most random starts for each network, at least 2.
+    backprop : BackpropOptions, optional
+        Rates and epochs of the backprop trainer.
+    camera_name : str
+    progress : callable, optional
+        Called with a stage's name and the share of it that is done.
+
+    Returns
+    -------
+    Calibration
+        `converged` is False when training was cut short; everything else is still there.
+
+    Raises
+    ------
+    UsageError
+        Something missing for the type, or an option that does not exist.
+    InputError, DegenerateGeometryError
+        Points that cannot give an answer, with the reason.
+    """
+    for name, value, known_values in (
+        ("method", method, METHODS),
+        ("trainer", trainer, TRAINERS),
+        ("distortion", distortion, DISTORTIONS),
+        ("outliers", outliers, OUTLIERS),
+    ):
+        if value not in known_values:
+            raise UsageError(f"{name} must be one of {', '.join(known_values)}, not {value!r}")
+    if starts < 2:
+        raise UsageError("starts must be at least 2: one start has nothing to agree with")
+    if intrinsics is not None and not isinstance(intrinsics, Intrinsics):
+        intrinsics = Intrinsics.from_matrix(intrinsics)
+    known = known_for(points, type, image_center, intrinsics, extrinsics, skew)
+    views = arrange(points)
+    check_points(views, known)
+    report = progress or (lambda stage, share: None)
+    strategy = _strategy(trainer, starts, backprop, report)
+    solution = solve(views, known, strategy, np.random.default_rng(seed), report)
+    return _Assembly(points, views, known, solution).calibration(method, trainer, seed, camera_name)
+
+
+def _strategy(
+    trainer: str, starts: int, backprop: BackpropOptions | None, report: Progress
+) -> Strategy:
+    if trainer == "lm":
+        # Starts see a few points of each view; the best one goes on to (nearly) all of them.
+        finish = LMOptions(stiffness=(0.0,), tolerance=1e-2, damping=1e-8)
         return Strategy(train_lm, Agreement(), (16, 40), lambda task: train_lm(task, finish), 1024, starts)
     from neurocal_cli.training.backprop import BackpropOptions, train_backprop
 
@@ -152,12 +264,12 @@ class _Assembly:
         refined = solution.refined
         cov = covariance(refined.normal, known.free, known.free_poses, 2 * len(views.index))
         self._check(cov)
-        A = known.matrix(refined.state.entries, views)
+        A = known.matrix(refined.state.entries[0], views)
         intrinsics = known.intrinsics or Intrinsics.from_matrix(A)
         if known.type != 3 and not known.free[1]:
             intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
         block, std = self._intrinsic_covariance(intrinsics, cov)
-        results, rmse, largest = self._views(intrinsics, cov)
+        results, rmse, largest = self._views(cov)
         free_names = tuple(n for n in INTRINSIC_NAMES if n not in known.fixed)
         keep = [INTRINSIC_NAMES.index(n) for n in free_names]
         reason = StopReason.CONVERGED
@@ -187,7 +299,7 @@ class _Assembly:
         )
 
     def _check(self, cov: Covariance) -> None:
-        entries = self.solution.refined.state.entries
+        entries = self.solution.refined.state.entries[0]
         free = np.flatnonzero(self.known.free)
         relative = np.zeros(2)
         for slot, entry in enumerate((0, 2)):
@@ -208,7 +320,7 @@ class _Assembly:
         }
         return block, std
 
-    def _views(self, intrinsics: Intrinsics, cov: Covariance) -> tuple[dict[str, ViewResult], float, float]:
+    def _views(self, cov: Covariance) -> tuple[dict[str, ViewResult], float, float]:
         """Poses in world units with their std, and the pixel error (3), unweighted."""
         views, known = self.views, self.known
         R, t = self.solution.refined.state.R, self.solution.refined.state.t
@@ -224,28 +336,24 @@ class _Assembly:
         J[:, 3:, :3] = cross_matrix(centre)
         J[:, 3:, 3:] = np.eye(3) * views.scale[:, None, None]
         std = np.sqrt(np.maximum(np.diagonal(J @ cov.poses @ np.swapaxes(J, 1, 2), axis1=1, axis2=2), 0.0))
-        squared = self._squared_errors(intrinsics, R, t_world)
+        squared = self._squared_errors()
         rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
+        R.setflags(write=False)
+        t_world.setflags(write=False)
         results = {
-            name: ViewResult(
-                Pose(R[k], t_world[k]),
-                dict(zip(POSE_NAMES, std[k].tolist(), strict=True)),
-                int(views.counts[k]),
-                float(rms[k]),
-                known.poses is not None,
+            name: ViewResult(Pose.exact(*pose), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, not known.free_poses)
+            for name, pose, sigma, n, r in zip(
+                views.names, zip(R, t_world, strict=True), std.tolist(), views.counts.tolist(), rms.tolist(), strict=True
             )
-            for k, name in enumerate(views.names)
         }
         return results, float(np.sqrt(squared.mean())), float(np.sqrt(squared.max()))
 
-    def _squared_errors(self, intrinsics: Intrinsics, R: Array, t: Array) -> Array:
+    def _squared_errors(self) -> Array:
         """Squared pixel error of each point, sorted by view; (N,)."""
-        tiles = self.views.tiles()
+        tiles = self.views.tiles
         errors = np.empty((len(tiles.view), tiles.local.shape[2]))
-        entries = self.known.normalised_entries(self.views)
-        entries = np.where(self.known.free, self.solution.refined.state.entries, entries)
         state = self.solution.refined.state
-        a, s, b, u0, v0 = entries
+        a, s, b, u0, v0 = state.entries[0]
         for chunk in tiles.chunks():
             view = tiles.view[chunk]
             Xc = state.R[view] @ tiles.local[chunk] + state.t[view][:, :, None]
@@ -261,7 +369,7 @@ class _Assembly:
         views, solution = self.views, self.solution
         state = solution.refined.state
         W = np.eye(3)
-        W[ENTRIES] = state.entries
+        W[ENTRIES] = state.entries[0]
         px = views.pixel_scale
         return NetworkRecord(
             W=W,

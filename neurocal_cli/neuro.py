@@ -34,7 +34,9 @@ from neurocal_cli.views import Views
 __all__ = ["Solution", "Strategy", "solve"]
 
 _MOST_CANDIDATES = 4  # of stage 2 that stage 3 tries
-_FEW_POINT_STARTS = 40
+_FEW_POINT_STARTS = 100
+_MANY_EQUATIONS = 12  # more equations than unknowns by this: a second good minimum is not seen any more
+_SMALL = 1500  # patterns in all up to which the starts may as well see every one
 _FLIP_RANGE = 20.0  # a mirrored pose this many times worse before any step is not a rival
 
 
@@ -144,7 +146,7 @@ class _Run:
     ) -> None:
         self.views, self.known, self.strategy, self.rng = views, known, strategy, rng
         self.progress = progress
-        self.tiles = views.tiles()
+        self.tiles = views.tiles
         # With other views to help or the intrinsics given, a nearly flat target is best begun flat.
         helped = views.n_views > 1 or known.type == 3
         self.flat = views.nearly_flat if helped else views.exactly_flat
@@ -172,10 +174,11 @@ class _Run:
 
     def _train_group(self, members: NDArray[np.intp], flat: bool) -> _Group:
         s, views = self.strategy, self.views
-        patterns = views.patterns(members, flat, s.start_points[0 if flat else 1], self.rng)
-        learnt = learn(patterns, s.trainer, self.rng, s.limit, self._fixed(), s.agreement)
         every = views.patterns(members, flat, s.finish_points)
-        if s.finish is not None:
+        small = every.weights.size <= _SMALL
+        some = every if small else views.patterns(members, flat, s.start_points[0 if flat else 1], self.rng)
+        learnt = learn(some, s.trainer, self.rng, s.limit, self._fixed(), s.agreement)
+        if s.finish is not None and not small:
             free = np.ones((3, 3), dtype=bool), np.ones((3, every.n_inputs), dtype=bool)
             trained = s.finish(Task(every, learnt.W, learnt.V, *free))
             learnt = replace(learnt, W=trained.W, V=trained.V, rms=every.rms(trained.loss))
@@ -214,11 +217,11 @@ class _Run:
         blocks = none | {g.flat: g.product[:, :, : 2 if g.flat else 3] for g in groups}
         given = self.known.normalised_entries(self.views)
         shared = shared_intrinsics(blocks[False], blocks[True], given, self.known.free, self.rng)
-        return shared.entries[:_MOST_CANDIDATES]
+        return shared.entries[:_MOST_CANDIDATES, None]
 
     def impose(self, groups: list[_Group], entries: Array) -> None:
         """Poses of the trained views from their products, given W."""
-        W = _matrix(entries)
+        W = _matrix(entries[0])
         for group in groups:
             R, t = pose_from_product(W, group.product)
             if group.flat:
@@ -263,7 +266,8 @@ class _Run:
                 break
         assert best is not None  # there is always one candidate
         best = self._try_mirrored(best)
-        if self.views.n_views == 1 and not self._reaches_bound(best, groups):
+        spare = 2 * int(self.views.distinct.sum()) - parameter_count(self.known, self.views.n_views)
+        if self.views.n_views == 1 and (spare < _MANY_EQUATIONS or not self._reaches_bound(best, groups)):
             best = self._try_random_cameras(best)
         return self._solution(best)
 
@@ -280,7 +284,7 @@ class _Run:
 
     def poses_only(self, able: NDArray[np.bool_]) -> Solution:
         """Type 3: each view's pose by itself."""
-        entries = self.known.normalised_entries(self.views)
+        entries = self.known.normalised_entries(self.views)[None]
         groups = self.train(able) if able.any() else []
         self.impose(groups, entries)
         self._add_random_poses(np.flatnonzero(~able), entries)
@@ -304,6 +308,10 @@ class _Run:
             self.rng,
             max(self.strategy.limit, _FEW_POINT_STARTS),
         )
+        if found is None:
+            raise DegenerateGeometryError(
+                f"no random start found a camera for these {len(self.views.index)} points; give more points"
+            )
         self._note_random(found)
         self.R[:], self.t[:] = found.state.R, found.state.t
         return self._solution(self._start(found.state.entries))
@@ -353,7 +361,7 @@ class _Run:
             return refined
         sub = self.views.subset(rivals)
         none = np.zeros(5, dtype=bool)
-        posed = self._count(refine(sub.tiles(), CameraState(state.entries, R[rivals], t[rivals]), none))
+        posed = self._count(refine(sub.tiles, CameraState(state.entries, R[rivals], t[rivals]), none))
         better = posed.cost < refined.cost[rivals] * (1 - 1e-9)
         if not better.any():
             return refined
@@ -364,8 +372,10 @@ class _Run:
 
     def _try_random_cameras(self, refined: Refined) -> Refined:
         found = find_camera(
-            self.views, refined.state.entries, self.known.free, self.rng, self.strategy.limit
+            self.views, refined.state.entries[0], self.known.free, self.rng, self.strategy.limit
         )
+        if found is None:
+            return refined
         self.starts += found.starts
         again = self._count(refine(self.tiles, found.state, self.known.free))
         return again if again.cost.sum() < refined.cost.sum() else refined
@@ -438,9 +448,9 @@ def _with_given_poses(
     learnt = learn(
         patterns, strategy.trainer, rng, strategy.limit, FixedWeights(W, np.eye(3)[None]), strategy.agreement
     )
-    tiles = views.tiles()
+    tiles = views.tiles
     entries = (learnt.W[0] / learnt.W[0, 2, 2])[ENTRIES]
-    state = CameraState(np.where(known.free, entries, known.normalised_entries(views)), R, t)
+    state = CameraState(np.where(known.free, entries, known.normalised_entries(views))[None], R, t)
     before = float(normal_blocks(tiles, state)[0][:, -1, -1].sum())
     refined = refine(tiles, state, known.free, free_pose=False)
     return Solution(

@@ -18,7 +18,8 @@ from neurocal_cli.geometry import Array, nearest_rotation
 __all__ = ["SharedIntrinsics", "pose_from_product", "shared_intrinsics"]
 
 _MAX_ITERATIONS = 50
-_TOLERANCE = 1e-10
+_TOLERANCE = 1e-4  # stage 3 goes on from here
+_ENOUGH = 3  # starts that have ended at the same, lowest loss
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,7 @@ def shared_intrinsics(
     given: Array,
     free: NDArray[np.bool_],
     rng: np.random.Generator,
-    starts: int = 16,
+    starts: int = 8,
 ) -> SharedIntrinsics:
     """Learn W from the products of all views.
 
@@ -75,12 +76,12 @@ def shared_intrinsics(
     p, loss = p[order], loss[order]
     entries = p.copy()
     entries[:, [0, 2]] = np.exp(p[:, [0, 2]])
-    tie = 1e-6 * loss[0] + 1e-16
+    tie = 1e-3 * loss[0] + 1e-16
     agreed = int((np.abs(loss - loss[0]) <= tie).sum())
     distinct = [0]
     for n in range(1, starts):
         gap = np.abs(p[n] - p[distinct]).max(axis=1).min()
-        if np.isfinite(loss[n]) and gap > 1e-3:
+        if np.isfinite(loss[n]) and gap > 1e-2:
             distinct.append(n)
     return SharedIntrinsics(entries[distinct], loss[distinct], starts, agreed)
 
@@ -157,7 +158,7 @@ def _descend(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
             scale = np.trace(H, axis1=1, axis2=2) / len(f) + 1e-12
             step = -np.linalg.solve(H + (damping * scale)[:, None, None] * np.eye(len(f)), g[..., None])[..., 0]
             trial = p.copy()
-            trial[:, f] += np.clip(step, -2.0, 2.0)  # two in the logarithm is a factor of 7
+            trial[:, f] += np.minimum(np.maximum(step, -2.0), 2.0)  # two in the logarithm is a factor of 7
             r_new, J_new = conditions(trial)
             new = 0.5 * (r_new * r_new).sum(axis=1)
             better = (new < loss) & ~done
@@ -166,7 +167,7 @@ def _descend(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
                 old[better] = fresh[better]
             damping = np.where(better, np.maximum(damping * 0.1, 1e-12), damping * growth)
             growth = np.where(better, 2.0, growth * 2)
-            if done.all():
+            if done.all() or (np.abs(loss - loss.min()) <= 1e-3 * loss.min() + 1e-16)[done].sum() >= _ENOUGH:
                 break
     return p, np.where(np.isfinite(loss), loss, np.inf)
 

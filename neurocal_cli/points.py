@@ -153,6 +153,8 @@ class Correspondences:
 
     def _check_finite(self) -> None:
         for name, values in (("X,Y,Z", self.world), ("u,v", self.pixels)):
+            if values.min() >= -_LARGEST and values.max() <= _LARGEST:  # False for nan, 20 times faster
+                continue
             good = np.abs(values).max(axis=1) <= _LARGEST  # False for nan as well
             if not good.all():
                 row = int(np.argmin(good))
@@ -189,7 +191,9 @@ def _frozen(array: NDArray[Any]) -> NDArray[Any]:
     return array
 
 
-def _factorise(labels: NDArray[Any] | Sequence[Any] | None, n: int) -> tuple[tuple[str, ...], NDArray[np.int64]]:
+def _factorise(
+    labels: NDArray[Any] | Sequence[Any] | None, n: int
+) -> tuple[tuple[str, ...], NDArray[np.int64]]:
     """Names in order of first appearance and each row's position among them.
 
     Rows of a view mostly stand together, so only the first row of each run is sorted.

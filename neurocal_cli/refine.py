@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.geometry import Array, nearest_rotation, rotation_exp
+from neurocal_cli.geometry import Array, orthonormalised, rotation_step
 from neurocal_cli.tiles import Tiles
 
 __all__ = ["ENTRIES", "CameraState", "Refined", "normal_blocks", "refine"]
@@ -40,8 +40,8 @@ class CameraState:
 
     Attributes
     ----------
-    entries : (5,) array
-        A11, A12, A22, A13, A23.
+    entries : (1, 5) or (V, 5) array
+        A11, A12, A22, A13, A23 of the camera that all views share, or of a camera for each.
     R : (V, 3, 3) array
     t : (V, 3) array
     """
@@ -53,7 +53,7 @@ class CameraState:
     def moved(self, by_entries: Array, by_pose: Array) -> CameraState:
         """The state after a step; by_pose (V, 6) holds omega and tau."""
         return CameraState(
-            self.entries + by_entries, rotation_exp(by_pose[:, :3]) @ self.R, self.t + by_pose[:, 3:]
+            self.entries + by_entries, rotation_step(by_pose[:, :3]) @ self.R, self.t + by_pose[:, 3:]
         )
 
 
@@ -69,14 +69,20 @@ class Refined:
     cost : (V,) array
         Sum of squared (whitened) residuals of each view.
     iterations : int
-    converged : bool
+    each_settled : bool array
+        Whether it converged: of each independent problem, or one for all views together.
     """
 
     state: CameraState
     normal: Array
     cost: Array
     iterations: int
-    converged: bool
+    each_settled: NDArray[np.bool_]
+
+    @property
+    def converged(self) -> bool:
+        """Whether all did."""
+        return bool(self.each_settled.all())
 
 
 def refine(
@@ -84,7 +90,7 @@ def refine(
     start: CameraState,
     free: NDArray[np.bool_],
     free_pose: bool = True,
-    max_iterations: int = 60,
+    max_iterations: int = 200,
 ) -> Refined:
     """Minimise the pixel error (3) from a start that is already near.
 
@@ -94,8 +100,8 @@ def refine(
     start : CameraState
         With all points in front of the camera.
     free : (5,) bool array
-        Which entries of A move. With none free the views are independent problems, solved side by
-        side, each with its own damping.
+        Which entries of A move. With none free, or with a camera for each view, the views are
+        independent problems, solved side by side, each with its own damping.
     free_pose : bool
         Whether the poses move.
     max_iterations : int
@@ -107,9 +113,9 @@ def refine(
             descent.step()
             iterations += 1
     state = descent.state
-    state = CameraState(state.entries, nearest_rotation(state.R), state.t)
+    state = CameraState(state.entries, orthonormalised(state.R), state.t)
     normal = descent.normal
-    return Refined(state, normal, normal[:, _R, _R].copy(), iterations, bool(descent.settled.all()))
+    return Refined(state, normal, normal[:, _R, _R].copy(), iterations, descent.settled)
 
 
 def normal_blocks(tiles: Tiles, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
@@ -132,7 +138,13 @@ def normal_blocks(tiles: Tiles, state: CameraState) -> tuple[Array, NDArray[np.b
             buffer = np.zeros((len(view), _R + 1, 2, n))
         whitening = None if tiles.whitening is None else tiles.whitening[chunk]
         in_front[chunk] = _derivatives(
-            tiles.local[chunk], tiles.pixels[chunk], whitening, state.entries, state.R[view], state.t[view], buffer
+            tiles.local[chunk],
+            tiles.pixels[chunk],
+            whitening,
+            state.entries if len(state.entries) == 1 else state.entries[view],
+            state.R[view],
+            state.t[view],
+            buffer,
         )
         J = buffer.reshape(len(view), _R + 1, 2 * n)
         np.matmul(J, np.swapaxes(J, 1, 2), out=by_tile[chunk])
@@ -149,7 +161,8 @@ def _derivatives(
     Around the centroid, Xc = exp(omega) R M + t + tau: with Y = R M,
     d Xc = omega x Y + tau, and (x, y) = (Xc_1, Xc_2) / Xc_3.
     """
-    a, s, b, u0, v0 = entries
+    # One camera: plain numbers are quicker than columns of one.
+    a, s, b, u0, v0 = entries[0] if len(entries) == 1 else entries.T[..., None]
     Y = R @ local
     q = Y[:, 2] + t[:, 2, None]
     in_front = np.asarray(q.min(axis=1) > 0)
@@ -166,7 +179,7 @@ def _derivatives(
             np.multiply(s, dy, out=u[:, column])
         elif dy is None:
             np.multiply(a, dx, out=u[:, column])
-        elif s == 0.0:
+        elif np.ndim(s) == 0 and s == 0.0:
             np.multiply(a, dx, out=u[:, column])
         else:
             np.add(a * dx, s * dy, out=u[:, column])
@@ -187,96 +200,108 @@ def _derivatives(
 
 
 class _Descent:
-    """Levenberg-Marquardt over one group (all views share A) or a group for each view."""
+    """Levenberg-Marquardt over groups: all views together when they share what is sought, else one each."""
 
-    def __init__(self, tiles: Tiles, start: CameraState, free: NDArray[np.bool_], free_pose: bool) -> None:
+    def __init__(
+        self, tiles: Tiles, start: CameraState, free: NDArray[np.bool_], free_pose: bool
+    ) -> None:
         self.tiles, self.state = tiles, start
-        self.free = np.flatnonzero(free)
-        self.free_pose = free_pose
-        self.groups = 1 if self.free.size else tiles.n_views
-        self.normal, in_front = normal_blocks(tiles, start)
-        self.damping = np.full(self.groups, 1e-4)
-        self.growth = np.full(self.groups, 2.0)
+        self.free, self.free_pose = np.flatnonzero(free), free_pose
+        self.together = len(start.entries) == 1 and bool(self.free.size) and tiles.n_views > 1
+        groups = 1 if self.together else tiles.n_views
+        self.normal, _ = normal_blocks(tiles, start)
+        self.cost = self._by_group(self.normal[:, _R, _R])
+        self.damping = np.full(groups, 1e-4)
+        self.growth = np.full(groups, 2.0)
         self.floor = self._by_group(2.0 * tiles.counts) * _FLOOR**2
         self.settled = self.cost <= self.floor
         self.done = self.settled.copy()
 
-    @property
-    def cost(self) -> Array:
-        """Cost of each group."""
-        return self._by_group(self.normal[:, _R, _R])
-
     def _by_group(self, by_view: Array) -> Array:
-        return by_view.sum(keepdims=True) if self.groups == 1 else by_view
+        return by_view.sum(keepdims=True) if self.together else by_view
 
     def step(self) -> None:
-        """One step of every group that is not done; views of finished groups stay."""
+        """One step of every group that is not done; the others stay."""
         by_entries, by_pose, predicted = self._solve()
-        if self.groups > 1:
-            by_pose[self.done] = 0.0
         trial = self.state.moved(by_entries, by_pose)
         normal, in_front = normal_blocks(self.tiles, trial)
-        sensible = in_front.all(keepdims=True) if self.groups == 1 else in_front
-        if trial.entries[0] <= 0 or trial.entries[2] <= 0:
-            sensible = np.zeros_like(sensible)
-        before, after = self.cost, self._by_group(normal[:, _R, _R])
-        better = sensible & (after < before) & ~self.done
-        self._accept(trial, normal, better)
-        small = predicted < _TOLERANCE * before
+        sensible = in_front.all(keepdims=True) if self.together else in_front
+        sensible = sensible & (trial.entries[:, [0, 2]] > 0).all()
+        after = self._by_group(normal[:, _R, _R])
+        better = sensible & (after < self.cost) & ~self.done
+        small = predicted < _TOLERANCE * self.cost
         stuck = ~better & (self.damping > _LARGEST_DAMPING)
-        bottom = ~better & sensible & (predicted < _FLAT_SHARE * before)
+        bottom = ~better & sensible & (predicted < _FLAT_SHARE * self.cost)
+        ratio = (self.cost - after) / predicted
+        self._accept(trial, normal, after, better)
         settled = (better & small) | bottom | (self.cost <= self.floor)
         self.settled |= settled & ~self.done
         self.done |= settled | stuck
-        ratio = (before - after) / predicted
-        shrink = np.clip(1 - np.clip(2 * ratio - 1, -1, 2) ** 3, 0.01, 2.0)
-        self.damping = np.clip(self.damping * np.where(better, shrink, self.growth), 1e-14, None)
+        gained = np.minimum(2 * ratio - 1, 2.0)
+        shrink = np.maximum(0.01, 1 - gained * gained * gained)
+        self.damping = np.maximum(self.damping * np.where(better, shrink, self.growth), 1e-14)
         self.growth = np.where(better, 2.0, 2 * self.growth)
 
-    def _accept(self, trial: CameraState, normal: Array, better: NDArray[np.bool_]) -> None:
-        if self.groups == 1:
-            if better[0]:
-                self.state, self.normal = trial, normal
-            return
-        keep = better[:, None, None]
-        self.state = CameraState(
-            self.state.entries,
-            np.where(keep, trial.R, self.state.R),
-            np.where(better[:, None], trial.t, self.state.t),
-        )
-        self.normal = np.where(keep, normal, self.normal)
+    def _accept(
+        self, trial: CameraState, normal: Array, cost: Array, better: NDArray[np.bool_]
+    ) -> None:
+        if better.all():
+            self.state, self.normal, self.cost = trial, normal, cost
+        elif better.any():
+            keep, old = better[:, None, None], self.state
+            entries = old.entries
+            if len(entries) > 1:
+                entries = np.where(better[:, None], trial.entries, entries)
+            R = np.where(keep, trial.R, old.R)
+            self.state = CameraState(entries, R, np.where(better[:, None], trial.t, old.t))
+            self.normal = np.where(keep, normal, self.normal)
+            self.cost = np.where(better, cost, self.cost)
 
     def _solve(self) -> tuple[Array, Array, Array]:
-        """Step by entries (5,) and by pose (V, 6), and the decrease it should bring, by group."""
-        N, f = self.normal, self.free
-        damping = self.damping if self.groups > 1 else np.repeat(self.damping, len(N))
-        by_entries, by_pose = np.zeros(_N), np.zeros((len(N), 6))
-        g_pose = N[:, _POSE, _R]
-        U = N[:, f[:, None], f].sum(axis=0)
-        g = N[:, f, _R].sum(axis=0)
-        U_diagonal = np.diagonal(U) + 1e-300
+        """Steps of the entries (1 or V, 5) and poses (V, 6), and the decrease by group they should bring."""
+        if not self.together:
+            return self._solve_apart(self.normal)
         if not self.free_pose:
-            lam = float(self.damping[0])
-            by_entries[f] = _solve_scaled(U + lam * np.diag(U_diagonal), g[:, None])[:, 0]
-            gain = by_entries[f] @ g + lam * (U_diagonal * by_entries[f] ** 2).sum()
-            return by_entries, by_pose, np.array([gain])
+            by_entries, _, predicted = self._solve_apart(self.normal.sum(axis=0, keepdims=True))
+            return by_entries, np.zeros((self.tiles.n_views, 6)), predicted
+        return self._solve_together()
+
+    def _solve_apart(self, N: Array) -> tuple[Array, Array, Array]:
+        """Each group has its own unknowns."""
+        pose = np.arange(_N, _R) if self.free_pose else np.arange(0)
+        columns = np.concatenate([self.free, pose])
+        H, g = N[:, columns[:, None], columns], N[:, columns, _R]
+        ridge = self.damping[:, None] * (np.diagonal(H, axis1=1, axis2=2) + 1e-300)
+        H[:, range(len(columns)), range(len(columns))] += ridge
+        step = _solve_scaled(H, g[..., None])[..., 0]
+        predicted = (step * (g + ridge * step)).sum(axis=1)
+        step[self.done] = 0.0
+        whole = np.zeros((len(N), _R))
+        whole[:, columns] = step
+        return whole[:, :_N] if self.free.size else np.zeros((1, _N)), whole[:, _N:], predicted
+
+    def _solve_together(self) -> tuple[Array, Array, Array]:
+        """One A, a pose for each view: the poses are eliminated by the Schur complement."""
+        N, f, damping = self.normal, self.free, float(self.damping[0])
+        total = N[:, :_N].sum(axis=0)
+        U, g = total[f[:, None], f], total[f, _R]
+        g_pose = N[:, _POSE, _R]
+        ridge = damping * (np.diagonal(U) + 1e-300)
         B = N[:, _POSE, _POSE].copy()
-        diagonal = np.diagonal(B, axis1=1, axis2=2) + 1e-300
-        B[:, range(6), range(6)] += damping[:, None] * diagonal
-        C = N[:, f[:, None], range(_N, _N + 6)]  # (V, f, 6)
+        ridge_pose = damping * (np.diagonal(B, axis1=1, axis2=2) + 1e-300)
+        B[:, range(6), range(6)] += ridge_pose
+        C = N[:, f, _POSE]  # (V, f, 6)
         solved = _solve_scaled(B, np.concatenate([np.swapaxes(C, 1, 2), g_pose[..., None]], axis=2))
-        if f.size:
-            lam = float(self.damping[0])
-            S = U + lam * np.diag(U_diagonal) - (C @ solved[:, :, :-1]).sum(axis=0)
-            rhs = g - (C @ solved[:, :, -1:])[..., 0].sum(axis=0)
-            by_entries[f] = _solve_scaled(S, rhs[:, None])[:, 0]
-        by_pose = solved[:, :, -1] - solved[:, :, :-1] @ by_entries[f]
-        gain = (by_pose * (g_pose + damping[:, None] * diagonal * by_pose)).sum(axis=1)
-        predicted = self._by_group(gain)
-        if f.size:
-            lam = float(self.damping[0])
-            predicted = predicted + by_entries[f] @ g + lam * (U_diagonal * by_entries[f] ** 2).sum()
-        return by_entries, by_pose, predicted
+        # (f, 6 V) times (6 V, f + 1): one product sums over views and poses.
+        flat_C = np.swapaxes(C, 0, 1).reshape(len(f), -1)
+        eliminated = flat_C @ solved.reshape(-1, len(f) + 1)
+        S = U + np.diag(ridge) - eliminated[:, :-1]
+        step = _solve_scaled(S, (g - eliminated[:, -1])[:, None])[:, 0]
+        by_pose = solved[:, :, -1] - solved[:, :, :-1] @ step
+        gain = (by_pose * (g_pose + ridge_pose * by_pose)).sum() + step @ (g + ridge * step)
+        by_entries = np.zeros((1, _N))
+        by_entries[0, f] = step
+        return by_entries, by_pose, np.array([gain])
 
 
 def _solve_scaled(H: Array, rhs: Array) -> Array:

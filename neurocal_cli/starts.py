@@ -30,7 +30,7 @@ class Agreement:
         The same in normalised pixels: what the trainer cannot resolve.
     """
 
-    relative: float = 1e-6
+    relative: float = 1e-4
     absolute: float = 1e-10
 
 

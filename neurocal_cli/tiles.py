@@ -114,7 +114,10 @@ def tile(
 
 def _tile_size(counts: NDArray[np.intp]) -> int:
     """The tile size that costs least: padding costs points, tiles cost a fixed overhead each."""
+    most = int(counts.max())
+    if most <= _LARGEST_TILE and most == counts.min():
+        return most
     candidates = {min(int(c), _LARGEST_TILE) for c in np.quantile(counts, [0, 0.25, 0.5, 0.75, 1])}
-    candidates |= {-(-int(c) // -(-int(c) // _LARGEST_TILE)) for c in (counts.max(), np.median(counts))}
+    candidates |= {-(-int(c) // -(-int(c) // _LARGEST_TILE)) for c in (most, np.median(counts))}
     overhead = 16
     return min(sorted(candidates), key=lambda n: float((-(-counts // n)).sum() * (n + overhead)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,6 +124,7 @@ class Views:
             extent=self.extent[views],
         )
 
+    @cached_property
     def tiles(self) -> Tiles:
         """All points, laid out for the last step."""
         return tile(self.local, self.pixels, self.whitening, self.index, self.n_views)

@@ -48,16 +48,15 @@ class LMOptions:
         Initial lambda, relative to the mean diagonal of the normal matrix.
     """
 
-    stiffness: tuple[float, ...] = (100.0, 1.0, 0.0)
-    release: float = 0.05
-    tolerance: float = 1e-9
+    stiffness: tuple[float, ...] = (300.0, 0.0)
+    release: float = 0.9
+    tolerance: float = 1e-6
     max_iterations: int = 60
-    damping: float = 1e-2
+    damping: float = 1e-3
 
 
 _FLOOR = 1e-13  # rms error, in units of the normalised image, that rounding alone accounts for
 _LARGEST_DAMPING = 1e8  # no step of any length lowers E: the bottom is reached
-_PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 
 
 def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
@@ -100,8 +99,16 @@ def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
 
 def _split(W: Array, product: Array) -> tuple[Array, Array]:
     """W as it was and the V that gives the product; the identity where W is nearly singular."""
-    W = np.where((np.linalg.cond(W) < 1e8)[:, None, None], W, np.eye(3))
-    return W, np.linalg.solve(W, product)
+    with np.errstate(over="ignore", invalid="ignore"):
+        try:
+            V = np.linalg.solve(W, product)
+        except np.linalg.LinAlgError:
+            V = np.full_like(product, np.nan)
+        regular = np.abs(V).max(axis=(1, 2)) < 1e8 * np.abs(product).max(axis=(1, 2))
+    if regular.all():
+        return W, V
+    keep = regular[:, None, None]
+    return np.where(keep, W, np.eye(3)), np.where(keep, V, product)
 
 
 class _Normal:
@@ -116,18 +123,19 @@ class _Normal:
         self.dt = np.ascontiguousarray(np.swapaxes(d, -1, -2))
         a, b = np.triu_indices(self.n_inputs)
         self.ZZ = Z[..., a] * Z[..., b]
-        # Where entry (k, a), (l, b) of the matrix is found among 6 output pairs x input pairs.
+        # Where entry (k, a), (l, b) of the matrix is found among 9 output pairs x input pairs.
         inputs = np.zeros((self.n_inputs, self.n_inputs), dtype=np.intp)
         inputs[a, b] = inputs[b, a] = np.arange(len(a))
-        outputs = np.zeros((3, 3), dtype=np.intp)
-        for n, (k, m) in enumerate(_PAIRS):
-            outputs[k, m] = outputs[m, k] = n
         self.free = np.flatnonzero(free)
         row, column = np.divmod(self.free, self.n_inputs)
-        self.place = outputs[row[:, None], row] * len(a) + inputs[column[:, None], column]
+        self.place = (3 * row[:, None] + row) * len(a) + inputs[column[:, None], column]
 
-    def __call__(self, product: Array, mu: Array, rows: NDArray[np.intp]) -> tuple[Array, Array, Array]:
-        """E (K,), gradient (K, n) and matrix (K, n, n) of the networks `rows`."""
+    def __call__(
+        self, product: Array, mu: Array, networks: NDArray[np.intp]
+    ) -> tuple[Array, Array, Array]:
+        """E (K,), gradient (K, n) and matrix (K, n, n) of some networks, in their order."""
+        # All of them, as in most steps: no copies of the patterns.
+        rows = slice(None) if len(networks) == len(self.w) else networks
         d, w = self.dt[rows], self.w[rows]
         m = mu[:, None]
         o = product @ self.Zt[rows]
@@ -139,12 +147,9 @@ class _Normal:
         gradient = -(error * wg[:, None]) @ self.Z[rows]
         # gamma^2 (I - o o^T / (o.o + mu)): what the elimination leaves of each pattern.
         wgg = wg * gamma
-        pull = wgg / norm
-        share = np.empty((len(product), len(_PAIRS), o.shape[2]))
-        for n, (k, j) in enumerate(_PAIRS):
-            np.multiply(-pull * o[:, k], o[:, j], out=share[:, n])
-            if k == j:
-                share[:, n] += wgg
+        share = (o * (wgg / -norm)[:, None])[:, :, None] * o[:, None]  # (K, 3, 3, N)
+        share = share.reshape(len(product), 9, -1)
+        share[:, ::4] += wgg[:, None]
         moments = (share @ self.ZZ[rows]).reshape(len(product), -1)
         return loss, gradient.reshape(len(product), -1)[:, self.free], moments[:, self.place]
 
@@ -187,40 +192,55 @@ class _Descent:
         trial.reshape(len(active), -1)[:, self.normal.free] += step
         if len(self.normal.free) == trial[0].size:
             # Without stiffness the scale is free, as gamma absorbs it: keep it at order 1.
-            loose = mu == 0
-            trial[loose] *= 2.0 / np.linalg.norm(trial[loose], axis=(1, 2))[:, None, None]
+            size = np.sqrt((trial * trial).sum(axis=(1, 2)))
+            trial *= np.where(mu == 0, 2.0 / size, 1.0)[:, None, None]
         loss, gradient, matrix = self.normal(trial, mu, active)
         before = self.loss[active]
         better = loss < before
         gain = np.where(better, (before - loss) / before, 0.0)
-        kept = active[better]
-        product[kept] = trial[better]
-        self.loss[kept], self.gradient[kept] = loss[better], gradient[better]
-        self.matrix[kept] = matrix[better]
+        self._keep(product, active, better, (trial, loss, gradient, matrix))
         self._adapt(active, better, (before - loss) / predicted)
         self.iterations[active] += 1
         stuck = ~better & (self.damping[active] > _LARGEST_DAMPING)
         done = (better & (gain < self.options.tolerance)) | stuck | (self.loss[active] <= self.floor[active])
         release = (mu > 0) & (done | (better & (gain < self.options.release)))
         self._release(product, active[release])
-        self.settled[active[done & ~release]] = True
-        return active[~(done & ~release)]
+        ended = done & ~release
+        self.settled[active[ended]] = True
+        return active[~ended]
+
+    def _keep(
+        self,
+        product: Array,
+        active: NDArray[np.intp],
+        better: NDArray[np.bool_],
+        trial: tuple[Array, Array, Array, Array],
+    ) -> None:
+        """Accept the trial of the networks that it made better."""
+        kept = active
+        if not better.all():
+            kept = active[better]
+            trial = (trial[0][better], trial[1][better], trial[2][better], trial[3][better])
+        product[kept], self.loss[kept], self.gradient[kept], self.matrix[kept] = trial
 
     def _solve(self, active: NDArray[np.intp]) -> tuple[Array, Array]:
         """Damped step and the loss that it should take off."""
-        H, g = self.matrix[active], self.gradient[active]
-        scale = np.trace(H, axis1=1, axis2=2) / H.shape[1]
+        H, g = self.matrix[active], self.gradient[active]  # copies
+        diagonal = np.einsum("kii->ki", H)
         # The second term keeps the matrix regular where the scale is free.
-        ridge = (self.damping[active] + 1e-14) * scale + 1e-300
-        step = np.linalg.solve(H + ridge[:, None, None] * np.eye(H.shape[1]), -g[..., None])[..., 0]
+        ridge = (self.damping[active] + 1e-14) * diagonal.mean(axis=1) + 1e-300
+        diagonal += ridge[:, None]
+        step = np.linalg.solve(H, -g[..., None])[..., 0]
         return step, 0.5 * (ridge[:, None] * step**2 - step * g).sum(axis=1)
 
     def _adapt(self, active: NDArray[np.intp], better: NDArray[np.bool_], ratio: Array) -> None:
         """Nielsen's rule: damping follows the ratio of real to predicted decrease."""
-        shrink = np.maximum(0.1, 1 - np.clip(2 * ratio - 1, -1, 2) ** 3)
-        factor = np.where(better, shrink, self.growth[active])
-        self.damping[active] = np.clip(self.damping[active] * factor, 1e-12, 1e12)
-        self.growth[active] = np.where(better, 2.0, 2 * self.growth[active])
+        growth = self.growth[active]
+        gained = np.minimum(2 * ratio - 1, 2.0)
+        shrink = np.maximum(0.1, 1 - gained * gained * gained)
+        damping = self.damping[active] * np.where(better, shrink, growth)
+        self.damping[active] = np.minimum(np.maximum(damping, 1e-12), 1e12)
+        self.growth[active] = np.where(better, 2.0, 2 * growth)
 
     def _release(self, product: Array, networks: NDArray[np.intp]) -> None:
         """Take these networks to the next, smaller stiffness."""
