@@ -58,7 +58,7 @@ def _record_lines(cal: Calibration) -> Iterator[str]:
     yield f"trainer: {text(cal.trainer)}"
     yield f"seed: {cal.seed}"
     yield f"converged: {str(bool(cal.converged)).lower()}"
-    yield f"stop_reason: {text(str(cal.stop_reason))}"
+    yield f"stop_reason: {text(str.__str__(cal.stop_reason))}"
     yield f"unit: {text(cal.unit)}"
     yield f"distortion: {text(cal.distortion_model)}"
     if cal.points.image_center is not None:
@@ -125,17 +125,21 @@ def _network_lines(network: NetworkRecord | None) -> Iterator[str]:
         yield "network: null"
         return
     yield "network:"
-    for name, weights in (("V", network.V), ("S2", network.S2)):
-        yield f"  {name}:" if weights else f"  {name}: {{}}"
-        for view, matrix in weights.items():
-            yield f"    {text(view)}: {flow(matrix)}"
+    yield from _matrix_lines("V", network.V)
     yield f"  W: {flow(network.W)}"
     yield f"  S1: {flow(network.S1)}"
+    yield from _matrix_lines("S2", network.S2)
     for name in ("starts", "agreed", "iterations", "refine_iterations"):
         yield f"  {name}: {int(getattr(network, name))}"
     for name in ("loss", "rmse_before", "rmse_after"):
         yield f"  {name}: {number(getattr(network, name))}"
     yield f"  curve: {flow(np.array(network.curve, dtype=float))}"
+
+
+def _matrix_lines(name: str, matrices: Mapping[str, Array]) -> Iterator[str]:
+    yield f"  {name}:" if matrices else f"  {name}: {{}}"
+    for view, matrix in matrices.items():
+        yield f"    {text(view)}: {flow(matrix)}"
 
 
 def _observation_lines(points: Correspondences) -> Iterator[str]:

@@ -39,7 +39,7 @@ def read_fast(data: bytes, layout: Layout, schema: Schema) -> Columns | None:
     n_lines = data.count(b"\n", layout.offset) + (not data.endswith(b"\n"))
     widths = _guess_widths(data, layout, schema)
     while widths is not None:
-        records = _load(data, layout, schema, widths)
+        records = _load(data, layout, schema, widths, n_lines)
         if records is None or len(records) != n_lines:  # NumPy skips blank lines
             return None
         labels = {name: np.ascontiguousarray(records[f"c{k}"]) for name, k in _places(layout, schema.labels)}
@@ -52,9 +52,10 @@ def read_fast(data: bytes, layout: Layout, schema: Schema) -> Columns | None:
 
 def _is_plain(data: bytes, layout: Layout, schema: Schema) -> bool:
     separator = layout.separator
-    if layout.offset >= len(data) or data.find(b"\n#", layout.offset - 1 if layout.offset else 0) >= 0:
+    before = max(layout.offset - 1, 0)  # so that the first line has a line end in front, too
+    if layout.offset >= len(data) or data.translate(None, _PLAIN):
         return False
-    if data.translate(None, _PLAIN):
+    if data.find(b"#", layout.offset) >= 0 and data.find(b"\n#", before) >= 0:
         return False
     if separator is None:
         return True
@@ -62,7 +63,7 @@ def _is_plain(data: bytes, layout: Layout, schema: Schema) -> bool:
         # Labels would keep the blanks around them.
         mark = separator.encode()
         blanks = (mark + b" ", b" " + mark, b"\n ", b" \n")
-        if any(data.find(blank, max(layout.offset - 1, 0)) >= 0 for blank in blanks) or data.endswith(b" "):
+        if any(data.find(blank, before) >= 0 for blank in blanks) or data.endswith(b" "):
             return False
         if data[layout.offset : layout.offset + 1] == b" ":
             return False
@@ -95,7 +96,9 @@ def _widened(widths: dict[str, int], full: set[str]) -> dict[str, int] | None:
     return wider if max(wider.values()) <= _WIDEST else None
 
 
-def _load(data: bytes, layout: Layout, schema: Schema, widths: dict[str, int]) -> NDArray[Any] | None:
+def _load(
+    data: bytes, layout: Layout, schema: Schema, widths: dict[str, int], n_lines: int
+) -> NDArray[Any] | None:
     """Load records with the fields c0, c1, ...; None where NumPy finds a fault."""
     known = set(schema.known)
     kinds = [
@@ -111,6 +114,7 @@ def _load(data: bytes, layout: Layout, schema: Schema, widths: dict[str, int]) -
                 dtype=[(f"c{k}", kind) for k, kind in enumerate(kinds)],
                 delimiter=layout.separator,
                 comments=None,
+                max_rows=n_lines,
                 ndmin=1,
                 encoding="ascii",
             )
@@ -122,7 +126,7 @@ def _columns(
     records: NDArray[Any], labels: dict[str, NDArray[Any]], layout: Layout, schema: Schema
 ) -> Columns | None:
     number_names = frozenset(schema.known) - schema.labels
-    numbers = {name: np.ascontiguousarray(records[f"c{k}"]) for name, k in _places(layout, number_names)}
+    numbers = {name: records[f"c{k}"] for name, k in _places(layout, number_names)}
     if not all(np.isfinite(column).all() for column in numbers.values()):
         return None
     for name, column in labels.items():
