@@ -17,11 +17,9 @@ __all__ = ["flow", "mapping", "number", "quoted", "text"]
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*").fullmatch
 _RESERVED = frozenset(("null", "true", "false", "yes", "no", "on", "off", "y", "n"))
 
-# Shortest repr writes 1e-05; YAML 1.1 wants a point in a number.
-_NO_POINT = re.compile(r"(?<![\d.])(\d+)e")
-
 # What YAML would fold, refuse or show wrongly; \uXXXX means the same to YAML and JSON.
 _UNSAFE = re.compile("[\x7f-\xa0\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff0-\uffff]")
+_encode = json.JSONEncoder(ensure_ascii=False).encode
 _SURROGATE = re.compile("[\ud800-\udfff]")
 
 
@@ -65,7 +63,7 @@ def quoted(value: str) -> str:
     """
     if _SURROGATE.search(value):
         raise InputError(f"the name {value[:40]!a} cannot be written as UTF-8; rename it")
-    quoted = json.dumps(value, ensure_ascii=False)
+    quoted = _encode(value)
     return quoted if quoted.isascii() and "\x7f" not in quoted else _UNSAFE.sub(_escaped, quoted)
 
 
@@ -74,4 +72,11 @@ def _escaped(match: re.Match[str]) -> str:
 
 
 def _with_point(numbers: str) -> str:
-    return _NO_POINT.sub(r"\1.0e", numbers) if "e" in numbers else numbers
+    """Write 1e-05, the shortest, as 1.0e-05: YAML 1.1 wants a point in a number."""
+    if "e" not in numbers:
+        return numbers
+    parts = numbers.split("e")
+    for k, part in enumerate(parts[:-1]):
+        if not part[-2:-1] or part[-2] not in "0123456789.":  # a single digit stands before the e
+            parts[k] = part + ".0"
+    return "e".join(parts)
