@@ -9,7 +9,7 @@ sets the pace, up to 2 / |o|^2 where it overshoots; hence 0.4 beside 0.05 for th
 data a constant rate converges to the exact camera. On noisy data it ends on a small cycle about the
 optimum, 2-40 % above its loss; the excess goes with the square of the rate, so the rates are halved
 whenever the loss has come to rest. From random weights the paper's Table 1 scene (440 points) takes
-400-800 epochs to 1e-7 px; boxes and corners with 0.3 px of noise take 800-4,000. Slower are nearly
+400-800 epochs to 1e-7 px; boxes and corners with 0.3 px of noise take 1,000-6,000. Slower are nearly
 flat targets (20,000 and more) and views so close that the gammas differ by a factor of 14 (8,000).
 """
 
@@ -34,6 +34,8 @@ _FIRST_CHECK = 10
 _CHECKS_PER_LIFE = 40
 # The loss is compared over 10 of them, a quarter of the training so far.
 _WINDOW = 10
+# Halvings in succession that must gain nothing: the cycles of two rates may agree by chance.
+_QUIET = 2
 # A network whose loss exceeds 10 times that of the silent network, W V = 0, has diverged.
 _DIVERGED = 10.0
 
@@ -108,8 +110,8 @@ def train_backprop(
     """Train a stack of networks by eqs. (9)-(11), with E_orth of eq. (14) where beta > 0.
 
     The rates of a network are halved whenever its loss has come to rest: a constant rate ends on a
-    small cycle about the optimum, whose excess goes with the rate's square. It has settled when
-    half the rates no longer lower the loss, or when the loss is below the floor.
+    small cycle about the optimum, whose excess goes with the rate's square. It has settled when two
+    halvings in succession leave the loss as it was, or when the loss is below the floor.
 
     Parameters
     ----------
@@ -178,6 +180,7 @@ class _Run:
         # When the present rates began, and the loss to which those before them had led.
         self.since = np.zeros(networks, dtype=np.int64)
         self.before = np.full(networks, np.inf)
+        self.quiet = np.zeros(networks, dtype=np.int64)
         self.curve = [self.loss()]
         if not np.isfinite(self.curve[0]).all():
             raise InputError("the patterns and the initial weights must be finite numbers")
@@ -242,7 +245,7 @@ class _Run:
         self.restarts[diverged] += 1
         self.scale[diverged] /= 2
         self.since[diverged] = len(self.curve)
-        self.before[diverged] = np.inf
+        self.before[diverged], self.quiet[diverged] = np.inf, 0
         self.active &= self.restarts <= self.options.halvings
 
     def _judge(self, loss: Array) -> None:
@@ -251,7 +254,9 @@ class _Run:
         past = self.curve[max(checkpoint - _WINDOW, 0)]
         least = self.options.tolerance * loss
         resting = self.active & (checkpoint - self.since >= _WINDOW) & (past - loss <= least)
-        done = (resting & (np.abs(self.before - loss) <= least)) | (self.active & (loss <= self.floor))
+        same = np.abs(self.before - loss) <= least
+        self.quiet[resting] = np.where(same, self.quiet + 1, 0)[resting]
+        done = (resting & (self.quiet >= _QUIET)) | (self.active & (loss <= self.floor))
         self.settled |= done
         self.active &= ~done
         slower = resting & ~done
