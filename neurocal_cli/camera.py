@@ -242,7 +242,9 @@ def decompose(P: Array, world: Array | None = None) -> tuple[Intrinsics, Pose]:
     P = np.asarray(P, dtype=float)
     M = P[:, :3]
     if np.linalg.cond(M / np.linalg.norm(M, axis=1, keepdims=True)) > 1e14:
-        raise DegenerateGeometryError("the projection matrix is singular: it is no camera with a focal length")
+        raise DegenerateGeometryError(
+            "the projection matrix is singular: it is no camera with a focal length"
+        )
     if world is None:
         sign = np.sign(np.linalg.det(M))
     else:

@@ -26,7 +26,6 @@ __all__ = [
     "euler_to_rotation",
     "nearest_rotation",
     "orthonormalised",
-    "plane_basis",
     "rotation_step",
     "rotation_to_euler",
     "rq",
@@ -175,27 +174,3 @@ def similarity(points: Array) -> tuple[Array, float]:
     centre = points.mean(axis=0)
     scale = float(np.abs(points - centre).max(initial=0.0))
     return centre, scale if scale > 0 else 1.0
-
-
-def plane_basis(points: Array) -> tuple[Array, Array]:
-    """Principal axes of points and their rms extents along them.
-
-    Parameters
-    ----------
-    points : (N, 3) array
-
-    Returns
-    -------
-    Q : (3, 3) array
-        Rotation whose columns are the principal axes, largest extent first.
-    extent : (3,) array
-        Rms extent along each axis, in the points' unit.
-    """
-    centred = points - points.mean(axis=0)
-    _, singular, Vt = np.linalg.svd(centred.T @ centred)
-    Q = Vt.T
-    if np.linalg.det(Q) < 0:
-        Q = Q * np.array([1.0, 1.0, -1.0])
-    # The product squares the condition: measure the extents on the points themselves.
-    extent = np.sqrt(np.mean((centred @ Q) ** 2, axis=0))
-    return Q, extent

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.assembly import assemble
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.errors import UsageError
-from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
-from neurocal_cli.neuro import Solution, Strategy, solve
-from neurocal_cli.observability import check_determined, check_points
+from neurocal_cli.geometry import Array
+from neurocal_cli.job import Job, Strategy
+from neurocal_cli.neuro import solve
+from neurocal_cli.observability import check_points
 from neurocal_cli.points import Correspondences
-from neurocal_cli.problems import Known, known_for
-from neurocal_cli.refine import ENTRIES
+from neurocal_cli.problems import known_for
 from neurocal_cli.starts import Agreement
+from neurocal_cli.training import Task, Trained
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
-from neurocal_cli.uncertainty import Covariance, covariance
-from neurocal_cli.views import Views, arrange
+from neurocal_cli.views import arrange
 
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions
@@ -32,10 +32,6 @@ TRAINERS = ("lm", "backprop")
 DISTORTIONS = ("none",)
 OUTLIERS = ("keep",)
 
-# A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
-_POOR = 0.05
-_POOR_THETA = 0.02  # rad
-
 Progress = Callable[[str, float], None]
 
 
@@ -100,311 +96,48 @@ def calibrate(
     InputError, DegenerateGeometryError
         Points that cannot give an answer, with the reason.
     """
-    for name, value, known_values in (
-        ("method", method, METHODS),
-        ("trainer", trainer, TRAINERS),
-        ("distortion", distortion, DISTORTIONS),
-        ("outliers", outliers, OUTLIERS),
-    ):
-        if value not in known_values:
-            raise UsageError(f"{name} must be one of {', '.join(known_values)}, not {value!r}")
-    if starts < 2:
-        raise UsageError("starts must be at least 2: one start has nothing to agree with")
+    _check_options(method, trainer, distortion, outliers, starts)
     if intrinsics is not None and not isinstance(intrinsics, Intrinsics):
         intrinsics = Intrinsics.from_matrix(intrinsics)
     known = known_for(points, type, image_center, intrinsics, extrinsics, skew)
     views = arrange(points)
     check_points(views, known)
     report = progress or (lambda stage, share: None)
-    strategy = _strategy(trainer, starts, backprop, report)
-    solution = solve(views, known, strategy, np.random.default_rng(seed), report)
-    return _Assembly(points, views, known, solution).calibration(method, trainer, seed, camera_name)
+    job = Job(views, known, _strategy(trainer, starts, backprop, report), np.random.default_rng(seed), report)
+    return assemble(job, points, solve(job), trainer=trainer, method=method, seed=seed, name=camera_name)
 
 
-def _strategy(
-    trainer: str, starts: int, backprop: BackpropOptions | None, report: Progress
-) -> Strategy:
-    if trainer == "lm":
-        # Starts see a few points of each view; the best one goes on to (nearly) all of them.
-        begin, finish = LMOptions(tolerance=1e-4), LMOptions(stiffness=(0.0,), tolerance=1e-2, damping=1e-8)
-        return Strategy(
-            lambda task: train_lm(task, begin),
-            Agreement(),
-            (16, 40),
-            lambda task: train_lm(task, finish),
-            1024,
-            starts,
-        )
-    from neurocal_cli.training.backprop import BackpropOptions
-
-__all__ = ["DISTORTIONS", "METHODS", "OUTLIERS", "TRAINERS", "calibrate"]
-
-METHODS = ("neuro",)
-TRAINERS = ("lm", "backprop")
-DISTORTIONS = ("none",)
-OUTLIERS = ("keep",)
-
-# A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
-_POOR = 0.05
-_POOR_THETA = 0.02  # rad
-
-Progress = Callable[[str, float], None]
-
-
-def calibrate(
-    points: Correspondences,
-    type: int = 1,
-    image_center: tuple[float, float] | None = None,
-    intrinsics: Intrinsics | Array | None = None,
-    extrinsics: Mapping[str, Pose] | None = None,
-    method: str = "neuro",
-    trainer: str = "lm",
-    distortion: str = "none",
-    skew: bool = True,
-    outliers: str = "keep",
-    seed: int = 0,
-    *,
-    starts: int = 20,
-    backprop: BackpropOptions | None = None,
-    camera_name: str = "camera",
-    progress: Progress | None = None,
-) -> Calibration:
-    """Calibrate a camera from known points, from random weights.
-
-    Parameters
-    ----------
-    points : Correspondences
-        One view of a target that is not flat, or several views of any target.
-    type : {1, 2, 3, 4}
-        What is given (paper, section 4.1): 1 nothing, 2 the image centre, 3 the intrinsics,
-        4 the extrinsics.
-    image_center : (u0, v0), optional [px]
-        Type 2; else the one with the points, else the centre of their image size.
-    intrinsics : Intrinsics or (3, 3) array, optional
-        Type 3.
-    extrinsics : dict of Pose by view name, optional
-        Type 4.
-    method : {"neuro"}
-    trainer : {"lm", "backprop"}
-    distortion : {"none"}
-    skew : bool
-        False: theta is pi/2.
-    outliers : {"keep"}
-    seed : int
-        Of the random weights; the same seed gives the same result.
-    starts : int
-        Most random starts for each network, at least 2.
-    backprop : BackpropOptions, optional
-        Rates and epochs of the backprop trainer.
-    camera_name : str
-    progress : callable, optional
-        Called with a stage's name and the share of it that is done.
-
-    Returns
-    -------
-    Calibration
-        `converged` is False when training was cut short; everything else is still there.
-
-    Raises
-    ------
-    UsageError
-        Something missing for the type, or an option that does not exist.
-    InputError, DegenerateGeometryError
-        Points that cannot give an answer, with the reason.
-    """
-    for name, value, known_values in (
+def _check_options(method: str, trainer: str, distortion: str, outliers: str, starts: int) -> None:
+    for name, value, choices in (
         ("method", method, METHODS),
         ("trainer", trainer, TRAINERS),
         ("distortion", distortion, DISTORTIONS),
         ("outliers", outliers, OUTLIERS),
     ):
-        if value not in known_values:
-            raise UsageError(f"{name} must be one of {', '.join(known_values)}, not {value!r}")
+        if value not in choices:
+            raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
     if starts < 2:
         raise UsageError("starts must be at least 2: one start has nothing to agree with")
-    if intrinsics is not None and not isinstance(intrinsics, Intrinsics):
-        intrinsics = Intrinsics.from_matrix(intrinsics)
-    known = known_for(points, type, image_center, intrinsics, extrinsics, skew)
-    views = arrange(points)
-    check_points(views, known)
-    report = progress or (lambda stage, share: None)
-    strategy = _strategy(trainer, starts, backprop, report)
-    solution = solve(views, known, strategy, np.random.default_rng(seed), report)
-    return _Assembly(points, views, known, solution).calibration(method, trainer, seed, camera_name)
 
 
-def _strategy(
-    trainer: str, starts: int, backprop: BackpropOptions | None, report: Progress
-) -> Strategy:
+def _strategy(trainer: str, starts: int, backprop: BackpropOptions | None, report: Progress) -> Strategy:
     if trainer == "lm":
         # Starts see a few points of each view; the best one goes on to (nearly) all of them.
+        begin = LMOptions(tolerance=1e-4)
         finish = LMOptions(stiffness=(0.0,), tolerance=1e-2, damping=1e-8)
-        return Strategy(train_lm, Agreement(), (16, 40), lambda task: train_lm(task, finish), 1024, starts)
+        return Strategy(
+            trainer=lambda task: train_lm(task, begin),
+            agreement=Agreement(),
+            start_points=(16, 40),
+            finish=lambda task: train_lm(task, finish),
+            finish_points=1024,
+            limit=starts,
+        )
     from neurocal_cli.training.backprop import BackpropOptions, train_backprop
 
     options = backprop or BackpropOptions()
 
-    def train(task):  # type: ignore[no-untyped-def]
+    def train(task: Task) -> Trained:
         return train_backprop(task, options, lambda share: report("training the networks", share))
 
     return Strategy(train, Agreement(0.02, 1e-4), (1024, 1024), None, 1024, starts)
-
-
-@dataclass(frozen=True, eq=False)
-class _Assembly:
-    """Turns the normalised solution into a calibration in pixels and world units."""
-
-    points: Correspondences
-    views: Views
-    known: Known
-    solution: Solution
-
-    def calibration(self, method: str, trainer: str, seed: int, camera_name: str) -> Calibration:
-        views, known, solution = self.views, self.known, self.solution
-        refined = solution.refined
-        cov = covariance(refined.normal, known.free, known.free_poses, 2 * len(views.index))
-        self._check(cov)
-        A = known.matrix(refined.state.entries[0], views)
-        intrinsics = known.intrinsics or Intrinsics.from_matrix(A)
-        if known.type != 3 and not known.free[1]:
-            intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
-        block, std = self._intrinsic_covariance(intrinsics, cov)
-        results, rmse, largest = self._views(cov)
-        free_names = tuple(n for n in INTRINSIC_NAMES if n not in known.fixed)
-        keep = [INTRINSIC_NAMES.index(n) for n in free_names]
-        reason = StopReason.CONVERGED
-        if not refined.converged:
-            reason = StopReason.MAX_ITERATIONS
-        elif not solution.certain:
-            reason = StopReason.NO_AGREEMENT
-        return Calibration(
-            intrinsics=intrinsics,
-            std=std,
-            fixed=known.fixed,
-            views=results,
-            points=self.points,
-            type=known.type,
-            method=method,
-            trainer=trainer,
-            seed=seed,
-            converged=reason is StopReason.CONVERGED,
-            stop_reason=reason.value,
-            rmse_px=rmse,
-            max_px=largest,
-            covariance=block[np.ix_(keep, keep)],
-            covariance_names=free_names,
-            network=self._network(rmse),
-            camera_name=camera_name,
-            warnings=_warnings(intrinsics, std, results),
-        )
-
-    def _check(self, cov: Covariance) -> None:
-        entries = self.solution.refined.state.entries[0]
-        free = np.flatnonzero(self.known.free)
-        relative = np.zeros(2)
-        for slot, entry in enumerate((0, 2)):
-            if entry in free:
-                place = int(np.flatnonzero(free == entry)[0])
-                relative[slot] = np.sqrt(cov.entries[place, place]) / entries[entry]
-        normals = (self.solution.refined.state.R @ self.views.basis)[:, :, 2]
-        check_determined(self.views, self.known, relative, cov.smallest, normals)
-
-    def _intrinsic_covariance(self, intrinsics: Intrinsics, cov: Covariance) -> tuple[Array, dict[str, float]]:
-        """Covariance (5, 5) and std of the five intrinsic parameters; 0 for given ones."""
-        free = np.flatnonzero(self.known.free)
-        J = intrinsics.entry_jacobian()[:, free] * self.views.pixel_scale
-        block = J @ cov.entries @ J.T
-        std = {
-            name: 0.0 if name in self.known.fixed else float(np.sqrt(block[n, n]))
-            for n, name in enumerate(INTRINSIC_NAMES)
-        }
-        return block, std
-
-    def _views(self, cov: Covariance) -> tuple[dict[str, ViewResult], float, float]:
-        """Poses in world units with their std, and the pixel error (3), unweighted."""
-        views, known = self.views, self.known
-        R, t = self.solution.refined.state.R, self.solution.refined.state.t
-        centre = (R @ views.centre[..., None])[..., 0]
-        scale = views.scale[:, None]
-        t_world = t * scale - centre
-        if known.poses is not None:
-            R = np.stack([known.poses[name].R for name in views.names])
-            t_world = np.stack([known.poses[name].t for name in views.names])
-        # t = scale tau_centre - R c: omega turns R c with it.
-        J = np.zeros((len(R), 6, 6))
-        J[:, :3, :3] = euler_jacobian(R)
-        J[:, 3:, :3] = cross_matrix(centre)
-        J[:, 3:, 3:] = np.eye(3) * views.scale[:, None, None]
-        std = np.sqrt(np.maximum(np.diagonal(J @ cov.poses @ np.swapaxes(J, 1, 2), axis1=1, axis2=2), 0.0))
-        squared = self._squared_errors()
-        rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
-        R.setflags(write=False)
-        t_world.setflags(write=False)
-        results = {
-            name: ViewResult(Pose.exact(*pose), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, not known.free_poses)
-            for name, pose, sigma, n, r in zip(
-                views.names, zip(R, t_world, strict=True), std.tolist(), views.counts.tolist(), rms.tolist(), strict=True
-            )
-        }
-        return results, float(np.sqrt(squared.mean())), float(np.sqrt(squared.max()))
-
-    def _squared_errors(self) -> Array:
-        """Squared pixel error of each point, sorted by view; (N,)."""
-        tiles = self.views.tiles
-        errors = np.empty((len(tiles.view), tiles.local.shape[2]))
-        state = self.solution.refined.state
-        a, s, b, u0, v0 = state.entries[0]
-        for chunk in tiles.chunks():
-            view = tiles.view[chunk]
-            Xc = state.R[view] @ tiles.local[chunk] + state.t[view][:, :, None]
-            x, y = Xc[:, 0] / Xc[:, 2], Xc[:, 1] / Xc[:, 2]
-            du = tiles.pixels[chunk, 0] - (a * x + s * y + u0)
-            dv = tiles.pixels[chunk, 1] - (b * y + v0)
-            errors[chunk] = du * du + dv * dv
-        rank = np.arange(len(self.views.index)) - np.repeat(self.views.first, self.views.counts)
-        slot = np.repeat(tiles.first * tiles.local.shape[2], self.views.counts) + rank
-        return np.asarray(errors.reshape(-1)[slot] * self.views.pixel_scale**2)
-
-    def _network(self, rmse: float) -> NetworkRecord:
-        views, solution = self.views, self.solution
-        state = solution.refined.state
-        W = np.eye(3)
-        W[ENTRIES] = state.entries[0]
-        px = views.pixel_scale
-        return NetworkRecord(
-            W=W,
-            V={name: np.column_stack([state.R[k], state.t[k]]) for k, name in enumerate(views.names)},
-            S1=views.S1,
-            S2={name: views.S2(k) for k, name in enumerate(views.names)},
-            starts=solution.starts,
-            agreed=solution.agreed,
-            iterations=solution.iterations,
-            refine_iterations=solution.refine_iterations,
-            loss=solution.network_rms * px,
-            rmse_before=solution.rms_before * px,
-            rmse_after=rmse,
-            curve=tuple(float(c) * px for c in solution.curve),
-        )
-
-
-def _warnings(
-    intrinsics: Intrinsics, std: Mapping[str, float], results: Mapping[str, ViewResult]
-) -> tuple[str, ...]:
-    """Parameters that exist but are badly determined."""
-    alpha = max(intrinsics.alpha_u, intrinsics.alpha_v)
-    limits = {
-        "alpha_u": _POOR * intrinsics.alpha_u,
-        "alpha_v": _POOR * intrinsics.alpha_v,
-        "u0": _POOR * alpha,
-        "v0": _POOR * alpha,
-        "theta": _POOR_THETA,
-    }
-    poor = [f"{name} (std {std[name]:.2g})" for name in INTRINSIC_NAMES if std[name] > limits[name]]
-    if not poor:
-        return ()
-    return (
-        f"badly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
-        "the target more, or give what is known (--no-skew, --type 2)",
-    )
-
-

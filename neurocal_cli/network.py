@@ -74,15 +74,13 @@ class Patterns:
         return np.sqrt(2 * loss / np.maximum(self.weights.sum(axis=1), 1e-300))
 
 
-def random_weights(
-    rng: np.random.Generator, networks: int, n_inputs: int
-) -> tuple[Array, Array]:
+def random_weights(rng: np.random.Generator, networks: int, n_inputs: int) -> tuple[Array, Array]:
     """Initial weights, uniform in [-1, 1] as the paper has them; W (G, 3, 3) and V (G, 3, I)."""
     return rng.uniform(-1, 1, (networks, 3, 3)), rng.uniform(-1, 1, (networks, 3, n_inputs))
 
 
 def output(W: Array, V: Array, inputs: Array) -> Array:
-    """o = W V Z before the factor gamma, eqs. (6) and (7); (G, N, 3)."""
+    """O = W V Z before the factor gamma, eqs. (6) and (7); (G, N, 3)."""
     return inputs @ np.swapaxes(W @ V, -1, -2)
 
 

@@ -102,8 +102,8 @@ def check_determined(
         angle = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T).min(), 0, 1)))
         if views.n_views > 1 and angle < _NEARLY_PARALLEL:
             raise DegenerateGeometryError(
-                f"the {views.n_views} boards are all parallel (within {angle:.1f} degrees), so no focal length "
-                "can be told from them; tilt the board by 20 to 50 degrees in different directions"
+                f"the {views.n_views} boards are all parallel (within {angle:.1f} degrees), so no "
+                "focal length can be told from them; tilt the board by 20 to 50 degrees in different directions"
             )
     if singular:
         raise DegenerateGeometryError(

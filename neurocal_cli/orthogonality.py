@@ -9,6 +9,7 @@ entries learn them from random values, again by Levenberg-Marquardt.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +127,7 @@ class _Conditions:
 
 
 def _through_inverse(p: Array, h: Array) -> tuple[Array, Array]:
-    """y = W^-1 h and its derivatives; p (B, 5), h (K, c, 3) -> (B, K, c, 3) and (B, K, c, 5, 3)."""
+    """Y = W^-1 h and its derivatives; p (B, 5), h (K, c, 3) -> (B, K, c, 3) and (B, K, c, 5, 3)."""
     la, s, lb, u, v = (p[:, n, None, None] for n in range(5))
     a, b = np.exp(la), np.exp(lb)
     y = np.empty((len(p), *h.shape))
@@ -156,7 +157,9 @@ def _descend(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
             H = np.swapaxes(J, 1, 2) @ J
             g = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
             scale = np.trace(H, axis1=1, axis2=2) / len(f) + 1e-12
-            step = -np.linalg.solve(H + (damping * scale)[:, None, None] * np.eye(len(f)), g[..., None])[..., 0]
+            step = -np.linalg.solve(H + (damping * scale)[:, None, None] * np.eye(len(f)), g[..., None])[
+                ..., 0
+            ]
             trial = p.copy()
             trial[:, f] += np.minimum(np.maximum(step, -2.0), 2.0)  # two in the logarithm is a factor of 7
             r_new, J_new = conditions(trial)
@@ -188,10 +191,11 @@ def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
     t : (K, 3) array
         With t_z > 0: the normalised origin is the points' centroid, which is in front.
     """
-    D = np.linalg.solve(W, product)
+    D = cast("Array", np.linalg.solve(W, product))
     D = D * np.where(D[:, 2, -1] < 0, -1.0, 1.0)[:, None, None]
     M = D[:, :, :-1]
-    scale = np.sqrt((M**2).sum((1, 2)) / M.shape[2])
+    scale: Array = np.sqrt((M**2).sum((1, 2)) / M.shape[2])
     if M.shape[2] == 2:
-        M = np.concatenate([M, np.cross(M[:, :, 0], M[:, :, 1])[:, :, None] / scale[:, None, None]], axis=2)
+        third = np.cross(M[:, :, 0], M[:, :, 1]) / scale[:, None]
+        M = np.asarray(np.concatenate([M, third[:, :, None]], axis=2), dtype=float)
     return nearest_rotation(M), D[:, :, -1] / scale[:, None]

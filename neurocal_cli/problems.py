@@ -19,7 +19,7 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.refine import ENTRIES
 from neurocal_cli.views import Views
 
-__all__ = ["Known", "known_for"]
+__all__ = ["Known", "intrinsic_matrix", "known_for"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +62,14 @@ class Known:
         """A [px] from normalised entries; given entries come back exactly as given."""
         pixels = entries * views.pixel_scale
         pixels[3:] += views.pixel_centre
-        A = np.eye(3)
-        A[ENTRIES] = np.where(self.free, pixels, self.entries)
-        return A
+        return intrinsic_matrix(np.where(self.free, pixels, self.entries))
+
+
+def intrinsic_matrix(entries: Array) -> Array:
+    """(3, 3) upper triangular A from its entries (5,), in any unit."""
+    A = np.eye(3)
+    A[ENTRIES] = entries
+    return A
 
 
 def known_for(

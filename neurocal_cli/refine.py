@@ -12,6 +12,7 @@ All quantities are normalised: pixels by S1, the world by each view's own S2.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,20 +174,15 @@ def _derivatives(
     u, v = out[:, :, 0], out[:, :, 1]
     u[:, 0], u[:, 1], u[:, 3] = x, y, 1.0
     v[:, 2], v[:, 4] = y, 1.0
-    rows = ((-x * Y2, -Y3 - y * Y2), (Y3 + x * Y1, y * Y1), (-Y2, Y1), (q, None), (None, q), (-x * q, -y * q))
-    for column, (dx, dy) in enumerate(rows, start=_N):
-        if dx is None:
-            np.multiply(s, dy, out=u[:, column])
-        elif dy is None:
-            np.multiply(a, dx, out=u[:, column])
-        elif np.ndim(s) == 0 and s == 0.0:
-            np.multiply(a, dx, out=u[:, column])
-        else:
-            np.add(a * dx, s * dy, out=u[:, column])
-        if dy is not None:
-            np.multiply(b, dy, out=v[:, column])
-        else:
-            v[:, column] = 0.0
+    by_omega = (-x * Y2, -Y3 - y * Y2), (Y3 + x * Y1, y * Y1), (-Y2, Y1)
+    plain = np.ndim(s) == 0 and s == 0.0  # no skew, as in most cameras
+    for column, (dx, dy) in zip((5, 6, 7, 10), (*by_omega, (-x * q, -y * q)), strict=True):
+        np.multiply(a, dx, out=u[:, column])
+        np.multiply(b, dy, out=v[:, column])
+        if not plain:
+            u[:, column] += s * dy
+    u[:, 8], v[:, 8] = a * q, 0.0
+    u[:, 9], v[:, 9] = s * q, b * q
     u[:, _R] = pixels[:, 0] - (a * x + s * y + u0)
     v[:, _R] = pixels[:, 1] - (b * y + v0)
     if whitening is not None:
@@ -202,9 +198,7 @@ def _derivatives(
 class _Descent:
     """Levenberg-Marquardt over groups: all views together when they share what is sought, else one each."""
 
-    def __init__(
-        self, tiles: Tiles, start: CameraState, free: NDArray[np.bool_], free_pose: bool
-    ) -> None:
+    def __init__(self, tiles: Tiles, start: CameraState, free: NDArray[np.bool_], free_pose: bool) -> None:
         self.tiles, self.state = tiles, start
         self.free, self.free_pose = np.flatnonzero(free), free_pose
         self.together = len(start.entries) == 1 and bool(self.free.size) and tiles.n_views > 1
@@ -213,11 +207,11 @@ class _Descent:
         self.cost = self._by_group(self.normal[:, _R, _R])
         self.damping = np.full(groups, 1e-4)
         self.growth = np.full(groups, 2.0)
-        self.floor = self._by_group(2.0 * tiles.counts) * _FLOOR**2
+        self.floor = self._by_group(tiles.counts * 2.0 * _FLOOR**2)
         self.settled = self.cost <= self.floor
         self.done = self.settled.copy()
 
-    def _by_group(self, by_view: Array) -> Array:
+    def _by_group(self, by_view: NDArray[Any]) -> Array:
         return by_view.sum(keepdims=True) if self.together else by_view
 
     def step(self) -> None:
@@ -242,9 +236,7 @@ class _Descent:
         self.damping = np.maximum(self.damping * np.where(better, shrink, self.growth), 1e-14)
         self.growth = np.where(better, 2.0, 2 * self.growth)
 
-    def _accept(
-        self, trial: CameraState, normal: Array, cost: Array, better: NDArray[np.bool_]
-    ) -> None:
+    def _accept(self, trial: CameraState, normal: Array, cost: Array, better: NDArray[np.bool_]) -> None:
         if better.all():
             self.state, self.normal, self.cost = trial, normal, cost
         elif better.any():

@@ -148,7 +148,7 @@ class _Search:
         self.starts[views] += count
         depth = output(trained.W, trained.V, patterns.inputs)[..., 2]
         real = patterns.weights > 0
-        in_front = np.where(real, depth > 0, True).all(1) | np.where(real, depth < 0, True).all(1)
+        in_front = np.asarray((~real | (depth > 0)).all(1) | (~real | (depth < 0)).all(1))
         rms = patterns.rms(trained.loss)
         for start in range(count):
             self._keep(views, slice(start, None, count), trained, rms, in_front, start)

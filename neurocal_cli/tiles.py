@@ -67,9 +67,7 @@ class Tiles:
         return np.add.reduceat(by_tile, self.first, axis=0)
 
 
-def tile(
-    local: Array, pixels: Array, whitening: Array | None, view: NDArray[np.intp], n_views: int
-) -> Tiles:
+def tile(local: Array, pixels: Array, whitening: Array | None, view: NDArray[np.intp], n_views: int) -> Tiles:
     """Cut points into tiles.
 
     Parameters

@@ -36,9 +36,7 @@ class Covariance:
     smallest: float
 
 
-def covariance(
-    normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: int
-) -> Covariance:
+def covariance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: int) -> Covariance:
     """Invert the normal matrix of a refined calibration.
 
     Parameters

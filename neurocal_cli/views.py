@@ -191,22 +191,16 @@ def arrange(points: Correspondences) -> Views:
     )  # fmt: skip
 
 
-def _principal_axes(
-    local: Array, counts: NDArray[np.intp], first: NDArray[np.intp]
-) -> tuple[Array, Array]:
+def _principal_axes(local: Array, counts: NDArray[np.intp], first: NDArray[np.intp]) -> tuple[Array, Array]:
     """Principal axes (V, 3, 3) and rms extents (V, 3) of each view's centred points."""
-    a, b = np.triu_indices(3)
-    second = np.add.reduceat(local[:, a] * local[:, b], first)
     scatter = np.empty((len(counts), 3, 3))
-    scatter[:, a, b] = scatter[:, b, a] = second
-    basis = np.linalg.eigh(scatter)[1][:, :, ::-1]
-    basis = basis * np.where(np.linalg.det(basis) < 0, -1.0, 1.0)[:, None, None]
-    # Eigenvalues of the scatter square the condition: measure the extents on the points.
-    if len(counts) == 1:
-        along = local @ basis[0]
-    else:
-        along = (local[:, None, :] @ np.repeat(basis, counts, axis=0))[:, 0]
-    return basis, np.sqrt(np.add.reduceat(along**2, first) / counts[:, None])
+    columns = np.ascontiguousarray(local.T)
+    for a, b in zip(*np.triu_indices(3), strict=True):
+        scatter[:, a, b] = scatter[:, b, a] = np.add.reduceat(columns[a] * columns[b], first)
+    values, basis = np.linalg.eigh(scatter / counts[:, None, None])
+    basis = basis[:, :, ::-1] * np.where(np.linalg.det(basis[:, :, ::-1]) < 0, -1.0, 1.0)[:, None, None]
+    # Rounding leaves 1e-16 in an eigenvalue that is 0, so 1e-8 in the extent: enough to tell a plane.
+    return basis, np.sqrt(np.maximum(values[:, ::-1], 0.0))
 
 
 def _distinct(local: Array, index: NDArray[np.intp], n_views: int) -> NDArray[np.intp]:

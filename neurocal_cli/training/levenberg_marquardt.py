@@ -18,6 +18,7 @@ linear problem; when mu is taken away the perspective unfolds from it.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,7 +102,7 @@ def _split(W: Array, product: Array) -> tuple[Array, Array]:
     """W as it was and the V that gives the product; the identity where W is nearly singular."""
     with np.errstate(over="ignore", invalid="ignore"):
         try:
-            V = np.linalg.solve(W, product)
+            V = cast("Array", np.linalg.solve(W, product))
         except np.linalg.LinAlgError:
             V = np.full_like(product, np.nan)
         regular = np.abs(V).max(axis=(1, 2)) < 1e8 * np.abs(product).max(axis=(1, 2))
@@ -130,9 +131,7 @@ class _Normal:
         row, column = np.divmod(self.free, self.n_inputs)
         self.place = (3 * row[:, None] + row) * len(a) + inputs[column[:, None], column]
 
-    def __call__(
-        self, product: Array, mu: Array, networks: NDArray[np.intp]
-    ) -> tuple[Array, Array, Array]:
+    def __call__(self, product: Array, mu: Array, networks: NDArray[np.intp]) -> tuple[Array, Array, Array]:
         """E (K,), gradient (K, n) and matrix (K, n, n) of some networks, in their order."""
         # All of them, as in most steps: no copies of the patterns.
         rows = slice(None) if len(networks) == len(self.w) else networks
@@ -230,7 +229,7 @@ class _Descent:
         # The second term keeps the matrix regular where the scale is free.
         ridge = (self.damping[active] + 1e-14) * diagonal.mean(axis=1) + 1e-300
         diagonal += ridge[:, None]
-        step = np.linalg.solve(H, -g[..., None])[..., 0]
+        step = cast("Array", np.linalg.solve(H, -g[..., None])[..., 0])
         return step, 0.5 * (ridge[:, None] * step**2 - step * g).sum(axis=1)
 
     def _adapt(self, active: NDArray[np.intp], better: NDArray[np.bool_], ratio: Array) -> None:

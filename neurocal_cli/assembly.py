@@ -1,0 +1,202 @@
+"""From the normalised solution to a calibration in pixels and world units, with its covariance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
+from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
+from neurocal_cli.job import Job, Solution
+from neurocal_cli.observability import check_determined
+from neurocal_cli.points import Correspondences
+from neurocal_cli.problems import Known, intrinsic_matrix
+from neurocal_cli.uncertainty import Covariance, covariance
+from neurocal_cli.views import Views
+
+__all__ = ["assemble"]
+
+# A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
+_POOR = 0.05
+_POOR_THETA = 0.02  # rad
+
+
+def assemble(
+    job: Job, points: Correspondences, solution: Solution, *, method: str, trainer: str, seed: int, name: str
+) -> Calibration:
+    """Put the result of `neuro.solve` into the user's units.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The points leave the answer open.
+    """
+    return _Assembly(points, job.views, job.known, solution).calibration(method, trainer, seed, name)
+
+
+@dataclass(frozen=True, eq=False)
+class _Assembly:
+    """Turns the normalised solution into a calibration in pixels and world units."""
+
+    points: Correspondences
+    views: Views
+    known: Known
+    solution: Solution
+
+    def calibration(self, method: str, trainer: str, seed: int, name: str) -> Calibration:
+        views, known, solution = self.views, self.known, self.solution
+        refined = solution.refined
+        cov = covariance(refined.normal, known.free, known.free_poses, 2 * len(views.index))
+        self._check(cov)
+        A = known.matrix(refined.state.entries[0], views)
+        intrinsics = known.intrinsics or Intrinsics.from_matrix(A)
+        if known.type != 3 and not known.free[1]:
+            intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
+        block, std = self._intrinsic_covariance(intrinsics, cov)
+        results, rmse, largest = self._views(cov)
+        free_names = tuple(n for n in INTRINSIC_NAMES if n not in known.fixed)
+        keep = [INTRINSIC_NAMES.index(n) for n in free_names]
+        reason = StopReason.CONVERGED
+        if not refined.converged:
+            reason = StopReason.MAX_ITERATIONS
+        elif not solution.tally.certain:
+            reason = StopReason.NO_AGREEMENT
+        return Calibration(
+            intrinsics=intrinsics,
+            std=std,
+            fixed=known.fixed,
+            views=results,
+            points=self.points,
+            type=known.type,
+            method=method,
+            trainer=trainer,
+            seed=seed,
+            converged=reason is StopReason.CONVERGED,
+            stop_reason=reason.value,
+            rmse_px=rmse,
+            max_px=largest,
+            covariance=block[np.ix_(keep, keep)],
+            covariance_names=free_names,
+            network=self._network(rmse),
+            camera_name=name,
+            warnings=_warnings(intrinsics, std, results),
+        )
+
+    def _check(self, cov: Covariance) -> None:
+        entries = self.solution.refined.state.entries[0]
+        free = np.flatnonzero(self.known.free)
+        relative = np.zeros(2)
+        for slot, entry in enumerate((0, 2)):
+            if entry in free:
+                place = int(np.flatnonzero(free == entry)[0])
+                relative[slot] = np.sqrt(cov.entries[place, place]) / entries[entry]
+        normals = (self.solution.refined.state.R @ self.views.basis)[:, :, 2]
+        check_determined(self.views, self.known, relative, cov.smallest, normals)
+
+    def _intrinsic_covariance(
+        self, intrinsics: Intrinsics, cov: Covariance
+    ) -> tuple[Array, dict[str, float]]:
+        """Covariance (5, 5) and std of the five intrinsic parameters; 0 for given ones."""
+        free = np.flatnonzero(self.known.free)
+        J = intrinsics.entry_jacobian()[:, free] * self.views.pixel_scale
+        block = J @ cov.entries @ J.T
+        std = {
+            name: 0.0 if name in self.known.fixed else float(np.sqrt(block[n, n]))
+            for n, name in enumerate(INTRINSIC_NAMES)
+        }
+        return block, std
+
+    def _views(self, cov: Covariance) -> tuple[dict[str, ViewResult], float, float]:
+        """Poses in world units with their std, and the pixel error (3), unweighted."""
+        views, known = self.views, self.known
+        R, t = self.solution.refined.state.R, self.solution.refined.state.t
+        centre = (R @ views.centre[..., None])[..., 0]
+        scale = views.scale[:, None]
+        t_world = t * scale - centre
+        if known.poses is not None:
+            R = np.stack([known.poses[name].R for name in views.names])
+            t_world = np.stack([known.poses[name].t for name in views.names])
+        # t = scale tau_centre - R c: omega turns R c with it.
+        J = np.zeros((len(R), 6, 6))
+        J[:, :3, :3] = euler_jacobian(R)
+        J[:, 3:, :3] = cross_matrix(centre)
+        J[:, 3:, 3:] = np.eye(3) * views.scale[:, None, None]
+        std = np.sqrt(np.maximum(np.diagonal(J @ cov.poses @ np.swapaxes(J, 1, 2), axis1=1, axis2=2), 0.0))
+        squared = self._squared_errors()
+        rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
+        R.setflags(write=False)
+        t_world.setflags(write=False)
+        results = {
+            name: ViewResult(
+                Pose.exact(*pose), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, not known.free_poses
+            )
+            for name, pose, sigma, n, r in zip(
+                views.names,
+                zip(R, t_world, strict=True),
+                std.tolist(),
+                views.counts.tolist(),
+                rms.tolist(),
+                strict=True,
+            )
+        }
+        return results, float(np.sqrt(squared.mean())), float(np.sqrt(squared.max()))
+
+    def _squared_errors(self) -> Array:
+        """Squared pixel error of each point, sorted by view; (N,)."""
+        tiles = self.views.tiles
+        errors = np.empty((len(tiles.view), tiles.local.shape[2]))
+        state = self.solution.refined.state
+        a, s, b, u0, v0 = state.entries[0]
+        for chunk in tiles.chunks():
+            view = tiles.view[chunk]
+            Xc = state.R[view] @ tiles.local[chunk] + state.t[view][:, :, None]
+            x, y = Xc[:, 0] / Xc[:, 2], Xc[:, 1] / Xc[:, 2]
+            du = tiles.pixels[chunk, 0] - (a * x + s * y + u0)
+            dv = tiles.pixels[chunk, 1] - (b * y + v0)
+            errors[chunk] = du * du + dv * dv
+        rank = np.arange(len(self.views.index)) - np.repeat(self.views.first, self.views.counts)
+        slot = np.repeat(tiles.first * tiles.local.shape[2], self.views.counts) + rank
+        return np.asarray(errors.reshape(-1)[slot] * self.views.pixel_scale**2)
+
+    def _network(self, rmse: float) -> NetworkRecord:
+        views, tally = self.views, self.solution.tally
+        state = self.solution.refined.state
+        px, n = views.pixel_scale, len(views.index)
+        return NetworkRecord(
+            W=intrinsic_matrix(state.entries[0]),
+            V={name: np.column_stack([state.R[k], state.t[k]]) for k, name in enumerate(views.names)},
+            S1=views.S1,
+            S2={name: views.S2(k) for k, name in enumerate(views.names)},
+            starts=tally.starts,
+            agreed=tally.agreed or 0,
+            iterations=tally.iterations,
+            refine_iterations=tally.refinements,
+            loss=float(np.sqrt(tally.squares / n)) * px,
+            rmse_before=float(np.sqrt(tally.before / n)) * px,
+            rmse_after=rmse,
+            curve=tuple((tally.curve * px).tolist()),
+        )
+
+
+def _warnings(
+    intrinsics: Intrinsics, std: Mapping[str, float], results: Mapping[str, ViewResult]
+) -> tuple[str, ...]:
+    """Parameters that exist but are badly determined."""
+    alpha = max(intrinsics.alpha_u, intrinsics.alpha_v)
+    limits = {
+        "alpha_u": _POOR * intrinsics.alpha_u,
+        "alpha_v": _POOR * intrinsics.alpha_v,
+        "u0": _POOR * alpha,
+        "v0": _POOR * alpha,
+        "theta": _POOR_THETA,
+    }
+    poor = [f"{name} (std {std[name]:.2g})" for name in INTRINSIC_NAMES if std[name] > limits[name]]
+    if not poor:
+        return ()
+    return (
+        f"badly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
+        "the target more, or give what is known (--no-skew, --type 2)",
+    )

@@ -1,0 +1,106 @@
+"""Whether a minimum is the right one, and what else it could be.
+
+A free network has more freedom than a camera, so its pixel error bounds from below what the camera
+can reach. A camera that comes as near to the bound as noise allows is the right one. Otherwise its
+rivals are tried: other intrinsics, the mirrored pose of a flat board, random cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.job import Job
+from neurocal_cli.observability import parameter_count
+from neurocal_cli.refine import CameraState, Refined, normal_blocks, refine
+from neurocal_cli.stage_networks import Group
+
+__all__ = ["better_by_view", "reaches_bound", "short_of_bound", "try_mirrored", "try_rival"]
+
+_TRIAL_STEPS = 15  # a rival must be ahead after so many
+_FLIP_RANGE = 20.0  # a mirrored pose this many times worse before any step is not a rival
+_FREEDOM = {True: 8, False: 11}  # of a flat and of a solid view's product, up to scale
+
+
+def reaches_bound(job: Job, refined: Refined, groups: Sequence[Group]) -> bool:
+    """Whether the camera fits as well as the free networks, up to what noise explains."""
+    bound = sum(float(g.bound.sum()) for g in groups)
+    freedom = sum(len(g.views) * _FREEDOM[g.flat] for g in groups)
+    conditions = freedom - parameter_count(job.known, job.views.n_views)
+    return bool(_explained(refined.cost.sum(), bound, conditions, 2 * len(job.views.index) - freedom))
+
+
+def short_of_bound(job: Job, refined: Refined, groups: Sequence[Group]) -> NDArray[np.bool_]:
+    """(V,) views of given intrinsics (type 3) whose pose does not fit as well as their network."""
+    short = np.zeros(job.views.n_views, dtype=bool)
+    for group in groups:
+        freedom = _FREEDOM[group.flat]
+        spare = 2 * job.views.counts[group.views] - freedom
+        short[group.views] = ~_explained(refined.cost[group.views], group.bound, freedom - 6, spare)
+    return short
+
+
+def _explained(
+    cost: Array, bound: Array | float, conditions: int, spare: NDArray[np.int64] | int
+) -> NDArray[np.bool_]:
+    """Whether an excess over the bound is what `conditions` imposed on noise would cost.
+
+    The excess over the residual variance is chi-squared distributed; the limit is its mean and six
+    standard deviations.
+    """
+    limit = conditions + 6 * np.sqrt(2.0 * max(conditions, 1)) + 10
+    variance = np.where(np.greater(spare, 0), np.asarray(bound) / np.maximum(spare, 1), 0.0)
+    return np.asarray(cost <= bound * (1 + 1e-9) + 1e-20 + limit * variance)
+
+
+def try_rival(job: Job, best: Refined, state: CameraState) -> Refined:
+    """The better of a result and what another start leads to, given a few steps to show it."""
+    trial = job.refine(state, _TRIAL_STEPS)
+    if trial.cost.sum() >= best.cost.sum():
+        return best
+    return trial if trial.converged else job.refine(trial.state)
+
+
+def better_by_view(job: Job, one: Refined, two: Refined) -> Refined:
+    """View by view the better of two results; for views that are independent (type 3)."""
+    better = two.cost < one.cost
+    R = np.where(better[:, None, None], two.state.R, one.state.R)
+    t = np.where(better[:, None], two.state.t, one.state.t)
+    return job.refine(CameraState(one.state.entries, R, t))
+
+
+def try_mirrored(job: Job, refined: Refined) -> Refined:
+    """Far flat boards have a second pose, tilted the other way, that fits nearly as well."""
+    views, state = job.views, refined.state
+    flat = np.flatnonzero(views.nearly_flat)
+    if not flat.size:
+        return refined
+    R, t = state.R.copy(), state.t.copy()
+    R[flat] = _mirrored(R[flat], t[flat], views.basis[flat])
+    normal, in_front = normal_blocks(views.tiles, CameraState(state.entries, R, t))
+    near = in_front & (normal[:, -1, -1] < _FLIP_RANGE**2 * refined.cost + 1e-20)
+    rivals = np.flatnonzero(near & views.nearly_flat)
+    if not rivals.size:
+        return refined
+    mirrored = CameraState(state.entries, R[rivals], t[rivals])
+    posed = refine(views.subset(rivals).tiles, mirrored, np.zeros(5, dtype=bool))
+    job.tally.refinements += posed.iterations
+    better = posed.cost < refined.cost[rivals] * (1 - 1e-9)
+    if not better.any():
+        return refined
+    R, t = state.R.copy(), state.t.copy()
+    R[rivals[better]], t[rivals[better]] = posed.state.R[better], posed.state.t[better]
+    again = job.refine(CameraState(state.entries, R, t))
+    return again if again.cost.sum() < refined.cost.sum() else refined
+
+
+def _mirrored(R: Array, t: Array, basis: Array) -> Array:
+    """The pose that a far flat board is mistaken for: its depths mirrored along the viewing ray."""
+    ray = t / np.linalg.norm(t, axis=1, keepdims=True)
+    normal = basis[:, :, 2]
+    across_ray = np.eye(3) - 2 * ray[:, :, None] * ray[:, None, :]
+    across_plane = np.eye(3) - 2 * normal[:, :, None] * normal[:, None, :]
+    return nearest_rotation(across_ray @ R @ across_plane)
