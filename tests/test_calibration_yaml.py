@@ -21,7 +21,10 @@ from neurocal_cli.io.yaml_text import number, quoted, text
 from neurocal_cli.io.yaml_tree import parse_yaml
 from neurocal_cli.points import Correspondences
 
-NAMES = st.text(st.characters(exclude_categories=("Cs",)), min_size=1, max_size=12) | st.sampled_from(
+# Without NUL, which NumPy drops at the end of a label.
+NAMES = st.text(
+    st.characters(exclude_categories=("Cs",), exclude_characters="\0"), min_size=1, max_size=12
+) | st.sampled_from(
     [
         "1e5",
         "0E0",
@@ -168,7 +171,7 @@ def test_a_file_written_anew_by_another_program_reads_the_same(tmp_path_factory,
     tree = yaml.load(format_calibration(cal), yaml.SafeLoader if slow else yaml.CSafeLoader)
     dumper = yaml.SafeDumper if slow else yaml.CSafeDumper
     dumper = type("Plain", (dumper,), {"ignore_aliases": lambda self, data: True})
-    again = yaml.dump(tree, Dumper=dumper, default_flow_style=style, allow_unicode=True, sort_keys=False)
+    again = yaml.dump(tree, Dumper=dumper, default_flow_style=style, sort_keys=False)
     assert same(cal, read(path, again))
 
 

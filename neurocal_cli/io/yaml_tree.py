@@ -47,7 +47,7 @@ _ROWS = re.compile(
     r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n((?:\1  - \[[^\n]*\]\n)+)", re.MULTILINE
 )
 _LABELS = frozenset(("view", "point"))
-_PLACEHOLDER = "\0rows"  # no file can hold it plainly: NUL is refused on reading
+_CUT = "!neurocal/rows"  # the tag of a scalar that stands for rows which were cut out
 
 
 def read_yaml(path: str | Path) -> tuple[Any, str]:
@@ -100,7 +100,7 @@ def _cut_rows(text: str) -> tuple[str, list[Any]]:
             return match[0]  # a name such as 1e5 without quotes is a number to JSON alone
         tables.append(table)
         head = match[0][: match.start(3) - match.start() - 1]
-        return f'{head} "\\0rows{len(tables) - 1}"' + "\n" * (len(table) + 1)
+        return f"{head} {_CUT} {len(tables) - 1}" + "\n" * (len(table) + 1)
 
     return _ROWS.sub(cut, text), tables
 
@@ -124,8 +124,8 @@ def _assemble(text: str, tables: list[Any], source: str) -> Any:
                 continue
             if not event.style:
                 value = value if str(event.tag).endswith(":str") else plain_value(value)
-            elif value.startswith(_PLACEHOLDER):
-                value = _table(value, tables, event, source)
+            if event.tag == _CUT and type(value) is int and 0 <= value < len(tables):
+                value = tables[value]
         elif kind is yaml.MappingStartEvent or kind is yaml.SequenceStartEvent:
             if type(containers[-1]) is dict and keys[-1] is None:
                 _fail("a key must be a word, not a list or mapping; correct it", event, source)
@@ -166,13 +166,6 @@ def _new_key(key: str, container: dict[str, Any], event: Any, source: str) -> st
     if key in container:
         _fail(f"the key {key[:60]!r} appears twice; remove one", event, source)
     return key
-
-
-def _table(value: str, tables: list[Any], event: Any, source: str) -> Any:
-    number = value.removeprefix(_PLACEHOLDER)
-    if number.isascii() and number.isdigit() and len(number) < 10 and int(number) < len(tables):
-        return tables[int(number)]
-    return _fail("holds a NUL character; remove it", event, source)
 
 
 def _fail(problem: str, event: Any, source: str) -> NoReturn:
