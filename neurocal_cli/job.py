@@ -12,7 +12,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.problems import Known
 from neurocal_cli.refine import CameraState, Refined, refine
 from neurocal_cli.starts import Agreement
-from neurocal_cli.training import Trainer
+from neurocal_cli.training import Task, Trained, Trainer
 from neurocal_cli.views import Views
 
 __all__ = ["Job", "Solution", "Strategy", "Tally"]
@@ -36,6 +36,9 @@ class Strategy:
         Most points of each view that a network sees.
     limit : int
         Most starts for each network.
+    constrained : callable or None
+        Trains on E_tot, eq. (14), with some weights fixed, given the task and the constant a; None
+        where the last stage alone imposes the constraints.
     """
 
     trainer: Trainer
@@ -44,6 +47,7 @@ class Strategy:
     finish: Trainer | None
     finish_points: int
     limit: int
+    constrained: Callable[[Task, float], Trained] | None = None
 
 
 @dataclass

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -140,4 +141,9 @@ def _strategy(trainer: str, starts: int, backprop: BackpropOptions | None, repor
     def train(task: Task) -> Trained:
         return train_backprop(task, options, lambda share: report("training the networks", share))
 
-    return Strategy(train, Agreement(0.02, 1e-4), (1024, 1024), None, 1024, starts)
+    def constrained(task: Task, a: float) -> Trained:
+        # Lower rates than from random weights, and every gamma where it belongs: it starts trained.
+        gentle = replace(options, rate_weights=0.4 * options.rate_weights, beta=10.0, a=a, resting_gamma=True)
+        return train_backprop(task, gentle, lambda share: report("training with E_orth", share))
+
+    return Strategy(train, Agreement(0.02, 1e-4), (1024, 1024), None, 1024, starts, constrained)

@@ -22,6 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -142,9 +143,22 @@ def residual_jacobian(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Ar
     return residuals, jacobian
 
 
+def _rotation_part(V: Array) -> Array:
+    """Columns of V that make up the rotation.
+
+    Raises
+    ------
+    InputError
+        V of a flat board, whose third column is missing.
+    """
+    if V.shape[-1] != 4:
+        raise InputError("E_orth needs V with four inputs; a flat board's V lacks a column of the rotation")
+    return V[..., :, :3]
+
+
 def e_orth(V: Array, a: float = 1.0) -> Array:
     """E_orth of eq. (14): how far the rows of V's rotation part are from orthonormal times sqrt(a); (G,)."""
-    M = V[..., :, :3]
+    M = _rotation_part(V)
     gram = M @ np.swapaxes(M, -1, -2) - a * np.eye(3)
     upper = np.triu(np.ones((3, 3)))
     return np.asarray((upper * gram**2).sum((-2, -1)))
@@ -157,7 +171,7 @@ def e_orth_gradient(V: Array, a: float = 1.0) -> Array:
     products before multiplying. The derivative pairs each row with its own product,
     2 {(v_1.v_2) V_2j + (v_1.v_3) V_3j}, and likewise for rows 2 and 3.
     """
-    M = V[..., :, :3]
+    M = _rotation_part(V)
     gram = M @ np.swapaxes(M, -1, -2) - a * np.eye(3)
     # 4 (|v_l|^2 - a) v_l from the diagonal, 2 (v_l . v_m) v_m from the rest.
     factor = 2.0 * (np.ones((3, 3)) + np.eye(3))
@@ -175,7 +189,7 @@ def e_orth_jacobian(V: Array, a: float = 1.0) -> tuple[Array, Array]:
         v_1.v_1 - a, v_1.v_2, v_1.v_3, v_2.v_2 - a, v_2.v_3, v_3.v_3 - a.
     jacobian : (G, 6, 3, I) array
     """
-    M = V[..., :, :3]
+    M = _rotation_part(V)
     rows, columns = np.triu_indices(3)
     residuals = (M @ np.swapaxes(M, -1, -2) - a * np.eye(3))[..., rows, columns]
     jacobian = np.zeros((*V.shape[:-2], 6, *V.shape[-2:]))

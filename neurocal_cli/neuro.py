@@ -3,6 +3,7 @@
 1. Each view's network learns the product W V_k from random weights (`stage_networks`).
 2. The orthogonality conditions split the products into one W and a pose for each view
    (`stage_cameras`).
+   The paper's trainer goes on with its orthogonality term (`stage_constraints`).
 3. All together on the true pixel error (3), with exact rotations (`refine`), and against whatever
    else might fit (`rivals`).
 
@@ -25,6 +26,7 @@ from neurocal_cli.random_cameras import find_camera, find_poses
 from neurocal_cli.refine import CameraState, Refined, normal_blocks
 from neurocal_cli.rivals import better_by_view, reaches_bound, short_of_bound, try_mirrored, try_rival
 from neurocal_cli.stage_cameras import cameras_from_products, candidate_intrinsics
+from neurocal_cli.stage_constraints import train_constrained
 from neurocal_cli.stage_networks import Group, begin_flat, train_networks
 
 __all__ = ["solve"]
@@ -69,7 +71,7 @@ def _camera_and_poses(job: Job) -> Refined:
     """Types 1 and 2."""
     groups = train_networks(job, np.ones(job.views.n_views, dtype=bool))
     first, *others = candidate_intrinsics(job, groups)
-    best = _begin(job, cameras_from_products(job, groups, first))
+    best = _begin(job, train_constrained(job, cameras_from_products(job, groups, first)))
     for entries in others:
         if reaches_bound(job, best, groups):
             break
@@ -125,7 +127,8 @@ def _poses(job: Job, able: NDArray[np.bool_]) -> Refined:
     """Type 3: each view's pose by itself."""
     groups = train_networks(job, able) if able.any() else []
     state = cameras_from_products(job, groups, job.entries[None])
-    best = try_mirrored(job, _begin(job, _with_random_poses(job, state, ~able)))
+    state = train_constrained(job, _with_random_poses(job, state, ~able))
+    best = try_mirrored(job, _begin(job, state))
     late = short_of_bound(job, best, groups)
     if late.any():
         best = better_by_view(job, best, job.refine(_with_random_poses(job, best.state, late)))

@@ -103,7 +103,7 @@ def check_determined(
         if views.n_views > 1 and angle < _NEARLY_PARALLEL:
             raise DegenerateGeometryError(
                 f"the {views.n_views} boards are all parallel (within {angle:.1f} degrees), so no "
-                "focal length can be told from them; tilt the board by 20 to 50 degrees in different directions"
+                "focal length can be told from them; tilt the board 20 to 50 degrees in different directions"
             )
     if singular:
         raise DegenerateGeometryError(

@@ -1,0 +1,215 @@
+"""Chessboard targets: where the vertices and the mid-points of their edges lie in the world.
+
+A plane has cols x rows inner vertices. Vertex (c, r) is ``origin + c square x_axis + r square y_axis``.
+The edges between neighbouring vertices carry the mid-points: ``h:c:r`` halfway from (c, r) to
+(c + 1, r), ``v:c:r`` halfway from (c, r) to (c, r + 1).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = ["Board", "Plane"]
+
+Triple = tuple[float, float, float]
+
+_AXIS_TOLERANCE = 1e-6
+_MOST_VERTICES = 1000  # along one side; no printer makes more, and a typing error asks for gigabytes
+
+
+@dataclass(frozen=True)
+class Plane:
+    """One flat chessboard.
+
+    Parameters
+    ----------
+    name : str
+        Prefix of the point ids; may be empty for the only plane of a board.
+    cols, rows : int
+        Inner vertices along x_axis and y_axis.
+    square : float [world unit]
+        Side of a square.
+    origin : 3 floats [world unit]
+        Vertex (0, 0).
+    x_axis, y_axis : 3 floats
+        Unit vectors, perpendicular to each other.
+
+    Raises
+    ------
+    InputError
+        A value out of range; the message begins with its name.
+    """
+
+    name: str
+    cols: int
+    rows: int
+    square: float
+    origin: Triple = (0.0, 0.0, 0.0)
+    x_axis: Triple = (1.0, 0.0, 0.0)
+    y_axis: Triple = (0.0, 1.0, 0.0)
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+        for count in ("cols", "rows"):
+            object.__setattr__(self, count, _count(count, getattr(self, count)))
+        square = _numbers("square", self.square, ())
+        if square <= 0:
+            raise InputError(f"square must be a positive length, found {square:g}")
+        object.__setattr__(self, "square", float(square))
+        for vector in ("origin", "x_axis", "y_axis"):
+            value = _numbers(vector, getattr(self, vector), (3,))
+            object.__setattr__(self, vector, tuple(value.tolist()))
+        self._check_axes()
+
+    @property
+    def prefix(self) -> str:
+        """What the ids of the plane's points begin with: ``name/``, or nothing without a name."""
+        return f"{self.name}/" if self.name else ""
+
+    @property
+    def normal(self) -> Array:
+        """(3,) array: x_axis x y_axis."""
+        return np.cross(self.x_axis, self.y_axis)
+
+    def at(self, grid: ArrayLike) -> Array:
+        """World coordinates of grid coordinates, (0, 0) being the first vertex and 1 a square.
+
+        Parameters
+        ----------
+        grid : (..., 2) array
+            Along x_axis and y_axis, in squares.
+
+        Returns
+        -------
+        world : (..., 3) array [world unit]
+        """
+        lengths = self.square * np.asarray(grid, dtype=float)
+        return lengths @ np.array([self.x_axis, self.y_axis]) + np.array(self.origin)
+
+    def vertices(self) -> Array:
+        """World coordinates of the vertices, ``[r, c]``; (rows, cols, 3) array [world unit]."""
+        c, r = np.meshgrid(np.arange(self.cols), np.arange(self.rows))
+        return self.at(np.stack([c, r], axis=-1))
+
+    def vertex_ids(self) -> tuple[str, ...]:
+        """Ids of the vertices, ``[plane/]c:r``, row by row."""
+        return tuple(f"{self.prefix}{c}:{r}" for r in range(self.rows) for c in range(self.cols))
+
+    def midpoint_grid(self) -> Array:
+        """Grid coordinates of the mid-points, all of ``h`` row by row and then all of ``v``.
+
+        Returns
+        -------
+        grid : (N, 2) array [squares]
+            (c + 1/2, r) for ``h``, (c, r + 1/2) for ``v``;
+            N = (cols - 1) rows + cols (rows - 1).
+        """
+        c, r = np.meshgrid(np.arange(self.cols - 1) + 0.5, np.arange(self.rows))
+        along_x = np.stack([c, r], axis=-1).reshape(-1, 2)
+        c, r = np.meshgrid(np.arange(self.cols), np.arange(self.rows - 1) + 0.5)
+        return np.concatenate([along_x, np.stack([c, r], axis=-1).reshape(-1, 2)])
+
+    def midpoint_ids(self) -> tuple[str, ...]:
+        """Ids of the mid-points in the order of `midpoint_grid`."""
+        along_x = [f"{self.prefix}h:{c}:{r}" for r in range(self.rows) for c in range(self.cols - 1)]
+        along_y = [f"{self.prefix}v:{c}:{r}" for r in range(self.rows - 1) for c in range(self.cols)]
+        return (*along_x, *along_y)
+
+    def midpoints(self) -> tuple[tuple[str, ...], Array]:
+        """Ids (N) and world coordinates (N, 3) [world unit] of the mid-points; see `midpoint_grid`."""
+        return self.midpoint_ids(), self.at(self.midpoint_grid())
+
+    def _check_axes(self) -> None:
+        x, y = np.array(self.x_axis), np.array(self.y_axis)
+        for name, axis in (("x_axis", x), ("y_axis", y)):
+            length = float(np.linalg.norm(axis))
+            if abs(length - 1) > _AXIS_TOLERANCE:
+                raise InputError(f"{name} must have the length 1, found {length:.9g}; divide it by that")
+        if abs(float(x @ y)) > _AXIS_TOLERANCE:
+            raise InputError(
+                f"x_axis and y_axis must be perpendicular, found the cosine {float(x @ y):.3g} between them"
+            )
+
+
+@dataclass(frozen=True)
+class Board:
+    """A calibration target of one or several flat chessboards.
+
+    Parameters
+    ----------
+    planes : Planes, at least one
+        Several of them need names, all different.
+    unit : str
+        Of all lengths.
+
+    Raises
+    ------
+    InputError
+        No plane, or names that are missing or the same.
+    """
+
+    planes: tuple[Plane, ...]
+    unit: str = "mm"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "planes", tuple(self.planes))
+        if not self.planes:
+            raise InputError("a board needs at least one plane")
+        names = [plane.name for plane in self.planes]
+        if len(names) > 1 and "" in names:
+            raise InputError("a board of several planes needs a name for each of them")
+        doubled = sorted({name for name in names if names.count(name) > 1})
+        if doubled:
+            raise InputError(f"two planes have the name {doubled[0]!r}; rename one")
+
+    @classmethod
+    def single(cls, cols: int, rows: int, square: float, unit: str = "mm") -> Board:
+        """Board of one plane without a name, at the world's origin."""
+        return cls((Plane("", cols, rows, square),), unit)
+
+    def plane(self, name: str) -> Plane:
+        """Find the plane with a name.
+
+        Raises
+        ------
+        InputError
+            There is none.
+        """
+        for plane in self.planes:
+            if plane.name == name:
+                return plane
+        raise InputError(f"the board has no plane {name!r}; it has {[p.name for p in self.planes]}")
+
+
+def _check_name(name: object) -> None:
+    if not isinstance(name, str):
+        raise InputError(f"name must be text, found {name!r}")
+    if name != name.strip() or not name.isprintable() or "/" in name:
+        raise InputError(f"name must be printable, without '/' and outer blanks, found {name!r}; rename it")
+
+
+def _count(name: str, value: object) -> int:
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or not 2 <= int(value) <= _MOST_VERTICES:  # type: ignore[call-overload]
+        raise InputError(
+            f"{name} counts inner vertices and must be a whole number from 2 to {_MOST_VERTICES}, "
+            f"found {value!r}"
+        )
+    return int(value)  # type: ignore[call-overload,no-any-return]
+
+
+def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    words = "a finite number" if shape == () else f"{shape[0]} finite numbers"
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} must be {words}, found {value!r}") from error
+    if array.shape != shape or not np.isfinite(array).all():
+        raise InputError(f"{name} must be {words}, found {value!r}")
+    return array
