@@ -171,7 +171,7 @@ class _Assembly:
             S1=views.S1,
             S2={name: views.S2(k) for k, name in enumerate(views.names)},
             starts=tally.starts,
-            agreed=tally.agreed or 0,
+            agreed=int(tally.agreed.min()),
             iterations=tally.iterations,
             refine_iterations=tally.refinements,
             loss=float(np.sqrt(tally.squares / n)) * px,

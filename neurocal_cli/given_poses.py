@@ -48,7 +48,7 @@ def solve_given_poses(job: Job) -> Solution:
     entries = np.where(known.free, learnt.W[0][ENTRIES], job.entries)[None]
     state = CameraState(entries, R, t)
     tally = job.tally
-    tally.note(int(learnt.starts.sum()), learnt.iterations, learnt.agreed)
+    tally.note(np.arange(views.n_views), learnt.agreed, int(learnt.starts.sum()), learnt.iterations)
     tally.squares = float(learnt.rms[0] ** 2 * len(views.index))
     tally.before = float(normal_blocks(views.tiles, state)[0][:, -1, -1].sum())
     tally.curve = learnt.curve

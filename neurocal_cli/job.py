@@ -56,34 +56,34 @@ class Tally:
 
     Attributes
     ----------
+    agreed : (V,) int array
+        How many of each view's starts ended at its best result.
     starts, iterations, refinements : int
         Random starts, their training steps, steps on the pixel error.
-    agreed : int or None
-        Starts that ended at the best result, the least of all networks.
-    certain : bool
-        Whether at least two did, for every network.
     squares, before : float
         Sum of E_2D's squares; squared pixel error at the start of the last stage.
     curve : (J,) array
         Learning curve of the first view's best start.
     """
 
+    agreed: NDArray[np.int64]
     starts: int = 0
     iterations: int = 0
     refinements: int = 0
-    agreed: int | None = None
-    certain: bool = True
     squares: float = 0.0
     before: float = 0.0
     curve: Array = field(default_factory=lambda: np.zeros(0))
 
-    def note(self, starts: int, iterations: int, agreed: NDArray[np.int64]) -> None:
-        """Enter the random starts of some networks."""
-        least = int(agreed.min())
+    @property
+    def certain(self) -> bool:
+        """Whether two starts agreed for every view."""
+        return bool((self.agreed >= 2).all())
+
+    def note(self, views: NDArray[np.intp], agreed: NDArray[np.int64], starts: int, iterations: int) -> None:
+        """Enter the random starts of some views; what was known of them is replaced."""
+        self.agreed[views] = agreed
         self.starts += starts
         self.iterations += iterations
-        self.agreed = least if self.agreed is None else min(self.agreed, least)
-        self.certain = self.certain and least >= 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +120,10 @@ class Job:
     strategy: Strategy
     rng: np.random.Generator
     progress: Callable[[str, float], None]
-    tally: Tally = field(default_factory=Tally)
+    tally: Tally = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "tally", Tally(np.zeros(self.views.n_views, dtype=np.int64)))
 
     @property
     def entries(self) -> Array:

@@ -102,7 +102,7 @@ def _camera_from_few_points(job: Job) -> Refined:
         raise DegenerateGeometryError(
             f"no random start found a camera for these {len(job.views.index)} points; give more points"
         )
-    job.tally.note(found.starts, found.iterations, found.agreed)
+    job.tally.note(np.array([0]), found.agreed, found.starts, found.iterations)
     return _begin(job, found.state)
 
 
@@ -115,8 +115,11 @@ def _helped_by_others(job: Job, able: NDArray[np.bool_]) -> Refined:
             f"{views.distinct[0]}); at least one needs 6, or 4 on a flat board"
         )
     helpers = np.flatnonzero(able)
-    part = Job(views.subset(helpers), job.known, job.strategy, job.rng, job.progress, job.tally)
+    part = Job(views.subset(helpers), job.known, job.strategy, job.rng, job.progress)
     known = _camera_and_poses(part).state
+    job.tally.note(helpers, part.tally.agreed, part.tally.starts, part.tally.iterations)
+    job.tally.squares, job.tally.before = part.tally.squares, part.tally.before
+    job.tally.refinements, job.tally.curve = part.tally.refinements, part.tally.curve
     R, t = np.zeros((views.n_views, 3, 3)), np.zeros((views.n_views, 3))
     R[helpers], t[helpers] = known.R, known.t
     state = _with_random_poses(job, CameraState(known.entries, R, t), ~able)
@@ -129,7 +132,7 @@ def _poses(job: Job, able: NDArray[np.bool_]) -> Refined:
     state = cameras_from_products(job, groups, job.entries[None])
     state = train_constrained(job, _with_random_poses(job, state, ~able))
     best = try_mirrored(job, _begin(job, state))
-    late = short_of_bound(job, best, groups)
+    late = short_of_bound(job, best, groups) | (able & (job.tally.agreed < 2))
     if late.any():
         best = better_by_view(job, best, job.refine(_with_random_poses(job, best.state, late)))
     return best
@@ -142,7 +145,7 @@ def _with_random_poses(job: Job, state: CameraState, which: NDArray[np.bool_]) -
         return state
     starts = max(job.strategy.limit, _FEW_POINT_STARTS)
     found = find_poses(job.views, members, state.entries, job.rng, starts)
-    job.tally.note(found.starts, found.iterations, found.agreed)
+    job.tally.note(members, found.agreed, found.starts, found.iterations)
     R, t = state.R.copy(), state.t.copy()
     R[members], t[members] = found.state.R, found.state.t
     return CameraState(state.entries, R, t)

@@ -73,8 +73,7 @@ def _train_group(job: Job, members: NDArray[np.intp], flat: bool) -> Group:
         trained = s.finish(Task(every, learnt.W, learnt.V, *free))
         learnt = replace(learnt, W=trained.W, V=trained.V, rms=every.rms(trained.loss))
         tally.iterations += int(trained.iterations.sum())
-    tally.note(int(learnt.starts.sum()), learnt.iterations, learnt.agreed)
-    tally.certain = tally.certain and bool(learnt.in_front.all())
+    tally.note(members, learnt.agreed, int(learnt.starts.sum()), learnt.iterations)
     tally.squares += float((learnt.rms**2 * views.counts[members]).sum())
     if members[0] == 0:
         tally.curve = learnt.curve
