@@ -21,7 +21,9 @@ from neurocal_cli.stage_networks import Group
 __all__ = ["better_by_view", "reaches_bound", "short_of_bound", "try_mirrored", "try_rival"]
 
 _TRIAL_STEPS = 15  # a rival must be ahead after so many
-_FLIP_RANGE = 20.0  # a mirrored pose this many times worse before any step is not a rival
+# A mirrored pose is a rival while its rms error is below so many times the other's: at first, and
+# after a few steps.
+_FLIP_RANGE, _FLIP_STEPS, _FLIP_CLOSE = 10.0, 3, 2.0
 _FREEDOM = {True: 8, False: 11}  # of a flat and of a solid view's product, up to scale
 
 
@@ -83,18 +85,28 @@ def try_mirrored(job: Job, refined: Refined) -> Refined:
     normal, in_front = normal_blocks(views.tiles, CameraState(state.entries, R, t))
     near = in_front & (normal[:, -1, -1] < _FLIP_RANGE**2 * refined.cost + 1e-20)
     rivals = np.flatnonzero(near & views.nearly_flat)
-    if not rivals.size:
-        return refined
-    mirrored = CameraState(state.entries, R[rivals], t[rivals])
-    posed = refine(views.subset(rivals).tiles, mirrored, np.zeros(5, dtype=bool))
-    job.tally.refinements += posed.iterations
+    for steps in (_FLIP_STEPS, 200):
+        if not rivals.size:
+            return refined
+        posed = _pose_alone(job, CameraState(state.entries, R[rivals], t[rivals]), rivals, steps)
+        R[rivals], t[rivals] = posed.state.R, posed.state.t
+        close = posed.cost < _FLIP_CLOSE**2 * refined.cost[rivals] + 1e-20
+        if steps == _FLIP_STEPS:
+            rivals = rivals[close]
     better = posed.cost < refined.cost[rivals] * (1 - 1e-9)
     if not better.any():
         return refined
-    R, t = state.R.copy(), state.t.copy()
-    R[rivals[better]], t[rivals[better]] = posed.state.R[better], posed.state.t[better]
-    again = job.refine(CameraState(state.entries, R, t))
+    moved_R, moved_t = state.R.copy(), state.t.copy()
+    moved_R[rivals[better]], moved_t[rivals[better]] = R[rivals[better]], t[rivals[better]]
+    again = job.refine(CameraState(state.entries, moved_R, moved_t))
     return again if again.cost.sum() < refined.cost.sum() else refined
+
+
+def _pose_alone(job: Job, state: CameraState, views: NDArray[np.intp], steps: int) -> Refined:
+    """Refine some views' poses with the intrinsics as they are."""
+    posed = refine(job.views.subset(views).tiles, state, np.zeros(5, dtype=bool), max_iterations=steps)
+    job.tally.refinements += posed.iterations
+    return posed
 
 
 def _mirrored(R: Array, t: Array, basis: Array) -> Array:

@@ -93,16 +93,14 @@ def board_midpoints(cols: int, rows: int) -> Array:
 
 def table_1() -> Scene:
     """The paper's simulated camera looking into a corner of two boards, 440 points."""
-    m = 18.0 * board_midpoints(11, 11)
+    m = 17.0 * board_midpoints(11, 11)
     zero = np.zeros(len(m))
-    wall = np.column_stack([18 + m[:, 0], -80 + m[:, 1], zero])
-    side = np.column_stack([zero, -80 + m[:, 1], -18 - m[:, 0]])
+    wall = np.column_stack([17 + m[:, 0], -75 + m[:, 1], zero])
+    side = np.column_stack([zero, -75 + m[:, 1], -17 - m[:, 0]])
     world = np.concatenate([wall, side])
     pixels, depth = project(TABLE_1_CAMERA.A, TABLE_1_POSE, world)
     assert depth.min() > 0
-    return Scene(
-        world, pixels, ["view"] * len(world), TABLE_1_CAMERA, {"view": TABLE_1_POSE}, (352, 240)
-    )
+    return Scene(world, pixels, ["view"] * len(world), TABLE_1_CAMERA, {"view": TABLE_1_POSE}, (352, 240))
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
@@ -181,7 +179,12 @@ def random_flat_set(rng: np.random.Generator, n_views: int, skew: bool, **fixed:
         pixels.append(seen)
         names += [name] * len(board)
     return Scene(
-        np.concatenate(worlds), np.concatenate(pixels), names, Intrinsics.from_matrix(A), poses, (width, height)
+        np.concatenate(worlds),
+        np.concatenate(pixels),
+        names,
+        Intrinsics.from_matrix(A),
+        poses,
+        (width, height),
     )
 
 

@@ -36,9 +36,7 @@ def bound(scene: Scene, type: int) -> Array:
 def run(type: int, sigma: float, trials: int) -> tuple[Array, Array]:
     """Ratios of the rms error and of the rms reported std to the bound, estimated ones only."""
     scene, rng = table_1(), np.random.default_rng(1000 * type + int(10 * sigma))
-    truth = np.concatenate(
-        [scene.intrinsics.values(), scene.poses["view"].euler, scene.poses["view"].t]
-    )
+    truth = np.concatenate([scene.intrinsics.values(), scene.poses["view"].euler, scene.poses["view"].t])
     errors, stds = [], []
     for trial in range(trials):
         calibration = calibrate(scene.points(sigma, rng), seed=trial, **scene.given(type))

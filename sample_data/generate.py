@@ -1,0 +1,83 @@
+"""Make the sample data: simulated cameras, seeded noise, nothing measured.
+
+Run ``python sample_data/generate.py`` to write the files again, byte for byte.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from neurocal_cli.board import Board, Plane
+from neurocal_cli.camera import Intrinsics, Pose, project
+from neurocal_cli.io.points_csv import write_points
+from neurocal_cli.points import Correspondences
+
+HERE = Path(__file__).resolve().parent
+SIGMA = 0.1  # px, of the simulated detector
+
+
+def corner() -> Correspondences:
+    """The camera of the paper's Table 1, looking into a corner of two boards: 440 mid-points."""
+    camera = Intrinsics(556.0, 549.0, 172.0, 121.0, 1.5708)
+    pose = Pose.from_euler(0.09, 0.80, -0.03, np.array([-27.0, -28.0, 701.0]))
+    board = Board(
+        (
+            Plane("wall", 11, 11, 17.0, (17, -75, 0), (1, 0, 0), (0, 1, 0)),
+            Plane("side", 11, 11, 17.0, (0, -75, -17), (0, 0, -1), (0, 1, 0)),
+        )
+    )
+    rng = np.random.default_rng(1)
+    ids, world = zip(*(plane.midpoints() for plane in board.planes), strict=True)
+    pixels = seen(camera, pose, np.concatenate(world), (352, 240), rng)
+    return Correspondences(
+        np.concatenate(world),
+        pixels,
+        view=["corner"] * len(pixels),
+        point=np.concatenate(ids),
+        image_size=(352, 240),
+        image_center=(172.0, 121.0),
+    )
+
+
+def flat_views() -> Correspondences:
+    """Ten views of a flat board of 9 x 6 vertices, 25 mm squares: 93 mid-points each."""
+    camera = Intrinsics(812.0, 809.0, 322.5, 236.0)
+    ids, world = Board.single(9, 6, 25.0).planes[0].midpoints()
+    rng = np.random.default_rng(2)
+    poses = list(tilted_poses(world.mean(axis=0), 10, rng))
+    pixels = [seen(camera, pose, world, (640, 480), rng) for pose in poses]
+    return Correspondences(
+        np.tile(world, (len(poses), 1)),
+        np.concatenate(pixels),
+        view=np.repeat([f"view{k + 1:02d}" for k in range(len(poses))], len(world)),
+        point=np.tile(ids, len(poses)),
+        image_size=(640, 480),
+    )
+
+
+def tilted_poses(centre: np.ndarray, n: int, rng: np.random.Generator) -> Iterator[Pose]:
+    """Poses that tilt the board 20-40 degrees to all sides, its centre near the image's."""
+    for k in range(n):
+        tilt, side = np.radians(rng.uniform(20, 40)), 2 * np.pi * k / n
+        turn = Pose.from_euler(0, 0, side, np.zeros(3)).R
+        R = turn @ Pose.from_euler(tilt, 0, 0, np.zeros(3)).R @ turn.T
+        t = np.array([rng.uniform(-40, 40), rng.uniform(-30, 30), rng.uniform(420, 560)])
+        yield Pose(R, t - R @ centre)
+
+
+def seen(
+    camera: Intrinsics, pose: Pose, world: np.ndarray, size: tuple[int, int], rng: np.random.Generator
+) -> np.ndarray:
+    """Pixels of world points with noise, to a hundred-thousandth of a pixel; all inside the image."""
+    pixels, depth = project(camera.A, pose, world)
+    if depth.min() <= 0 or pixels.min() < 0 or (pixels > np.array(size) - 1).any():
+        raise SystemExit("a point is outside the image: choose another pose")
+    return np.round(pixels + SIGMA * rng.normal(size=pixels.shape), 5)
+
+
+if __name__ == "__main__":
+    write_points(corner(), str(HERE / "points.csv"))
+    write_points(flat_views(), str(HERE / "flat.csv"))

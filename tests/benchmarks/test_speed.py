@@ -1,0 +1,97 @@
+"""Speed, beside OpenCV in the same run; nothing is asserted about time.
+
+Run with ``pytest tests/benchmarks --benchmark-enable --benchmark-group-by=param:n_views``.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from scenes import Scene, random_flat_set, table_1
+
+from neurocal_cli import Correspondences, calibrate, read_points
+from neurocal_cli.camera import project
+
+VIEWS = [13, 100, 1000]
+
+
+def flat_scene(n_views: int) -> Scene:
+    rng = np.random.default_rng(5)
+    return random_flat_set(rng, n_views, False, cols=9, rows=6, f=1500)
+
+
+@pytest.mark.benchmark(group="flat views of 54 points")
+@pytest.mark.parametrize("n_views", [*VIEWS, 3000])
+def test_neurocal_on_flat_views(benchmark: BenchmarkFixture, n_views: int) -> None:
+    points = flat_scene(n_views).points(0.3, np.random.default_rng(1))
+    calibration = benchmark(lambda: calibrate(points, skew=False))
+    assert calibration.converged
+
+
+@pytest.mark.benchmark(group="flat views of 54 points")
+@pytest.mark.parametrize("n_views", VIEWS)
+def test_opencv_on_the_same_views(benchmark: BenchmarkFixture, n_views: int) -> None:
+    cv2 = pytest.importorskip("cv2")
+    cv2.setNumThreads(1)
+    points = flat_scene(n_views).points(0.3, np.random.default_rng(1))
+    views = range(points.n_views)
+    world = [points.world[points.view_index == k].astype(np.float32) for k in views]
+    pixels = [points.pixels[points.view_index == k].astype(np.float32) for k in views]
+    # The pinhole camera without skew: the same unknowns.
+    flags = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    result = benchmark(lambda: cv2.calibrateCamera(world, pixels, points.image_size, None, None, flags=flags))
+    assert result[0] == pytest.approx(calibrate(points, skew=False).rmse_px, rel=1e-4)
+
+
+@pytest.mark.benchmark(group="one view")
+@pytest.mark.parametrize("type", [1, 2, 3, 4])
+def test_one_view_of_440_points(benchmark: BenchmarkFixture, type: int) -> None:
+    scene = table_1()
+    points = scene.points(0.3, np.random.default_rng(1))
+    assert benchmark(lambda: calibrate(points, **scene.given(type))).converged
+
+
+def million_points() -> Correspondences:
+    scene, rng = table_1(), np.random.default_rng(2)
+    world = rng.uniform(-90, 90, (1_000_000, 3))
+    pixels, _ = project(scene.intrinsics.A, scene.poses["view"], world)
+    return Correspondences(world, pixels + 0.3 * rng.normal(size=pixels.shape))
+
+
+@pytest.mark.benchmark(group="one view")
+def test_one_view_of_a_million_points(benchmark: BenchmarkFixture) -> None:
+    points = million_points()
+    assert benchmark.pedantic(lambda: calibrate(points), rounds=3).converged
+
+
+@pytest.mark.benchmark(group="reading")
+def test_reading_a_million_rows(benchmark: BenchmarkFixture, tmp_path: Path) -> None:
+    points = million_points()
+    rows = np.column_stack([points.world, points.pixels])
+    file = tmp_path / "million.csv"
+    file.write_text("X,Y,Z,u,v\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")
+    assert len(benchmark.pedantic(lambda: read_points(str(file)), rounds=3)) == 1_000_000
+
+
+@pytest.mark.benchmark(group="whole commands")
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["-c", "import click, rich"],
+        ["-m", "neurocal_cli", "--help"],
+        ["-c", "import numpy, yaml, click"],
+        ["-m", "neurocal_cli", "calibrate", "sample_data/points.csv", "-o", "{tmp}/camera.yaml"],
+    ],
+    ids=["import click, rich", "neurocal --help", "import numpy, yaml, click", "calibrate 440 points"],
+)
+def test_a_whole_process(benchmark: BenchmarkFixture, tmp_path: Path, command: list[str]) -> None:
+    root = Path(__file__).resolve().parents[2]
+    full = [sys.executable, *(part.replace("{tmp}", str(tmp_path)) for part in command)]
+    benchmark.pedantic(
+        lambda: subprocess.run(full, cwd=root, check=True, capture_output=True), rounds=10, warmup_rounds=2
+    )
