@@ -16,6 +16,8 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Covariance", "covariance"]
 
+_ROUNDING = 1e-30  # an eigenvalue this far below the diagonal is not there
+
 
 @dataclass(frozen=True, eq=False)
 class Covariance:
@@ -69,7 +71,10 @@ def covariance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residu
 
 
 def _inverse(H: Array, reference: Array) -> tuple[Array, float]:
-    """Inverse of symmetric matrices, and their smallest eigenvalue relative to `reference`'s diagonal."""
+    """Inverse of symmetric matrices, and their smallest eigenvalue relative to `reference`'s diagonal.
+
+    The inverse is nan and the eigenvalue 0 where a matrix is singular.
+    """
     scale = 1.0 / np.sqrt(np.diagonal(reference, axis1=-2, axis2=-1) + 1e-300)
     outer = scale[..., :, None] * scale[..., None, :]
     scaled = H * outer
@@ -77,6 +82,7 @@ def _inverse(H: Array, reference: Array) -> tuple[Array, float]:
         return np.full_like(H, np.nan), 0.0
     values, vectors = np.linalg.eigh(scaled)
     smallest = float(values.min(initial=1.0))
-    safe = np.maximum(values, 1e-300)
-    inverse = (vectors / safe[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return inverse * outer, max(smallest, 0.0)
+    if smallest < _ROUNDING:
+        return np.full_like(H, np.nan), 0.0
+    inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return inverse * outer, smallest
