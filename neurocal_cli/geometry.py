@@ -74,11 +74,10 @@ def rotation_to_euler(R: Array) -> Array:
     locked = cy < _GIMBAL_COSINE
     R_y = np.arctan2(-R[..., 2, 0], cy)
     R_z = np.where(locked, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
-    R_x = np.where(
-        locked,
-        np.arctan2(-R[..., 1, 2], R[..., 1, 1]),
-        np.arctan2(R[..., 2, 1], R[..., 2, 2]),
-    )
+    # From Rz^-1 R, whose second row is (0, cos R_x, -sin R_x): near the lock R_z is rounding, and
+    # this R_x makes up for it where the third row's would have an error of its own.
+    cz, sz = np.cos(R_z), np.sin(R_z)
+    R_x = np.arctan2(sz * R[..., 0, 2] - cz * R[..., 1, 2], cz * R[..., 1, 1] - sz * R[..., 0, 1])
     return np.stack([R_x, R_y, R_z], axis=-1)
 
 
