@@ -220,7 +220,7 @@ class _Descent:
         trial = self.state.moved(by_entries, by_pose)
         normal, in_front = normal_blocks(self.tiles, trial)
         sensible = in_front.all(keepdims=True) if self.together else in_front
-        sensible = sensible & (trial.entries[:, [0, 2]] > 0).all()
+        sensible = sensible & (trial.entries[:, [0, 2]] > 0).all(axis=1)
         after = self._by_group(normal[:, _R, _R])
         better = sensible & (after < self.cost) & ~self.done
         small = predicted < _TOLERANCE * self.cost
