@@ -11,6 +11,7 @@ from neurocal_cli.network import Patterns
 from neurocal_cli.problems import intrinsic_matrix
 from neurocal_cli.refine import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.starts import FixedWeights, learn
+from neurocal_cli.views import Views
 
 __all__ = ["solve_given_poses"]
 
@@ -21,10 +22,11 @@ def solve_given_poses(job: Job) -> Solution:
     Raises
     ------
     DegenerateGeometryError
-        A given pose puts points behind the camera.
+        A given pose puts points behind the camera, or only a mirrored camera could see them so.
     """
     views, known, strategy = job.views, job.known, job.strategy
     R, t = _normalised_poses(job)
+    _check_in_front(views, R, t)
     rows = views.patterns(np.arange(views.n_views), False, strategy.finish_points, job.rng)
     # Hidden outputs Y = V Z, eq. (6): the camera's coordinates.
     hidden = rows.inputs @ np.swapaxes(np.concatenate([R, t[..., None]], axis=2), 1, 2)
@@ -32,12 +34,6 @@ def solve_given_poses(job: Job) -> Solution:
     # "with appropriate scaling if necessary".
     real = rows.weights > 0
     depth = np.where(real, hidden[..., 2], np.nan)
-    if np.nanmin(depth) <= 0:
-        behind = int(np.argmax((depth <= 0).any(axis=1)))
-        raise DegenerateGeometryError(
-            f"the given pose of view {views.names[behind]!r} puts points behind the camera; "
-            "it must map world to camera, Xc = R M + t, z forward"
-        )
     hidden = hidden / np.nanmean(depth, axis=1)[:, None, None]
     patterns = Patterns(hidden[real][None], rows.targets[real][None], rows.weights[real][None])
     W = intrinsic_matrix(job.entries)
@@ -46,6 +42,11 @@ def solve_given_poses(job: Job) -> Solution:
     fixed = FixedWeights(W, np.eye(3)[None])
     learnt = learn(patterns, strategy.trainer, job.rng, strategy.limit, fixed, strategy.agreement)
     entries = np.where(known.free, learnt.W[0][ENTRIES], job.entries)[None]
+    if (entries[0, [0, 2]] <= 0).any():
+        raise DegenerateGeometryError(
+            "only a mirrored camera could see these pixels from the given poses; check the poses (world to "
+            "camera, z forward), the axes of X,Y,Z (right-handed?) and of u,v (v downwards?), and the pairing"
+        )
     state = CameraState(entries, R, t)
     tally = job.tally
     tally.note(np.arange(views.n_views), learnt.agreed, int(learnt.starts.sum()), learnt.iterations)
@@ -53,6 +54,17 @@ def solve_given_poses(job: Job) -> Solution:
     tally.before = float(normal_blocks(views.tiles, state)[0][:, -1, -1].sum())
     tally.curve = learnt.curve
     return Solution(job.refine(state), tally)
+
+
+def _check_in_front(views: Views, R: Array, t: Array) -> None:
+    """Every point, not only those that train the network."""
+    depth = (views.local * np.repeat(R[:, 2], views.counts, axis=0)).sum(axis=1)
+    behind = np.minimum.reduceat(depth, views.first) + t[:, 2] <= 0
+    if behind.any():
+        raise DegenerateGeometryError(
+            f"the given pose of view {views.names[int(np.argmax(behind))]!r} puts points behind the camera; "
+            "it must map world to camera, Xc = R M + t, z forward"
+        )
 
 
 def _normalised_poses(job: Job) -> tuple[Array, Array]:
