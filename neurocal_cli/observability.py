@@ -13,7 +13,10 @@ __all__ = ["check_determined", "check_points", "parameter_count"]
 
 _COLLINEAR = 1e-6  # second extent as a share of the first
 _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which rounding rules
-_MEANINGLESS = 0.5  # std of a focal length over its value
+# Std of a focal length over its value. Parallel boards under noise fit best with tilts of about one
+# standard deviation each, and V boards then seem to tell the focal length to 1 / sqrt(2 V): flat
+# targets have to do better than that by this factor.
+_MEANINGLESS = 0.5
 _NEARLY_PARALLEL = 5.0  # degrees
 
 
@@ -39,7 +42,7 @@ def check_points(views: Views, known: Known) -> None:
         raise DegenerateGeometryError(
             f"{equations // 2} different points give {equations} equations for {unknowns} unknowns; "
             f"give at least {unknowns // 2 + 1} points"
-            + (", or more of the camera (--no-skew, --type 2)" if known.type == 1 else "")
+            + (f", or more of the camera ({_givable(known)})" if known.type == 1 else "")
         )
 
 
@@ -66,8 +69,10 @@ def _check_planes(views: Views, known: Known) -> None:
     needed = -(-free // 2)
     names = "the intrinsics and the pose" if known.type == 1 else "alpha_u, alpha_v and theta"
     ways = [f"{needed} views of the board from different angles", "points in two planes"]
-    if known.free[1]:
-        ways.append("--no-skew" if known.type == 2 else "--type 2 --no-skew")
+    if 2 * len(flat) >= free - known.free[1]:
+        ways.append("--no-skew")
+    elif known.type == 1:
+        ways.append("--type 2 --no-skew" if known.free[1] else "--type 2")
     views_text = "one view" if len(flat) == 1 else f"{len(flat)} views"
     raise DegenerateGeometryError(
         f"{views_text} of one plane cannot tell {names} apart; give {', '.join(ways[:-1])} or {ways[-1]}"
@@ -96,21 +101,45 @@ def check_determined(
         A singular normal matrix, or a focal length known no better than to `_MEANINGLESS`.
     """
     singular = not smallest > _SINGULAR
-    if not singular and relative_std.max(initial=0.0) < _MEANINGLESS:
+    boards = views.nearly_flat.all() and known.free_poses and known.free[[0, 2]].any()
+    limit = _MEANINGLESS / np.sqrt(2 * views.n_views) if boards else _MEANINGLESS
+    if not singular and relative_std.max(initial=0.0) < limit:
         return
-    if views.nearly_flat.all() and known.free_poses and known.free[[0, 2]].any():
-        angle = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T).min(), 0, 1)))
-        if views.n_views > 1 and angle < _NEARLY_PARALLEL:
-            raise DegenerateGeometryError(
-                f"the {views.n_views} boards are all parallel (within {angle:.1f} degrees), so no "
-                "focal length can be told from them; tilt the board 20 to 50 degrees in different directions"
-            )
+    if boards:
+        _check_tilts(views, normals, singular)
+    more = f", or give more of the camera ({ways})" if (ways := _givable(known)) else ""
     if singular:
         raise DegenerateGeometryError(
             "the points do not determine all unknowns (the normal matrix is singular); "
-            "spread the points in depth, or give more of the camera (--no-skew, --type 2, --type 3)"
+            f"spread the points in depth{more}"
         )
     raise DegenerateGeometryError(
         f"the focal length is known no better than to {100 * relative_std.max():.0f} % of itself; "
-        "bring the target nearer, tilt it more, or give more of the camera (--no-skew, --type 2)"
+        f"bring the target nearer, tilt it more{more}"
     )
+
+
+def _check_tilts(views: Views, normals: Array, singular: bool) -> None:
+    """Refuse flat boards that stand parallel, to the image or to each other."""
+    if views.n_views == 1:
+        raise DegenerateGeometryError(
+            "one view of a board that is (nearly) parallel to the image cannot tell the focal length; "
+            "tilt the board by 20 to 50 degrees"
+        )
+    angle = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T).min(), 0, 1)))
+    if singular and angle >= _NEARLY_PARALLEL:
+        return
+    # Noise on parallel boards reads as a long lens and large tilts: the angle means nothing then.
+    found = "parallel as far as the noise lets one tell"
+    if angle < _NEARLY_PARALLEL:
+        found = f"all parallel (within {angle:.1f} degrees)"
+    raise DegenerateGeometryError(
+        f"the {views.n_views} boards are {found}, so no focal length can be told from them; "
+        "tilt the board by 20 to 50 degrees in different directions"
+    )
+
+
+def _givable(known: Known) -> str:
+    """Options that would leave fewer unknowns."""
+    ways = ["--no-skew"] if known.free[1] else []
+    return ", ".join(ways + [f"--type {more}" for more in (2, 3) if more > known.type])
