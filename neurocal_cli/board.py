@@ -201,7 +201,7 @@ def _count(name: str, value: object) -> int:
             f"{name} counts inner vertices and must be a whole number from 2 to {_MOST_VERTICES}, "
             f"found {value!r}"
         )
-    return int(value)  # type: ignore[call-overload,no-any-return]
+    return int(value)  # type: ignore[call-overload]
 
 
 def _numbers(name: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:

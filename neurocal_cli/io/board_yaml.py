@@ -1,0 +1,97 @@
+"""Board YAML: a chessboard target, of one plane or several, as a file that people write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.board import Board, Plane
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.io.files import write_whole
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import flow, mapping, number, text
+from neurocal_cli.io.yaml_tree import parse_yaml, read_yaml
+
+__all__ = ["format_board", "parse_board", "read_board", "write_board"]
+
+_COUNTS = ("cols", "rows")
+_VECTORS = ("origin", "x_axis", "y_axis")
+_PLANE_KEYS = ("name", *_COUNTS, "square", *_VECTORS)
+
+
+def read_board(path: str | Path) -> Board:
+    """Read a board.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``-`` is stdin.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read or is no board; the message names the file and the key.
+    """
+    return _board(Field(*read_yaml(path)))
+
+
+def parse_board(content: str, source: str = "board") -> Board:
+    """Read a board from the text of a file; see `read_board`."""
+    return _board(Field(parse_yaml(content, source), source))
+
+
+def write_board(board: Board, path: str | Path) -> None:
+    """Write a board; `read_board` gives back the same numbers to the last bit."""
+    write_whole(path, format_board(board))
+
+
+def format_board(board: Board) -> str:
+    """Board as the text of a YAML file."""
+    lines = [f"unit: {text(board.unit)}", "planes:"]
+    for plane in board.planes:
+        entries = {"name": text(plane.name)} if plane.name else {}
+        entries |= {key: str(getattr(plane, key)) for key in _COUNTS}
+        entries["square"] = number(plane.square)
+        entries |= {key: flow(np.array(getattr(plane, key))) for key in _VECTORS}
+        lines.append(f"  - {mapping(**entries)}")
+    return "\n".join([*lines, ""])
+
+
+def _board(root: Field) -> Board:
+    _only(root, ("unit", "planes"))
+    fields = list(root["planes"].items())
+    if not fields:
+        root["planes"].fail("a list of at least one plane")
+    unit = root["unit"].text() if "unit" in root else "mm"
+    planes = tuple(_plane(field, alone=len(fields) == 1) for field in fields)
+    try:
+        return Board(planes, unit)
+    except InputError as error:
+        raise FormatError(f"planes: {error}", root.source) from error
+
+
+def _plane(field: Field, *, alone: bool) -> Plane:
+    """One plane; without company it may leave out its name and where it lies."""
+    _only(field, _PLANE_KEYS)
+    cols, rows = (field[key].integer(2) for key in _COUNTS)
+    square = field["square"].number()
+    place: dict[str, Any] = {
+        key: tuple(field[key].array(3).tolist()) for key in _VECTORS if not alone or key in field
+    }
+    name = field["name"].text() if not alone or "name" in field else ""
+    try:
+        return Plane(name, cols, rows, square, **place)
+    except InputError as error:
+        raise FormatError(f"{field.path}.{error}", field.source) from error
+
+
+def _only(field: Field, known: tuple[str, ...]) -> None:
+    """Refuse keys that would be passed over: a misspelt axis would silently be the default one."""
+    for key in field.keys():  # noqa: SIM118
+        if key not in known:
+            where = f"{field.path}: " if field.path else ""
+            raise FormatError(
+                f"{where}the key {key[:60]!r} is not known; use one of {', '.join(known)}", field.source
+            )
