@@ -1,0 +1,161 @@
+"""The point-spread function: a Gaussian over the box of the pixel, integrated exactly.
+
+Most pixels are even inside, or change linearly under a gradient of light; they are convolved as a
+whole. Pixels with edges are made of cells: their means go with the rest, and what the cells differ
+from the mean is spread one pixel at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["Blur"]
+
+_TAIL = 5.7  # standard deviations beyond which the Gaussian counts as nothing: 1e-8 of the light
+_STRIP = 16  # rows at a time
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
+
+
+@dataclass(frozen=True)
+class Blur:
+    """Kernels of a blur.
+
+    Parameters
+    ----------
+    sigma : float [px]
+        Of the Gaussian.
+    parts : int
+        Cells along a pixel's side.
+    """
+
+    sigma: float
+    parts: int
+
+    @property
+    def radius(self) -> int:
+        """Pixels to each side that a pixel's light reaches."""
+        return math.ceil(_TAIL * self.sigma + 0.5)
+
+    @cached_property
+    def whole(self) -> Array:
+        """(2 radius + 1,) array: light that an even pixel sends to its neighbours."""
+        return _spread(np.arange(-self.radius, self.radius + 1.0), 0.5, self.sigma)
+
+    @cached_property
+    def slope(self) -> Array:
+        """(2 radius + 1,) array: weight of a pixel's slope for the pixel that sees it at +j."""
+        offsets = np.arange(-self.radius, self.radius + 1.0)
+        t = 0.5 * _NODES
+        return np.asarray((_response(offsets[:, None] + t, self.sigma) * t) @ (0.5 * _WEIGHTS))
+
+    @cached_property
+    def cell(self) -> Array:
+        """(2 radius + 1, parts) array: light that each cell sends to the pixel at +j.
+
+        An edge within a cell is lost in the cell's mean, which adds the variance of a box as wide
+        as the cell; the Gaussian is made narrower by that.
+        """
+        sigma = math.sqrt(max(self.sigma**2 - 1 / (12 * self.parts**2), 0.0))
+        centres = (np.arange(self.parts) + 0.5) / self.parts - 0.5
+        offsets = np.arange(-self.radius, self.radius + 1.0)
+        return _spread(offsets[:, None] - centres, 0.5 / self.parts, sigma)
+
+    def convolve(self, level: Array, slope_u: Array | None, slope_v: Array | None) -> Array:
+        """Blur an image of pixels that are even, or linear, inside.
+
+        Parameters
+        ----------
+        level : (H, W) array
+            Mean of each pixel.
+        slope_u, slope_v : (H, W) arrays, optional [1/px]
+            Slopes within each pixel.
+
+        Returns
+        -------
+        image : (H - 2 radius, W - 2 radius) array
+        """
+        image = _along_v(_along_u(level, self.whole), self.whole)
+        if slope_u is not None:
+            image += _along_v(_along_u(slope_u, self.slope), self.whole)
+        if slope_v is not None:
+            image += _along_v(_along_u(slope_v, self.whole), self.slope)
+        return image
+
+    def scatter(self, image: Array, row: NDArray[np.intp], column: NDArray[np.intp], cells: Array) -> None:
+        """Add to an image what the cells of pixels send, in place.
+
+        Parameters
+        ----------
+        image : (H, W) array
+            With a border of ``radius`` around what will be kept.
+        row, column : (N,) int arrays
+            Different pixels, at least ``radius`` from the image's border.
+        cells : (N, parts, parts) array
+            Differences from the pixel's mean, ``[pixel, v, u]``.
+        """
+        spread = self.cell @ cells @ self.cell.T
+        flat, width = image.reshape(-1), image.shape[1]
+        start = row * width + column
+        for j in range(-self.radius, self.radius + 1):
+            for i in range(-self.radius, self.radius + 1):
+                flat[start + (j * width + i)] += spread[:, j + self.radius, i + self.radius]
+
+
+def _along_u(image: Array, kernel: Array) -> Array:
+    """``out[y, x] = sum_j kernel[j] image[y, x + j]``, only where the kernel lies inside."""
+    width = image.shape[1] - len(kernel) + 1
+    out = np.empty((image.shape[0], width))
+    for first in range(0, len(image), _STRIP):  # strips stay in the cache
+        strip = image[first : first + _STRIP]
+        total = kernel[0] * strip[:, :width]
+        for j in range(1, len(kernel)):
+            total += kernel[j] * strip[:, j : j + width]
+        out[first : first + _STRIP] = total
+    return out
+
+
+def _along_v(image: Array, kernel: Array) -> Array:
+    """As `_along_u`, down the columns."""
+    height = len(image) - len(kernel) + 1
+    out = np.empty((height, image.shape[1]))
+    for first in range(0, height, _STRIP):
+        last = min(first + _STRIP, height)
+        total = kernel[0] * image[first:last]
+        for j in range(1, len(kernel)):
+            total += kernel[j] * image[first + j : last + j]
+        out[first:last] = total
+    return out
+
+
+def _response(t: Array, sigma: float) -> Array:
+    """Gaussian over the pixel's box: what a point of light at t gives to the pixel at 0."""
+    if sigma == 0:
+        return (np.abs(t) < 0.5).astype(float)
+    return _normal_cdf((t + 0.5) / sigma) - _normal_cdf((t - 0.5) / sigma)
+
+
+def _spread(offset: Array, half: float, sigma: float) -> Array:
+    """Integral of `_response` from offset - half to offset + half, in closed form."""
+    total = np.zeros_like(offset)
+    for sign, shift in ((1, 0.5 + half), (-1, 0.5 - half), (-1, half - 0.5), (1, -0.5 - half)):
+        total += sign * _twice_integrated(offset + shift, sigma)
+    return total
+
+
+def _twice_integrated(x: Array, sigma: float) -> Array:
+    if sigma == 0:
+        return np.maximum(x, 0.0)
+    z = x / sigma
+    return np.asarray(sigma * (z * _normal_cdf(z) + np.exp(-0.5 * z * z) / math.sqrt(2 * math.pi)))
+
+
+def _normal_cdf(z: Array) -> Array:
+    flat = [0.5 * math.erfc(-x / math.sqrt(2)) for x in np.asarray(z, dtype=float).ravel().tolist()]
+    return np.array(flat).reshape(np.shape(z))
