@@ -22,6 +22,7 @@ __all__ = ["assemble"]
 # A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
 _POOR = 0.05
 _POOR_THETA = 0.02  # rad
+_MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor a lens
 
 
 def assemble(
@@ -82,7 +83,18 @@ class _Assembly:
             covariance_names=free_names,
             network=self._network(rmse),
             camera_name=name,
-            warnings=_warnings(intrinsics, std, results),
+            warnings=(*self._misfit(rmse), *_warnings(intrinsics, std, results)),
+        )
+
+    def _misfit(self, rmse: float) -> tuple[str, ...]:
+        """A camera that does not fit its points at all."""
+        spread = self.views.pixel_scale * float(np.sqrt((self.views.pixels**2).sum(axis=1).mean()))
+        if rmse < _MISFIT * spread:
+            return ()
+        given = {3: ", and the intrinsics", 4: ", and the poses"}.get(self.known.type, "")
+        return (
+            f"the camera fits its points only to {rmse:.3g} px; check that each pixel belongs to its point, "
+            f"the order and the signs of X,Y,Z and u,v{given}",
         )
 
     def _check(self, cov: Covariance) -> None:

@@ -24,7 +24,14 @@ from neurocal_cli.job import Job, Solution
 from neurocal_cli.observability import parameter_count
 from neurocal_cli.random_cameras import find_camera, find_poses
 from neurocal_cli.refine import CameraState, Refined, normal_blocks
-from neurocal_cli.rivals import better_by_view, reaches_bound, short_of_bound, try_mirrored, try_rival
+from neurocal_cli.rivals import (
+    better_by_view,
+    reaches_bound,
+    refuse_mirrored,
+    short_of_bound,
+    try_mirrored,
+    try_rival,
+)
 from neurocal_cli.stage_cameras import cameras_from_products, candidate_intrinsics
 from neurocal_cli.stage_constraints import train_constrained
 from neurocal_cli.stage_networks import Group, begin_flat, train_networks
@@ -79,6 +86,7 @@ def _camera_and_poses(job: Job) -> Refined:
     best = try_mirrored(job, best)
     if job.views.n_views == 1:
         best = _against_random_cameras(job, best, groups)
+    refuse_mirrored(job, best, groups)
     return best
 
 
@@ -135,6 +143,7 @@ def _poses(job: Job, able: NDArray[np.bool_]) -> Refined:
     late = short_of_bound(job, best, groups) | (able & (job.tally.agreed < 2))
     if late.any():
         best = better_by_view(job, best, job.refine(_with_random_poses(job, best.state, late)))
+    refuse_mirrored(job, best, groups)
     return best
 
 

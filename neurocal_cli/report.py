@@ -89,8 +89,8 @@ def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], li
     e = evaluation
     overall = [
         ["[px]", "rms", "bias", "max"],
-        ["u", _pixels(e.rms_u), _pixels(e.bias_u, "+"), ""],
-        ["v", _pixels(e.rms_v), _pixels(e.bias_v, "+"), ""],
+        ["u", _pixels(e.rms_u), _bias(e.bias_u, e.rms_u), ""],
+        ["v", _pixels(e.rms_v), _bias(e.bias_v, e.rms_v), ""],
         ["both", _pixels(e.rmse_px), "", _pixels(e.max_px)],
     ]
     views = [["view", "points", "behind", "rms [px]", "max [px]", "pose"]]
@@ -116,14 +116,25 @@ def _number(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _pixels(value: float, sign: str = "") -> str:
+def _bias(value: float, rms: float) -> str:
+    """To the digits of the rms error that it is part of: what is smaller is rounding."""
+    if not (math.isfinite(value) and math.isfinite(rms)):
+        return "-"
+    text = _pixels(rms)
+    if "e" in text:
+        return f"{value:+.1e}"
+    decimals = len(text.partition(".")[2])
+    return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no minus before a zero
+
+
+def _pixels(value: float) -> str:
     """Four significant digits, without an exponent for all but tiny errors."""
     if not math.isfinite(value):
         return "-"
     if value != 0 and abs(value) < 1e-4:
-        return f"{value:{sign}.1e}"
+        return f"{value:.1e}"
     whole = len(str(int(abs(value))))
-    return f"{value:{sign}.{max(0, 5 - whole)}f}"
+    return f"{value:.{max(0, 5 - whole)}f}"
 
 
 def _name(name: str) -> str:

@@ -12,18 +12,29 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.job import Job
 from neurocal_cli.observability import parameter_count
 from neurocal_cli.refine import CameraState, Refined, normal_blocks, refine
 from neurocal_cli.stage_networks import Group
 
-__all__ = ["better_by_view", "reaches_bound", "short_of_bound", "try_mirrored", "try_rival"]
+__all__ = [
+    "better_by_view",
+    "reaches_bound",
+    "refuse_mirrored",
+    "short_of_bound",
+    "try_mirrored",
+    "try_rival",
+]
 
 _TRIAL_STEPS = 15  # a rival must be ahead after so many
 # A mirrored pose is a rival while its rms error is below so many times the other's: at first, and
 # after a few steps.
 _FLIP_RANGE, _FLIP_STEPS, _FLIP_CLOSE = 10.0, 3, 2.0
+# Data are taken for mirrored when a mirrored camera's rms error is so many times lower, and there
+# are enough points that chance does not do that.
+_MIRRORED_BETTER, _MIRRORED_POINTS = 3.0, 12
 _FREEDOM = {True: 8, False: 11}  # of a flat and of a solid view's product, up to scale
 
 
@@ -56,6 +67,28 @@ def _explained(
     limit = conditions + 6 * np.sqrt(2.0 * max(conditions, 1)) + 10
     variance = np.where(np.greater(spare, 0), np.asarray(bound) / np.maximum(spare, 1), 0.0)
     return np.asarray(cost <= bound * (1 + 1e-9) + 1e-20 + limit * variance)
+
+
+def refuse_mirrored(job: Job, refined: Refined, groups: Sequence[Group]) -> None:
+    """Refuse points in space that a free network fits well, but as a mirrored camera.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        X,Y,Z left-handed, two columns swapped, v upwards.
+    """
+    for group in groups:
+        if group.flat:
+            continue
+        # The normalised origin is the points' centroid: in front with P's right sign.
+        mirrored = np.linalg.det(group.product[:, :, :3]) * group.product[:, 2, 3] < 0
+        mirrored &= refined.cost[group.views] > _MIRRORED_BETTER**2 * group.bound + 1e-20
+        mirrored &= job.views.distinct[group.views] >= _MIRRORED_POINTS
+        if mirrored.any():
+            raise DegenerateGeometryError(
+                f"view {job.views.names[group.views[int(np.argmax(mirrored))]]!r}: only a mirrored camera "
+                "could see these points; check the axes of X,Y,Z (right-handed?) and of u,v (v downwards?)"
+            )
 
 
 def try_rival(job: Job, best: Refined, state: CameraState) -> Refined:

@@ -62,7 +62,7 @@ def test_given_parameters_stay_exactly_as_given(type: int) -> None:
         assert (K.u0, K.v0) == (172.0, 121.0)
         assert calibration.std["u0"] == calibration.std["v0"] == 0.0
     if type == 3:
-        assert K == scene.intrinsics
+        assert scene.intrinsics == K
     if type == 4:
         assert np.array_equal(pose.R, scene.poses["view"].R)
         assert np.array_equal(pose.t, scene.poses["view"].t)
