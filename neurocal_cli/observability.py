@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
@@ -52,12 +53,22 @@ def _check_each_view(views: Views) -> None:
     for bad, reason in (
         (views.distinct < 2, "all points are the same world point; check the columns X,Y,Z"),
         (line, "all points lie on one line; give points that spread over a plane or in space"),
+        (_on_one_line(views), "all pixels u,v lie on one line; check the columns"),
         (few, "fewer than 4 different points; give at least 4 (6 for a solid target of type 1)"),
     ):
         if bad.any():
             which = int(np.argmax(bad))
             many = f" (and {int(bad.sum()) - 1} more views)" if bad.sum() > 1 else ""
             raise DegenerateGeometryError(f"view {views.names[which]!r}{many}: {reason}")
+
+
+def _on_one_line(views: Views) -> NDArray[np.bool_]:
+    """(V,) whether all the view's pixels do, or are the same."""
+    centre = np.add.reduceat(views.pixels, views.first) / views.counts[:, None]
+    du, dv = (views.pixels - np.repeat(centre, views.counts, axis=0)).T
+    suu, suv, svv = (np.add.reduceat(product, views.first) for product in (du * du, du * dv, dv * dv))
+    total = suu + svv
+    return np.asarray(total - np.hypot(suu - svv, 2 * suv) <= 2 * _COLLINEAR**2 * total)
 
 
 def _check_planes(views: Views, known: Known) -> None:
@@ -113,9 +124,11 @@ def check_determined(
             "the points do not determine all unknowns (the normal matrix is singular); "
             f"spread the points in depth{more}"
         )
+    share = relative_std.max()
+    known_to = f"is known no better than to {100 * share:.0f} % of itself" if share < 1 else "cannot be told"
     raise DegenerateGeometryError(
-        f"the focal length is known no better than to {100 * relative_std.max():.0f} % of itself; "
-        f"bring the target nearer, tilt it more{more}"
+        f"the focal length {known_to}; bring the target nearer, tilt it more{more}, and check that each "
+        "pixel belongs to its point"
     )
 
 
