@@ -1,0 +1,79 @@
+"""What is found and what is measured: the vertices of a chessboard, its edges' mid-points.
+
+Grid coordinates are whole numbers (c, r), c along a row of vertices and r along a column, oriented
+like the image: turning from the direction of growing c to that of growing r is turning from u to v.
+Where (0, 0) lies and which side is c is arbitrary here; `identity` settles it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["EDGE_H", "EDGE_V", "VERTEX", "Grid", "Measured"]
+
+# Kinds of points: the mid-point of the edge from (c, r) to (c + 1, r), from (c, r) to (c, r + 1),
+# and the vertex (c, r) itself.
+EDGE_H, EDGE_V, VERTEX = 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """Vertices of one chessboard, as far as they are seen.
+
+    Attributes
+    ----------
+    pixels : (rows, cols, 2) array [px]
+        Of vertex (c, r) at ``[r, c]``; nan where it was not found. The first and last row and column
+        each hold at least one vertex.
+    dark : int
+        0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where ``c + r + dark`` is even.
+    """
+
+    pixels: Array
+    dark: int
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """(rows, cols) which vertices were found."""
+        return np.isfinite(self.pixels[..., 0])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(cols, rows), as boards are named."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+
+@dataclass(frozen=True, eq=False)
+class Measured:
+    """Points of one grid, measured in the image.
+
+    Attributes
+    ----------
+    kind : (N,) int array
+        `EDGE_H`, `EDGE_V` or `VERTEX`.
+    index : (N, 2) int array
+        (c, r), in the grid's coordinates.
+    pixels : (N, 2) array [px]
+    covariance : (N, 3) array [px^2]
+        suu, suv, svv.
+    vertices : (rows, cols, 2) array [px]
+        The grid's vertices after refinement, nan where not seen or not fitted.
+    rejected : int
+        Fits that failed the quality gate and are left out.
+    polarity : float [px]
+        How far the edges were displaced towards the dark side by gamma, ink and blooming before
+        that was taken off.
+    """
+
+    kind: NDArray[np.int64]
+    index: NDArray[np.int64]
+    pixels: Array
+    covariance: Array
+    vertices: Array
+    rejected: int
+    polarity: float
