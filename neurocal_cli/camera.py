@@ -103,7 +103,7 @@ class Intrinsics:
         """Derivative of (alpha_u, alpha_v, u0, v0, theta) by A's (A11, A12, A22, A13, A23); (5, 5)."""
         sine, cosine = np.sin(self.theta), np.cos(self.theta)
         # theta = atan2(A11, -A12) and alpha_v = A22 sin(theta).
-        theta_by_a11 = -sine * cosine / self.alpha_u
+        theta_by_a11 = sine * cosine / self.alpha_u
         theta_by_a12 = sine * sine / self.alpha_u
         alpha_v_by_theta = self.alpha_v / np.tan(self.theta)
         J = np.zeros((5, 5))
@@ -241,7 +241,8 @@ def decompose(P: Array, world: Array | None = None) -> tuple[Intrinsics, Pose]:
     """
     P = np.asarray(P, dtype=float)
     M = P[:, :3]
-    if np.linalg.cond(M / np.linalg.norm(M, axis=1, keepdims=True)) > 1e14:
+    lengths = np.linalg.norm(M, axis=1, keepdims=True)
+    if not lengths.min() > 0 or np.linalg.cond(M / lengths) > 1e14:
         raise DegenerateGeometryError(
             "the projection matrix is singular: it is no camera with a focal length"
         )
