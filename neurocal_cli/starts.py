@@ -148,8 +148,9 @@ class _Search:
         self.starts[views] += count
         depth = output(trained.W, trained.V, patterns.inputs)[..., 2]
         real = patterns.weights > 0
-        in_front = np.asarray((~real | (depth > 0)).all(1) | (~real | (depth < 0)).all(1))
         rms = patterns.rms(trained.loss)
+        # A loss that overflowed must not win: nothing is below nan.
+        in_front = ((~real | (depth > 0)).all(1) | (~real | (depth < 0)).all(1)) & np.isfinite(rms)
         for start in range(count):
             self._keep(views, slice(start, None, count), trained, rms, in_front, start)
 
