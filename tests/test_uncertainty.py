@@ -1,0 +1,191 @@
+"""Standard deviations against the dense inverse of the whole normal matrix, in the user's own units."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import Scene, random_flat_set, random_solid
+
+from neurocal_cli import Correspondences, calibrate
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
+from neurocal_cli.geometry import Array
+from neurocal_cli.refine import CameraState, normal_blocks
+from neurocal_cli.uncertainty import covariance
+from neurocal_cli.views import arrange
+
+
+def whitener(points: Correspondences) -> Array:
+    """(N, 2, 2) factors U with U^T U the inverse covariance of each pixel."""
+    if points.covariance is None:
+        return np.tile(np.eye(2), (len(points), 1, 1))
+    suu, suv, svv = points.covariance.T
+    S = np.stack([np.stack([suu, suv], -1), np.stack([suv, svv], -1)], -2)
+    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(S)), 1, 2)
+
+
+def parameters(cal: Calibration) -> Array:
+    poses = [np.concatenate([view.pose.euler, view.pose.t]) for view in cal.views.values()]
+    return np.concatenate([cal.intrinsics.values(), *poses])
+
+
+def seen(points: Correspondences, p: Array, U: Array) -> Array:
+    """Whitened pixels (2 N,) for the parameters by their names in the paper."""
+    pixels = np.empty((len(points), 2))
+    A = Intrinsics(*p[:5]).A
+    for k in range(points.n_views):
+        x, y, z, *t = p[5 + 6 * k : 11 + 6 * k]
+        mine = points.view_index == k
+        pixels[mine] = project(A, Pose.from_euler(x, y, z, np.array(t)), points.world[mine])[0]
+    return np.asarray((U @ pixels[..., None]).reshape(-1))
+
+
+def dense_covariance(cal: Calibration, type: int) -> Array:
+    """Covariance of all the parameters, zero for given ones, by central differences."""
+    points, p = cal.points, parameters(cal)
+    U = whitener(points)
+    free = np.array([name not in cal.fixed for name in INTRINSIC_NAMES] + [type != 4] * (len(p) - 5))
+    # Steps that move the pixels by about 1e-3 of the image, whatever the unit.
+    size = np.abs(points.world).max()
+    scale = np.concatenate(
+        [[p[0], p[1], p[0], p[1], 1.0], np.tile([1.0, 1.0, 1.0] + [size] * 3, len(cal.views))]
+    )
+    columns = []
+    for n in np.flatnonzero(free):
+        h = 1e-6 * scale[n] * np.eye(len(p))[n]
+        columns.append((seen(points, p + h, U) - seen(points, p - h, U)) / (2e-6 * scale[n]))
+    J = np.column_stack(columns)
+    length = np.linalg.norm(J, axis=0)
+    _, R = np.linalg.qr(J / length)
+    inverse = np.linalg.inv(R) / length[:, None]
+    r = (U @ points.pixels[..., None]).reshape(-1) - seen(points, p, U)
+    found = np.zeros((len(p), len(p)))
+    found[np.ix_(free, free)] = inverse @ inverse.T * (r @ r) / (len(r) - free.sum())
+    return found
+
+
+def assert_std(cal: Calibration, type: int, relative: float = 1e-5) -> None:
+    dense = dense_covariance(cal, type)
+    std = np.sqrt(np.diagonal(dense))
+    reported = [cal.std[name] for name in INTRINSIC_NAMES]
+    reported += [view.std[name] for view in cal.views.values() for name in POSE_NAMES]
+    np.testing.assert_allclose(reported, std, rtol=relative)
+    rows = [INTRINSIC_NAMES.index(name) for name in cal.covariance_names]
+    limit = relative * std[rows][:, None] * std[rows]
+    assert (np.abs(cal.covariance - dense[np.ix_(rows, rows)]) <= limit).all()
+
+
+def noisy(scene: Scene, weights: str, rng: np.random.Generator) -> Correspondences:
+    """Points with noise of the size that their covariances say."""
+    points = scene.points()
+    n = len(points)
+    if weights == "none":
+        return scene.points(0.3, rng)
+    su, sv = rng.uniform(0.1, 0.8, (2, n))
+    c = rng.uniform(-0.9, 0.9, n) if weights == "suu,suv,svv" else np.zeros(n)
+    sv = su if weights == "sigma" else sv
+    factor = np.zeros((n, 2, 2))
+    factor[:, 0, 0], factor[:, 1, 0], factor[:, 1, 1] = su, c * sv, sv * np.sqrt(1 - c * c)
+    noise = (factor @ rng.normal(size=(n, 2, 1)))[..., 0]
+    return replace(
+        points, pixels=points.pixels + noise, covariance=np.column_stack([su * su, c * su * sv, sv * sv])
+    )
+
+
+@pytest.mark.parametrize("weights", ["none", "sigma", "suu,suv,svv"])
+@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize("type", [1, 2, 3, 4])
+def test_std_and_covariance_of_a_solid_target(type: int, skew: bool, weights: str) -> None:
+    rng = np.random.default_rng(type)
+    scene = random_solid(np.random.default_rng(5), 1, skew)
+    assert len(scene.view) > 20
+    assert_std(calibrate(noisy(scene, weights, rng), skew=skew, **scene.given(type)), type)
+
+
+@pytest.mark.parametrize("weights", ["none", "suu,suv,svv"])
+@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize("type", [1, 2, 3, 4])
+def test_std_and_covariance_of_flat_boards(type: int, skew: bool, weights: str) -> None:
+    rng = np.random.default_rng(type)
+    scene = random_flat_set(np.random.default_rng(3), 4, skew, cols=9, rows=6)
+    assert_std(calibrate(noisy(scene, weights, rng), skew=skew, **scene.given(type)), type)
+
+
+def test_std_of_theta_and_alpha_v_with_axes_that_are_far_from_perpendicular() -> None:
+    rng = np.random.default_rng(0)
+    scene = random_solid(np.random.default_rng(5), 1, True)
+    camera = Intrinsics(scene.intrinsics.alpha_u, scene.intrinsics.alpha_v, 500.0, 400.0, 1.2)
+    pixels = project(camera.A, scene.poses["view"], scene.world)[0]
+    points = Correspondences(scene.world, pixels + 0.2 * rng.normal(size=pixels.shape))
+    assert_std(calibrate(points), 1)
+
+
+@pytest.mark.parametrize("type", [1, 3])
+def test_std_of_a_pose_whose_world_origin_is_300_target_sizes_away(type: int) -> None:
+    rng = np.random.default_rng(0)
+    scene = random_solid(np.random.default_rng(5), 1, False)
+    size = np.ptp(scene.world, axis=0).max()
+    shift = np.array([300.0, -200.0, 100.0]) * size
+    points = replace(scene.points(0.3, rng), world=scene.world - scene.world.mean(axis=0) + shift)
+    # Differences of numbers 300 times larger than the target leave 1e-4 of the answer open.
+    assert_std(calibrate(points, skew=False, **scene.given(type)), type, 1e-4)
+
+
+@pytest.mark.parametrize("free", [[1, 1, 1, 1, 1], [1, 0, 1, 0, 0], [0, 0, 0, 0, 0]])
+@pytest.mark.parametrize("poses", [True, False])
+def test_elimination_view_by_view_is_the_inverse_of_the_whole(free: list[int], poses: bool) -> None:
+    f = np.flatnonzero(free)
+    if not poses and not f.size:
+        return
+    scene = random_flat_set(np.random.default_rng(1), 5, False, cols=6, rows=5)
+    views = arrange(scene.points(0.5, np.random.default_rng(2)))
+    normal, _ = normal_blocks(views.tiles, scene.true_state(views))
+    whole = np.zeros((len(f) + 30 * poses,) * 2)
+    whole[: len(f), : len(f)] = normal[:, f[:, None], f].sum(axis=0)
+    for k in range(5 * poses):
+        mine = slice(len(f) + 6 * k, len(f) + 6 * k + 6)
+        whole[mine, mine] = normal[k, 5:11, 5:11]
+        whole[: len(f), mine] = normal[k][f, 5:11]
+        whole[mine, : len(f)] = normal[k][f, 5:11].T
+    variance = normal[:, 11, 11].sum() / (2 * len(scene.view) - len(whole))
+    expected = variance * np.linalg.inv(whole)
+    found = covariance(normal, np.array(free, dtype=bool), poses, 2 * len(scene.view))
+    np.testing.assert_allclose(found.entries, expected[: len(f), : len(f)], rtol=1e-8)
+    for k in range(5):
+        mine = slice(len(f) + 6 * k, len(f) + 6 * k + 6)
+        block = expected[mine, mine] if poses else np.zeros((6, 6))
+        np.testing.assert_allclose(
+            found.poses[k], block, rtol=1e-7, atol=1e-9 * np.abs(block).max(initial=0.0)
+        )
+    assert found.smallest > 0
+
+
+def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
+    scene = random_flat_set(np.random.default_rng(1), 3, False, cols=6, rows=5)
+    views = arrange(scene.points())
+    normal, _ = normal_blocks(views.tiles, scene.true_state(views))
+    normal[1, 5:11] = normal[1, :, 5:11] = 0.0  # a pose that nothing depends on
+    assert covariance(normal, np.ones(5, dtype=bool), True, 180).smallest == 0
+    # Without the third view's tilt the focal length and the distance are one unknown.
+    state = scene.true_state(views)
+    flat = CameraState(state.entries, np.tile(np.eye(3), (3, 1, 1)), np.tile([0.0, 0.0, 5.0], (3, 1)))
+    normal, _ = normal_blocks(views.tiles, flat)
+    assert covariance(normal, np.ones(5, dtype=bool), True, 180).smallest < 1e-13
+
+
+def test_the_std_is_the_spread_over_many_noises() -> None:
+    rng = np.random.default_rng(0)
+    scene = random_flat_set(np.random.default_rng(3), 5, True, cols=9, rows=6)
+    results = [calibrate(noisy(scene, "suu,suv,svv", rng)) for _ in range(400)]
+    values = np.array([parameters(cal) for cal in results])
+    std = np.array(
+        [
+            [cal.std[n] for n in INTRINSIC_NAMES] + [v.std[n] for v in cal.views.values() for n in POSE_NAMES]
+            for cal in results
+        ]
+    )
+    # The noise of each result is drawn anew with its covariances, which all have one distribution;
+    # 400 draws know a standard deviation to 3.5 %, the largest of 35 to 4 times that.
+    assert np.abs(values.std(axis=0) / np.sqrt((std**2).mean(axis=0)) - 1).max() < 0.14
