@@ -20,7 +20,7 @@ HOMES = {
     "rich": ("commands/",),
     "matplotlib": ("plots.py",),
     "yaml": ("io/",),
-    "cv2": (),
+    "cv2": ("detection/", "rendering/", "io/images.py"),
     "scipy": (),
 }
 METHODS = {"read_text", "read_bytes", "write_text", "write_bytes", "open"}

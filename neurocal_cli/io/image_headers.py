@@ -1,0 +1,209 @@
+"""What an image file says of itself, read without decoding it: its size above all.
+
+A file of a kilobyte can claim a terabyte of pixels, and decoders differ in what they make of half a
+file; both are settled here, before any of them sees it.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from neurocal_cli.errors import FormatError
+
+__all__ = ["Header", "read_header"]
+
+_EXIF_MARK = b"Exif\0\0"
+_ORIENTATION, _WIDTH, _HEIGHT = 274, 256, 257
+_STRIPS = ((273, 279), (324, 325))  # offsets and lengths of strips, of tiles
+_TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
+_JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+_JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
+
+
+@dataclass(frozen=True)
+class Header:
+    """Size and orientation of a stored image.
+
+    Attributes
+    ----------
+    kind : str
+        ``PNG``, ``JPEG``, ``TIFF``, ``BMP`` or ``PNM``.
+    width, height : int [px]
+        As stored, before the orientation is applied.
+    orientation : int
+        EXIF's tag: 1 upright, 2-8 mirrored or turned.
+    """
+
+    kind: str
+    width: int
+    height: int
+    orientation: int = 1
+
+
+class _TruncatedError(Exception):
+    """The file ends before its header says so."""
+
+
+def read_header(data: bytes, source: str) -> Header:
+    """Read the header of an image file and check that the file is all there.
+
+    Parameters
+    ----------
+    data : bytes
+        The whole file.
+    source : str
+        Its name, for messages.
+
+    Raises
+    ------
+    FormatError
+        Empty, no image of a known kind, truncated, damaged, or without pixels.
+    """
+    if not data:
+        raise FormatError("is empty; give an image", source)
+    reader = next((read for mark, read in _READERS if re.match(mark, data, re.DOTALL)), None)
+    if reader is None:
+        raise FormatError("is no image that can be read; give PNG, JPEG, TIFF, BMP, PGM or PPM", source)
+    try:
+        header = reader(data)
+    except (_TruncatedError, struct.error, IndexError) as error:
+        raise FormatError("is cut off in the middle; copy the image again", source) from error
+    except ValueError as error:
+        raise FormatError(f"is damaged ({error}); copy the image again", source) from error
+    if header.width <= 0 or header.height <= 0:
+        raise FormatError(f"has {header.width} x {header.height} px; give an image with pixels", source)
+    return header
+
+
+def _png(data: bytes) -> Header:
+    width = height = 0
+    orientation = 1
+    for kind, body in _png_chunks(data):
+        if kind == b"IHDR":
+            width, height = struct.unpack_from(">II", body)
+        elif kind == b"eXIf":
+            orientation = _exif_orientation(body)
+    return Header("PNG", width, height, orientation)
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Chunks up to the end mark, each with its checksum verified."""
+    at, kind = 8, b""
+    while kind != b"IEND":
+        length, kind = struct.unpack_from(">I4s", data, at)
+        end = at + 8 + length
+        if end + 4 > len(data):
+            raise _TruncatedError
+        if zlib.crc32(memoryview(data)[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            raise ValueError("a checksum is wrong")
+        yield kind, b"" if kind == b"IDAT" else data[at + 8 : end]
+        at = end + 4
+
+
+def _jpeg(data: bytes) -> Header:
+    width = height = 0
+    orientation, at = 1, 2
+    while True:
+        if data[at] != 0xFF:
+            raise ValueError("a marker is missing")
+        marker = data[at + 1]
+        if marker == 0xFF or marker in _JPEG_ALONE:  # fill bytes, marks
+            at += 1 if marker == 0xFF else 2
+            continue
+        if marker == 0xDA:
+            break
+        (length,) = struct.unpack_from(">H", data, at + 2)
+        if marker in _JPEG_FRAMES:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+        elif marker == 0xE1 and data.startswith(_EXIF_MARK, at + 4):
+            orientation = _exif_orientation(data[at + 10 : at + 2 + length])
+        at += 2 + length
+    if data.rfind(b"\xff\xd9", at) < 0:  # the end mark, which a thumbnail in front has as well
+        raise _TruncatedError
+    return Header("JPEG", width, height, orientation)
+
+
+def _bmp(data: bytes) -> Header:
+    (start, size) = struct.unpack_from("<II", data, 10)
+    if size == 12:
+        width, height, _, depth = struct.unpack_from("<HHHH", data, 18)
+        packing = 0
+    else:
+        width, height, _, depth, packing = struct.unpack_from("<iiHHI", data, 18)
+    if packing in (0, 3) and start + (width * depth + 31) // 32 * 4 * abs(height) > len(data):
+        raise _TruncatedError
+    return Header("BMP", width, abs(height))
+
+
+def _pnm(data: bytes) -> Header:
+    numbers = 2 if data[1:2] in b"14" else 3
+    gap = rb"(?:\s|#[^\n\r]*[\n\r])+"
+    match = re.match(rb"P[1-6]" + (gap + rb"(\d{1,18})") * numbers + rb"\s", data)
+    if match is None:
+        if len(data) < 15:
+            raise _TruncatedError
+        raise ValueError("its header is none of PGM or PPM")
+    width, height = int(match[1]), int(match[2])
+    if data[1:2] in b"56":
+        channels = 1 if data[1:2] == b"5" else 3
+        if match.end() + width * height * channels * (2 if int(match[3]) > 255 else 1) > len(data):
+            raise _TruncatedError
+    return Header("PNM", width, height)
+
+
+def _tiff(data: bytes) -> Header:
+    fields = _tiff_fields(data)
+    for offsets, lengths in _STRIPS:
+        ends = [sum(pair) for pair in zip(fields.get(offsets, ()), fields.get(lengths, ()), strict=False)]
+        if ends and max(ends) > len(data):
+            raise _TruncatedError
+    if not (fields.get(_WIDTH) and fields.get(_HEIGHT)):
+        raise ValueError("it has no size")
+    return Header("TIFF", fields[_WIDTH][0], fields[_HEIGHT][0], _upright(fields.get(_ORIENTATION, (1,))))
+
+
+def _exif_orientation(block: bytes) -> int:
+    """Orientation in an EXIF block, which is a TIFF without an image; 1 where it cannot be read."""
+    try:
+        return _upright(_tiff_fields(block).get(_ORIENTATION, (1,)))
+    except (struct.error, ValueError, IndexError, _TruncatedError):
+        return 1
+
+
+def _upright(values: tuple[int, ...]) -> int:
+    return values[0] if values and 1 <= values[0] <= 8 else 1
+
+
+def _tiff_fields(data: bytes) -> dict[int, tuple[int, ...]]:
+    """Whole-number fields of the first directory by their tags; TIFF and BigTIFF."""
+    order = "<" if data[:2] == b"II" else ">"
+    big = struct.unpack_from(order + "H", data, 2)[0] == 43
+    number, count, step = ("Q", "Q", 20) if big else ("I", "H", 12)
+    (at,) = struct.unpack_from(order + number, data, 8 if big else 4)
+    (entries,) = struct.unpack_from(order + count, data, at)
+    at += struct.calcsize(count)
+    room = struct.calcsize(number)
+    fields = {}
+    for entry in range(at, at + step * min(entries, 4096), step):
+        tag, kind, n = struct.unpack_from(f"{order}HH{number}", data, entry)
+        if kind not in _TIFF_TYPES:
+            continue
+        form = f"{order}{min(n, len(data))}{_TIFF_TYPES[kind]}"  # no file holds more values than bytes
+        place = entry + 4 + room
+        if struct.calcsize(form) > room:
+            (place,) = struct.unpack_from(order + number, data, place)
+        fields[tag] = struct.unpack_from(form, data, place)
+    return fields
+
+
+_READERS: tuple[tuple[bytes, Callable[[bytes], Header]], ...] = (
+    (rb"\x89PNG\r\n\x1a\n", _png),
+    (rb"\xff\xd8\xff", _jpeg),
+    (rb"(?:II|MM).?[*+]", _tiff),
+    (rb"BM.{8}", _bmp),
+    (rb"P[1-6][\s#]", _pnm),
+)

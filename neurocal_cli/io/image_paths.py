@@ -1,0 +1,85 @@
+"""Which image files the words of a command line name."""
+
+from __future__ import annotations
+
+import glob
+import os
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.io.files import one_line
+
+__all__ = ["IMAGE_ENDINGS", "find_images", "view_names"]
+
+IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm")
+
+
+def find_images(words: Iterable[str]) -> tuple[str, ...]:
+    """Find the files that are meant by names, folders and patterns.
+
+    Parameters
+    ----------
+    words : iterable of str
+        A file (or ``-``) stands for itself, whether it exists or not; a folder for the images in
+        it, by their endings, sorted; a pattern such as ``left*.png``, which no shell expanded, for
+        the files that match, sorted.
+
+    Raises
+    ------
+    FormatError
+        A folder that cannot be read or without images, or a pattern that nothing matches.
+    """
+    paths: list[str] = []
+    for word in words:
+        if word != "-" and os.path.isdir(word):
+            paths += _in_folder(word)
+        elif glob.has_magic(word) and not os.path.lexists(word):
+            paths += _matching(word)
+        else:
+            paths.append(word)
+    return tuple(paths)
+
+
+def view_names(paths: Iterable[str]) -> tuple[str, ...]:
+    """Name a view after each file, without folder and ending; ``stdin`` for ``-``.
+
+    Raises
+    ------
+    InputError
+        Two files would have the same name.
+    """
+    files = tuple(paths)
+    names = tuple("stdin" if path == "-" else Path(path).stem for path in files)
+    doubled = next((name for name, count in Counter(names).items() if count > 1), None)
+    if doubled is not None:
+        first, second, *_ = (
+            one_line(path) for path, name in zip(files, names, strict=True) if name == doubled
+        )
+        if first == second:
+            raise InputError(f"{first} is given twice; give each image once")
+        raise InputError(f"{first} and {second} would both be the view {doubled!r}; rename one of them")
+    return names
+
+
+def _in_folder(folder: str) -> list[str]:
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError as error:
+        raise FormatError("may not be read; change its permissions", one_line(folder)) from error
+    # Hidden files are other programs' business: previews, half of a copy.
+    names = [name for name in names if name.lower().endswith(IMAGE_ENDINGS) and not name.startswith(".")]
+    paths = [path for path in (os.path.join(folder, name) for name in names) if os.path.isfile(path)]
+    if not paths:
+        raise FormatError(
+            f"holds no images ({', '.join(IMAGE_ENDINGS)}); give a folder that does", one_line(folder)
+        )
+    return paths
+
+
+def _matching(pattern: str) -> list[str]:
+    paths = sorted(path for path in glob.glob(pattern) if not os.path.isdir(path))
+    if not paths:
+        raise FormatError("no file matches this pattern; check the path", one_line(pattern))
+    return paths

@@ -1,0 +1,176 @@
+"""Images as arrays of grey values."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import FormatError, InputError, NeurocalError
+from neurocal_cli.io.files import read_bytes
+from neurocal_cli.io.image_headers import Header, read_header
+
+__all__ = ["MOST_PIXELS", "Image", "encode_png", "parse_image", "read_image"]
+
+MOST_PIXELS = 200_000_000  # larger than any camera's; what a file claims beyond is refused
+
+_TURNS = {
+    2: "mirrored left to right",
+    3: "turned by 180 degrees",
+    4: "mirrored top to bottom",
+    5: "mirrored along its diagonal",
+    6: "turned by 90 degrees clockwise",
+    7: "mirrored along its other diagonal",
+    8: "turned by 90 degrees counter-clockwise",
+}
+_STDERR = 2
+_ONE_AT_A_TIME = threading.Lock()  # the program's stderr is one
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """A picture.
+
+    Attributes
+    ----------
+    grey : (height, width) uint8 or uint16 array [DN]
+        Colours are weighed as OpenCV does: 0.299 R + 0.587 G + 0.114 B.
+    source : str
+        Name for messages.
+    notes : tuple of str
+        What was done to the pixels that a user may not expect.
+    """
+
+    grey: NDArray[np.uint8] | NDArray[np.uint16]
+    source: str = "image"
+    notes: tuple[str, ...] = ()
+
+    @property
+    def bits(self) -> int:
+        """Bits of a pixel, 8 or 16."""
+        return 8 * self.grey.dtype.itemsize
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.grey.shape[1], self.grey.shape[0]
+
+
+def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
+    """Read an image: PNG, JPEG, TIFF, BMP, PGM or PPM, grey or colour, of 8 or 16 bits.
+
+    As in OpenCV's ``imread``, an image whose EXIF orientation says so is turned upright, and pixel
+    coordinates are those of the turned image; a note tells.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``-`` is stdin.
+    most_pixels : int
+        Larger images are refused, before they take any memory.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read, is no image, is damaged, or too large.
+    """
+    return parse_image(*read_bytes(path), most_pixels)
+
+
+def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXELS) -> Image:
+    """Read an image from the bytes of a file; see `read_image`."""
+    header = read_header(data, source)
+    if header.width * header.height > most_pixels:
+        raise FormatError(
+            f"has {header.width} x {header.height} px, more than the {most_pixels / 1e6:g} million that are "
+            "read; scale it down",
+            source,
+        )
+    grey = _decoded(data, header, source)
+    notes = []
+    if header.orientation != 1:
+        notes.append(
+            f"{source}: {_TURNS[header.orientation]} as its EXIF orientation says; pixel coordinates are "
+            "those of the turned image"
+        )
+    return Image(grey, source, tuple(notes))
+
+
+def encode_png(picture: NDArray[np.uint8]) -> bytes:
+    """Picture as the bytes of a PNG file.
+
+    Parameters
+    ----------
+    picture : (height, width) or (height, width, 3) uint8 array
+        Colours in the order red, green, blue.
+
+    Raises
+    ------
+    InputError
+        The picture cannot be written as PNG.
+    """
+    ordered = picture[..., ::-1] if picture.ndim == 3 else picture
+    try:
+        done, data = cv2.imencode(".png", np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    except cv2.error as error:
+        raise InputError(f"a picture of the shape {picture.shape} cannot be written as PNG") from error
+    if not done:
+        raise NeurocalError("the picture cannot be written as PNG")
+    return data.tobytes()
+
+
+def _decoded(data: bytes, header: Header, source: str) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Grey values of a file that looks whole; the decoder's complaints stay off the user's screen."""
+    with _captured_stderr() as complaints:
+        try:
+            grey = cv2.imdecode(
+                np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+            )
+        except cv2.error:
+            grey = None
+    if grey is None:
+        raise FormatError(
+            f"cannot be decoded: a damaged {header.kind}, or a variety of it that few programs read; "
+            "save it as PNG of 8 or 16 bits",
+            source,
+        )
+    # The JPEG decoder fills what it cannot make out with grey and only says so here.
+    if any(mark in text for text in complaints for mark in ("Corrupt JPEG", "Premature end")):
+        raise FormatError("is damaged; copy the image again", source)
+    turned = header.orientation >= 5
+    size = (header.width, header.height) if turned else (header.height, header.width)
+    if grey.shape != size:
+        raise FormatError(f"is no single picture of {header.width} x {header.height} px", source)
+    if grey.dtype == np.uint8:
+        return grey.astype(np.uint8, copy=False)
+    if grey.dtype == np.uint16:
+        return grey.astype(np.uint16, copy=False)
+    raise FormatError("has pixels of neither 8 nor 16 bits; convert it to one of these", source)
+
+
+@contextmanager
+def _captured_stderr() -> Iterator[list[str]]:
+    """Catch what the C libraries below OpenCV write to stderr, past Python; yields its lines."""
+    lines: list[str] = []
+    with _ONE_AT_A_TIME, tempfile.TemporaryFile() as file:
+        try:
+            former = os.dup(_STDERR)
+        except OSError:  # closed: there is nothing to keep clean
+            yield lines
+            return
+        try:
+            os.dup2(file.fileno(), _STDERR)
+            yield lines
+        finally:
+            os.dup2(former, _STDERR)
+            os.close(former)
+            file.seek(0)
+            lines += file.read(100_000).decode("utf-8", "replace").splitlines()
