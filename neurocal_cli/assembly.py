@@ -11,7 +11,9 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, Vie
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
 from neurocal_cli.job import Job, Solution
+from neurocal_cli.lens import Lens, coefficient_names
 from neurocal_cli.observability import check_determined
+from neurocal_cli.pixel_error import residuals
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, intrinsic_matrix
 from neurocal_cli.uncertainty import Covariance, covariance
@@ -22,6 +24,7 @@ __all__ = ["assemble"]
 # A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
 _POOR = 0.05
 _POOR_THETA = 0.02  # rad
+_TOLD_APART = 2.0  # standard deviations
 _MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor a lens
 
 
@@ -50,16 +53,15 @@ class _Assembly:
     def calibration(self, method: str, trainer: str, seed: int, name: str) -> Calibration:
         views, known, solution = self.views, self.known, self.solution
         refined = solution.refined
-        cov = covariance(refined.normal, known.free, known.free_poses, 2 * len(views.index))
+        cov = covariance(refined.normal, known.free_camera, known.free_poses, 2 * len(views.index))
         self._check(cov)
         A = known.matrix(refined.state.entries[0], views)
         intrinsics = known.intrinsics or Intrinsics.from_matrix(A)
         if known.type != 3 and not known.free[1]:
             intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
-        block, std = self._intrinsic_covariance(intrinsics, cov)
+        block, std = self._camera_covariance(intrinsics, cov)
         results, rmse, largest = self._views(cov)
-        free_names = tuple(n for n in INTRINSIC_NAMES if n not in known.fixed)
-        keep = [INTRINSIC_NAMES.index(n) for n in free_names]
+        free = [n for n, name in enumerate(std) if name not in known.fixed]
         reason = StopReason.CONVERGED
         if not refined.converged:
             reason = StopReason.MAX_ITERATIONS
@@ -79,11 +81,17 @@ class _Assembly:
             stop_reason=reason.value,
             rmse_px=rmse,
             max_px=largest,
-            covariance=block[np.ix_(keep, keep)],
-            covariance_names=free_names,
+            covariance=block[np.ix_(free, free)],
+            covariance_names=tuple(np.array(list(std))[free].tolist()),
+            distortion_model=known.lens.model,
+            distortion=refined.state.k,
             network=self._network(rmse),
             camera_name=name,
-            warnings=(*self._misfit(rmse), *_warnings(intrinsics, std, results)),
+            warnings=(
+                *self._misfit(rmse),
+                *_warnings(intrinsics, std),
+                *_noise_coefficients(Lens(known.lens.model, refined.state.k), std),
+            ),
         )
 
     def _misfit(self, rmse: float) -> tuple[str, ...]:
@@ -108,16 +116,18 @@ class _Assembly:
         normals = (self.solution.refined.state.R @ self.views.basis)[:, :, 2]
         check_determined(self.views, self.known, relative, cov.smallest, normals)
 
-    def _intrinsic_covariance(
-        self, intrinsics: Intrinsics, cov: Covariance
-    ) -> tuple[Array, dict[str, float]]:
-        """Covariance (5, 5) and std of the five intrinsic parameters; 0 for given ones."""
-        free = np.flatnonzero(self.known.free)
-        J = intrinsics.entry_jacobian()[:, free] * self.views.pixel_scale
+    def _camera_covariance(self, intrinsics: Intrinsics, cov: Covariance) -> tuple[Array, dict[str, float]]:
+        """Covariance of the intrinsic parameters and the lens's coefficients, and their std; 0 if given."""
+        known = self.known
+        coefficients = coefficient_names(known.lens.model)
+        J = np.zeros((5 + len(coefficients),) * 2)
+        J[:5, :5] = intrinsics.entry_jacobian() * self.views.pixel_scale
+        J[5:, 5:] = np.eye(len(coefficients))
+        J = J[:, np.flatnonzero(known.free_camera)]
         block = J @ cov.entries @ J.T
         std = {
-            name: 0.0 if name in self.known.fixed else float(np.sqrt(block[n, n]))
-            for n, name in enumerate(INTRINSIC_NAMES)
+            name: 0.0 if name in known.fixed else float(np.sqrt(block[n, n]))
+            for n, name in enumerate((*INTRINSIC_NAMES, *coefficients))
         }
         return block, std
 
@@ -159,16 +169,7 @@ class _Assembly:
     def _squared_errors(self) -> Array:
         """Squared pixel error of each point, sorted by view; (N,)."""
         tiles = self.views.tiles
-        errors = np.empty((len(tiles.view), tiles.local.shape[2]))
-        state = self.solution.refined.state
-        a, s, b, u0, v0 = state.entries[0]
-        for chunk in tiles.chunks():
-            view = tiles.view[chunk]
-            Xc = state.R[view] @ tiles.local[chunk] + state.t[view][:, :, None]
-            x, y = Xc[:, 0] / Xc[:, 2], Xc[:, 1] / Xc[:, 2]
-            du = tiles.pixels[chunk, 0] - (a * x + s * y + u0)
-            dv = tiles.pixels[chunk, 1] - (b * y + v0)
-            errors[chunk] = du * du + dv * dv
+        errors = (residuals(tiles, self.solution.refined.state) ** 2).sum(axis=1)
         rank = np.arange(len(self.views.index)) - np.repeat(self.views.first, self.views.counts)
         slot = np.repeat(tiles.first * tiles.local.shape[2], self.views.counts) + rank
         return np.asarray(errors.reshape(-1)[slot] * self.views.pixel_scale**2)
@@ -193,9 +194,18 @@ class _Assembly:
         )
 
 
-def _warnings(
-    intrinsics: Intrinsics, std: Mapping[str, float], results: Mapping[str, ViewResult]
-) -> tuple[str, ...]:
+def _noise_coefficients(lens: Lens, std: Mapping[str, float]) -> tuple[str, ...]:
+    """Warn of coefficients that the data does not tell from 0."""
+    pairs = zip(coefficient_names(lens.model), lens.coefficients, strict=True)
+    noise = [
+        f"{name} ({k:.2g} +- {std[name]:.2g})" for name, k in pairs if 0 < abs(k) < _TOLD_APART * std[name]
+    ]
+    if not noise:
+        return ()
+    return (f"not told from 0: {', '.join(noise)}; a simpler --distortion would do",)
+
+
+def _warnings(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:
     """Parameters that exist but are badly determined."""
     alpha = max(intrinsics.alpha_u, intrinsics.alpha_v)
     limits = {

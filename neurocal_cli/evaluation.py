@@ -17,7 +17,9 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.lens import distort
 from neurocal_cli.points import Correspondences
+from neurocal_cli.problems import KnownCamera
 
 __all__ = ["CameraEvaluation", "ViewEvaluation", "evaluate_camera"]
 
@@ -85,14 +87,15 @@ class CameraEvaluation:
 
 
 def evaluate_camera(
-    calibration: Calibration | Intrinsics, points: Correspondences | None = None
+    calibration: Calibration | KnownCamera | Intrinsics, points: Correspondences | None = None
 ) -> CameraEvaluation:
     """Reprojection error of a calibrated camera.
 
     Parameters
     ----------
-    calibration : Calibration or Intrinsics
-        With intrinsic parameters alone, the pose of every view is fitted.
+    calibration : Calibration, or a camera without poses
+        With intrinsic parameters, or a camera file's intrinsics and lens, the pose of every view is
+        fitted.
     points : Correspondences, optional
         Default: the points that the camera was calibrated from.
 
@@ -103,26 +106,26 @@ def evaluate_camera(
     Raises
     ------
     InputError
-        Points of another image size, or none; a distorted camera.
+        Points of another image size, or none.
     DegenerateGeometryError
         A new view whose points do not determine its pose.
     """
     warnings: list[str] = []
-    if isinstance(calibration, Intrinsics):
-        intrinsics, poses, seed = calibration, {}, 0
-        if points is None:
-            raise InputError("intrinsic parameters hold no points; give the points to judge them by")
-    else:
+    poses: dict[str, Pose] = {}
+    seed = 0
+    if isinstance(calibration, Calibration):
         points = calibration.points if points is None else points
         warnings += _compare(calibration, points)
-        intrinsics, seed = calibration.intrinsics, calibration.seed
+        seed = calibration.seed
         poses = {name: view.pose for name, view in calibration.views.items()}
+    elif points is None:
+        raise InputError("intrinsic parameters hold no points; give the points to judge them by")
     fitted = np.array([name not in poses for name in points.view_names])
     if fitted.any():
-        new_poses, problems = _fit_poses(intrinsics, points.select(fitted[points.view_index]), seed)
+        new_poses, problems = _fit_poses(calibration, points.select(fitted[points.view_index]), seed)
         poses.update(new_poses)
         warnings += problems
-    predicted, in_front = _predict(intrinsics.A, [poses[name] for name in points.view_names], points)
+    predicted, in_front = _predict(calibration, [poses[name] for name in points.view_names], points)
     residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
     if not in_front.all():
         n_behind = np.count_nonzero(~in_front)
@@ -132,11 +135,6 @@ def evaluate_camera(
 
 def _compare(calibration: Calibration, points: Correspondences) -> list[str]:
     """Refuse points that the calibration does not apply to; return what to warn of."""
-    if np.any(calibration.distortion != 0):
-        raise InputError(
-            "the camera has lens distortion, which is not supported yet; undistort the points and "
-            "evaluate with the coefficients set to 0"
-        )
     here, there = points.image_size, calibration.image_size
     if here is not None and there is not None and here != there:
         raise InputError(
@@ -152,12 +150,12 @@ def _compare(calibration: Calibration, points: Correspondences) -> list[str]:
 
 
 def _fit_poses(
-    intrinsics: Intrinsics, points: Correspondences, seed: int
+    camera: KnownCamera | Intrinsics, points: Correspondences, seed: int
 ) -> tuple[dict[str, Pose], list[str]]:
     """Type 3: poses of views that the calibration does not know, and what to warn of."""
     from neurocal_cli.methods import calibrate  # the trainers: only when there is something to train
 
-    fit = calibrate(points, type=3, intrinsics=intrinsics, seed=seed)
+    fit = calibrate(points, type=3, intrinsics=camera, seed=seed)
     poses = {name: view.pose for name, view in fit.views.items()}
     warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
     if not fit.converged:
@@ -165,7 +163,9 @@ def _fit_poses(
     return poses, warnings
 
 
-def _predict(A: Array, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:
+def _predict(
+    known: KnownCamera | Intrinsics, poses: list[Pose], points: Correspondences
+) -> tuple[Array, NDArray[np.bool_]]:
     """Pixels of all the points, each through the pose of its view, and which lie in front."""
     R = np.stack([pose.R for pose in poses])[points.view_index]
     t = np.stack([pose.t for pose in poses])[points.view_index]
@@ -173,6 +173,10 @@ def _predict(A: Array, poses: list[Pose], points: Correspondences) -> tuple[Arra
     depth = camera[:, 2]
     in_front = depth > 0
     image = camera[:, :2] / np.where(in_front, depth, np.nan)[:, None]
+    A = known.A if isinstance(known, Intrinsics) else known.intrinsics.A
+    if not isinstance(known, Intrinsics) and known.distortion_model != "none":
+        bent = distort(known.distortion_model, known.distortion, image[:, 0], image[:, 1])
+        image = np.column_stack(bent)
     return image @ A[:2, :2].T + A[:2, 2], in_front
 
 

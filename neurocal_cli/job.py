@@ -112,7 +112,8 @@ class Job:
     rng : numpy.random.Generator
     progress : callable
         Called with the stage's name and the share of it that is done.
-    tally : Tally
+    tally : Tally, optional
+        A new one, unless the job goes on from another.
     """
 
     views: Views
@@ -120,10 +121,11 @@ class Job:
     strategy: Strategy
     rng: np.random.Generator
     progress: Callable[[str, float], None]
-    tally: Tally = field(init=False)
+    tally: Tally = field(default_factory=lambda: Tally(np.zeros(0, dtype=np.int64)))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "tally", Tally(np.zeros(self.views.n_views, dtype=np.int64)))
+        if not self.tally.agreed.size:
+            object.__setattr__(self, "tally", Tally(np.zeros(self.views.n_views, dtype=np.int64)))
 
     @property
     def entries(self) -> Array:
@@ -132,6 +134,7 @@ class Job:
 
     def refine(self, state: CameraState, max_iterations: int = 200) -> Refined:
         """The last step (3) from a state, entered in the tally."""
-        refined = refine(self.views.tiles, state, self.known.free, self.known.free_poses, max_iterations)
+        free = self.known.free if state.lens == "none" else self.known.free_camera
+        refined = refine(self.views.tiles, state, free, self.known.free_poses, max_iterations)
         self.tally.refinements += refined.iterations
         return refined

@@ -14,10 +14,12 @@ from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.errors import UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Strategy
+from neurocal_cli.lens import MODELS, Lens, coefficient_names
 from neurocal_cli.neuro import solve
 from neurocal_cli.observability import check_points
 from neurocal_cli.points import Correspondences
-from neurocal_cli.problems import known_for
+from neurocal_cli.problems import Known, KnownCamera, known_for
+from neurocal_cli.stage_lens import learn_lens, straighten
 from neurocal_cli.starts import Agreement
 from neurocal_cli.training import Task, Trained
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
@@ -30,7 +32,7 @@ __all__ = ["DISTORTIONS", "METHODS", "OUTLIERS", "TRAINERS", "calibrate"]
 
 METHODS = ("neuro",)
 TRAINERS = ("lm", "backprop")
-DISTORTIONS = ("none",)
+DISTORTIONS = tuple(MODELS)
 OUTLIERS = ("keep",)
 
 Progress = Callable[[str, float], None]
@@ -40,7 +42,7 @@ def calibrate(
     points: Correspondences,
     type: int = 1,
     image_center: tuple[float, float] | None = None,
-    intrinsics: Intrinsics | Array | None = None,
+    intrinsics: Intrinsics | KnownCamera | Array | None = None,
     extrinsics: Mapping[str, Pose] | None = None,
     method: str = "neuro",
     trainer: str = "lm",
@@ -65,13 +67,15 @@ def calibrate(
         4 the extrinsics.
     image_center : (u0, v0), optional [px]
         Type 2; else the one with the points, else the centre of their image size.
-    intrinsics : Intrinsics or (3, 3) array, optional
-        Type 3.
+    intrinsics : Intrinsics, (3, 3) array or a camera with a lens, optional
+        Type 3. A camera with a lens is a `Calibration` or what `read_intrinsics` returns.
     extrinsics : dict of Pose by view name, optional
         Type 4.
     method : {"neuro"}
     trainer : {"lm", "backprop"}
-    distortion : {"none"}
+    distortion : {"none", "k1", "k1k2", "plumb_bob", "rational", "fisheye"}
+        The lens model whose coefficients are estimated with everything else. Type 3 takes the lens of
+        the given camera instead.
     skew : bool
         False: theta is pi/2.
     outliers : {"keep"}
@@ -98,14 +102,34 @@ def calibrate(
         Points that cannot give an answer, with the reason.
     """
     _check_options(method, trainer, distortion, outliers, starts)
-    if intrinsics is not None and not isinstance(intrinsics, Intrinsics):
-        intrinsics = Intrinsics.from_matrix(intrinsics)
-    known = known_for(points, type, image_center, intrinsics, extrinsics, skew)
-    views = arrange(points)
+    camera, lens = _given_camera(intrinsics)
+    known = known_for(points, type, image_center, camera, extrinsics, skew)
+    known = _with_lens(known, distortion, lens)
+    ideal = straighten(points, known)
+    views = arrange(ideal)
     check_points(views, known)
     report = progress or (lambda stage, share: None)
     job = Job(views, known, _strategy(trainer, starts, backprop, report), np.random.default_rng(seed), report)
-    return assemble(job, points, solve(job), trainer=trainer, method=method, seed=seed, name=camera_name)
+    job, solution = learn_lens(job, solve(job), points)
+    return assemble(job, points, solution, trainer=trainer, method=method, seed=seed, name=camera_name)
+
+
+def _given_camera(given: Intrinsics | KnownCamera | Array | None) -> tuple[Intrinsics | None, Lens]:
+    if given is None or isinstance(given, Intrinsics):
+        return given, Lens()
+    if isinstance(given, (np.ndarray, list, tuple)):
+        return Intrinsics.from_matrix(np.asarray(given)), Lens()
+    return given.intrinsics, Lens(given.distortion_model, given.distortion)
+
+
+def _with_lens(known: Known, distortion: str, given: Lens) -> Known:
+    if known.type != 3:
+        return replace(known, lens=Lens(distortion), free_lens=distortion != "none")
+    if distortion not in ("none", given.model):
+        raise UsageError(
+            f"type 3 takes the lens of the given camera ({given.model}), not distortion {distortion}"
+        )
+    return replace(known, lens=given, fixed=known.fixed | set(coefficient_names(given.model)))
 
 
 def _check_options(method: str, trainer: str, distortion: str, outliers: str, starts: int) -> None:

@@ -119,6 +119,11 @@ def check_determined(
     if boards:
         _check_tilts(views, normals, singular)
     more = f", or give more of the camera ({ways})" if (ways := _givable(known)) else ""
+    if singular and known.free_lens:
+        raise DegenerateGeometryError(
+            f"the points do not determine all coefficients of the {known.lens.model} lens; choose a simpler "
+            "--distortion, or give points over more of the image"
+        )
     if singular:
         raise DegenerateGeometryError(
             "the points do not determine all unknowns (the normal matrix is singular); "

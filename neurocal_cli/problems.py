@@ -7,7 +7,8 @@ Type 4: the extrinsics, V.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +16,31 @@ from numpy.typing import NDArray
 from neurocal_cli.camera import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
+from neurocal_cli.lens import Lens
 from neurocal_cli.points import Correspondences
 from neurocal_cli.refine import ENTRIES
 from neurocal_cli.views import Views
 
-__all__ = ["Known", "intrinsic_matrix", "known_for"]
+__all__ = ["Known", "KnownCamera", "intrinsic_matrix", "known_for"]
+
+
+class KnownCamera(Protocol):
+    """A camera with a lens: a `Calibration`, or what `read_intrinsics` returns."""
+
+    @property
+    def intrinsics(self) -> Intrinsics:
+        """Its five parameters."""
+        ...
+
+    @property
+    def distortion_model(self) -> str:
+        """One of `lens.MODELS`."""
+        ...
+
+    @property
+    def distortion(self) -> Array:
+        """The model's coefficients."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +59,10 @@ class Known:
         Names of the given intrinsic parameters.
     intrinsics : Intrinsics or None
         All of them, for type 3: returned as they are.
+    lens : Lens
+        The model to end with; its coefficients where they are given.
+    free_lens : bool
+        Whether the coefficients are estimated.
     """
 
     type: int
@@ -46,6 +71,13 @@ class Known:
     poses: Mapping[str, Pose] | None
     fixed: frozenset[str]
     intrinsics: Intrinsics | None
+    lens: Lens = field(default_factory=Lens)
+    free_lens: bool = False
+
+    @property
+    def free_camera(self) -> NDArray[np.bool_]:
+        """(5 + K,) which of A's entries and of the lens's coefficients are estimated."""
+        return np.concatenate([self.free, np.full(len(self.lens.coefficients), self.free_lens)])
 
     @property
     def free_poses(self) -> bool:

@@ -13,6 +13,7 @@ from typing import Any
 from neurocal_cli.calibration import Calibration, NetworkRecord, ViewResult
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.evaluation import CameraEvaluation
+from neurocal_cli.lens import coefficient_names
 
 __all__ = [
     "align",
@@ -163,6 +164,10 @@ def _parameter_rows(calibration: Calibration) -> list[list[str]]:
         unit = "rad" if name == "theta" else "px"
         value = float(getattr(calibration.intrinsics, name))
         rows.append(_parameter_row(name, unit, value, calibration.std[name], name in calibration.fixed))
+    for name, value in zip(
+        coefficient_names(calibration.distortion_model), calibration.distortion, strict=True
+    ):
+        rows.append(_parameter_row(name, "", value, calibration.std[name], name in calibration.fixed))
     if len(calibration.views) == 1:
         (view,) = calibration.views.values()
         values = [*view.pose.euler, *view.pose.t]
@@ -173,7 +178,7 @@ def _parameter_rows(calibration: Calibration) -> list[list[str]]:
 
 
 def _parameter_row(name: str, unit: str, value: float, std: float, given: bool) -> list[str]:
-    label = f"{name} [{unit}]"
+    label = f"{name} [{unit}]" if unit else name
     if given:
         return [label, f"{value:.7g}", "given", ""]
     relative = f"{100 * std / abs(value):.2g} %" if value != 0 and math.isfinite(std) else "-"

@@ -8,6 +8,7 @@ rivals are tried: other intrinsics, the mirrored pose of a flat board, random ca
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,7 +105,7 @@ def better_by_view(job: Job, one: Refined, two: Refined) -> Refined:
     better = two.cost < one.cost
     R = np.where(better[:, None, None], two.state.R, one.state.R)
     t = np.where(better[:, None], two.state.t, one.state.t)
-    return job.refine(CameraState(one.state.entries, R, t))
+    return job.refine(replace(one.state, R=R, t=t))
 
 
 def try_mirrored(job: Job, refined: Refined) -> Refined:
@@ -115,13 +116,13 @@ def try_mirrored(job: Job, refined: Refined) -> Refined:
         return refined
     R, t = state.R.copy(), state.t.copy()
     R[flat] = _mirrored(R[flat], t[flat], views.basis[flat])
-    normal, in_front = normal_blocks(views.tiles, CameraState(state.entries, R, t))
+    normal, in_front = normal_blocks(views.tiles, replace(state, R=R, t=t))
     near = in_front & (normal[:, -1, -1] < _FLIP_RANGE**2 * refined.cost + 1e-20)
     rivals = np.flatnonzero(near & views.nearly_flat)
     for steps in (_FLIP_STEPS, 200):
         if not rivals.size:
             return refined
-        posed = _pose_alone(job, CameraState(state.entries, R[rivals], t[rivals]), rivals, steps)
+        posed = _pose_alone(job, replace(state, R=R[rivals], t=t[rivals]), rivals, steps)
         R[rivals], t[rivals] = posed.state.R, posed.state.t
         close = posed.cost < _FLIP_CLOSE**2 * refined.cost[rivals] + 1e-20
         if steps == _FLIP_STEPS:
@@ -131,13 +132,15 @@ def try_mirrored(job: Job, refined: Refined) -> Refined:
         return refined
     moved_R, moved_t = state.R.copy(), state.t.copy()
     moved_R[rivals[better]], moved_t[rivals[better]] = R[rivals[better]], t[rivals[better]]
-    again = job.refine(CameraState(state.entries, moved_R, moved_t))
+    again = job.refine(replace(state, R=moved_R, t=moved_t))
     return again if again.cost.sum() < refined.cost.sum() else refined
 
 
 def _pose_alone(job: Job, state: CameraState, views: NDArray[np.intp], steps: int) -> Refined:
     """Refine some views' poses with the intrinsics as they are."""
-    posed = refine(job.views.subset(views).tiles, state, np.zeros(5, dtype=bool), max_iterations=steps)
+    posed = refine(
+        job.views.subset(views).tiles, state, np.zeros(5 + len(state.k), dtype=bool), max_iterations=steps
+    )
     job.tally.refinements += posed.iterations
     return posed
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.pixel_error import POSE, camera_columns
 
 __all__ = ["Covariance", "covariance"]
 
@@ -26,7 +27,7 @@ class Covariance:
     Attributes
     ----------
     entries : (f, f) array
-        Of A's free entries.
+        Of A's free entries and the lens's free coefficients.
     poses : (V, 6, 6) array
         Of omega and tau of each view; zero where poses are given.
     smallest : float
@@ -43,26 +44,27 @@ def covariance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residu
 
     Parameters
     ----------
-    normal : (V, 12, 12) array
+    normal : (V, 12 + K, 12 + K) array
         From `refine`.
-    free : (5,) bool array
+    free : (5 + K,) bool array
+        Of A's entries and the lens's coefficients.
     free_pose : bool
     n_residuals : int
         Twice the number of points.
     """
-    f = np.flatnonzero(free)
+    f = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     V = len(normal)
     unknowns = len(f) + (6 * V if free_pose else 0)
-    variance = float(normal[:, 11, 11].sum()) / max(n_residuals - unknowns, 1)
+    variance = float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
     U = normal[:, f[:, None], f].sum(axis=0)
     if not free_pose:
         inverse, smallest = _inverse(U, U)
         return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
-    B = normal[:, 5:11, 5:11]
+    B = normal[:, POSE, POSE]
     B_inverse, smallest = _inverse(B, B)
     if not f.size:
         return Covariance(np.zeros((0, 0)), variance * B_inverse, smallest)
-    C = normal[:, f[:, None], range(5, 11)]  # (V, f, 6)
+    C = normal[:, f, POSE]  # (V, f, 6)
     gain = C @ B_inverse
     S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
     S_inverse, smallest_shared = _inverse(S, U)

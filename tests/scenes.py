@@ -156,7 +156,7 @@ def random_solid(rng: np.random.Generator, type: int, skew: bool) -> Scene:
 def random_flat_set(rng: np.random.Generator, n_views: int, skew: bool, **fixed: float) -> Scene:
     """A flat board in several views, tilted 10-60 degrees to any side, rolled by any angle."""
     cols, rows = int(fixed.get("cols", rng.integers(4, 12))), int(fixed.get("rows", rng.integers(3, 9)))
-    width = int(rng.integers(480, 4000))
+    width = int(fixed.get("width", rng.integers(480, 4000)))
     height = int(width * rng.uniform(0.55, 0.9))
     f = float(fixed.get("f", np.exp(rng.uniform(np.log(0.5 * width), np.log(min(6000, 4 * width))))))
     A = np.array(

@@ -190,16 +190,23 @@ def test_type_4_finds_the_camera_of_a_known_pose(tmp_path: Path, points: Path, c
     assert sum(line.endswith("given") for line in result.stderr.splitlines()) == 6
 
 
-def test_a_given_camera_with_distortion_is_refused(tmp_path: Path, points: Path) -> None:
-    ros = tmp_path / "ros.yaml"
+def test_type_3_keeps_the_lens_of_a_ros_file(tmp_path: Path, points: Path) -> None:
+    ros, out = tmp_path / "ros.yaml", tmp_path / "posed.yaml"
     ros.write_text(
         "image_width: 640\nimage_height: 480\ncamera_name: c\ncamera_matrix: {rows: 3, cols: 3, "
         "data: [600, 0, 320, 0, 600, 240, 0, 0, 1]}\ndistortion_model: plumb_bob\n"
-        "distortion_coefficients: {rows: 1, cols: 5, data: [-0.2, 0, 0, 0, 0]}\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [-0.05, 0, 0, 0, 0]}\n"
     )
-    result = run("calibrate", points, "--type", 3, "--intrinsics", ros)
-    assert result.exit_code == 1
-    assert "undistort the points first" in result.stderr
+    result = run("calibrate", points, "--type", 3, "--intrinsics", ros, "-o", out)
+    assert result.exit_code == 0, result.stderr
+    assert read_calibration(out).distortion.tolist() == [-0.05, 0, 0, 0, 0]
+    assert "k1  " in result.stderr
+
+
+def test_type_3_cannot_choose_a_lens(points: Path, camera: Path) -> None:
+    result = run("calibrate", points, "--type", 3, "--intrinsics", camera, "--distortion", "k1")
+    assert result.exit_code == 2
+    assert "leave out --distortion" in result.stderr
 
 
 def test_a_given_camera_of_another_image_size_is_refused(tmp_path: Path, camera: Path) -> None:

@@ -105,12 +105,10 @@ def test_points_in_another_unit_are_warned_of_when_poses_are_reused() -> None:
     assert "mm" in warning
 
 
-def test_a_distorted_camera_is_refused() -> None:
-    distorted = replace(
-        made_calibration(), distortion_model="plumb_bob", distortion=np.array([-0.2, 0, 0, 0, 0])
-    )
-    with pytest.raises(NeurocalError, match="undistort the points"):
-        evaluate_camera(distorted)
+def test_the_lens_is_part_of_the_prediction() -> None:
+    straight = made_calibration()
+    bent = replace(straight, distortion_model="plumb_bob", distortion=np.array([-0.2, 0, 0, 0, 0]))
+    assert evaluate_camera(bent).rmse_px > evaluate_camera(straight).rmse_px + 0.1
 
 
 def test_ten_thousand_views_are_evaluated_at_once() -> None:

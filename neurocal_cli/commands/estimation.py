@@ -14,11 +14,11 @@ from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from neurocal_cli.camera import Intrinsics
+    from neurocal_cli.io.camera_files import CameraFile
     from neurocal_cli.points import Correspondences
     from neurocal_cli.training.backprop import BackpropOptions
 
-__all__ = ["Estimation", "estimation_options", "given_intrinsics"]
+__all__ = ["Estimation", "estimation_options", "given_camera"]
 
 _BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
 
@@ -68,6 +68,8 @@ class Estimation:
             raise UsageError("--type 4 needs the known poses; give --extrinsics CAMERA.yaml")
         if self.type == "3" and self.no_skew:
             raise UsageError("--no-skew cannot change the given camera of --type 3; leave it out")
+        if self.type == "3" and self.distortion != "none":
+            raise UsageError("--type 3 takes the lens of the given camera; leave out --distortion")
         for name, option in _BACKPROP_ONLY.items():
             if getattr(self, name) is not None and self.trainer != "backprop":
                 raise UsageError(f"{option} belongs to --trainer backprop; this is --trainer {self.trainer}")
@@ -100,7 +102,7 @@ class Estimation:
         if self.type == "2":
             arguments["image_center"] = self._center(points)
         elif self.intrinsics is not None:
-            points, arguments["intrinsics"] = given_intrinsics(self.intrinsics, points)
+            points, arguments["intrinsics"] = given_camera(self.intrinsics, points)
         elif self.extrinsics is not None:
             from neurocal_cli.io.camera_files import read_extrinsics
 
@@ -138,22 +140,17 @@ class Estimation:
         return center
 
 
-def given_intrinsics(path: str, points: Correspondences) -> tuple[Correspondences, Intrinsics]:
+def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, CameraFile]:
     """Read a known camera; give the points its image size if they have none.
 
     Raises
     ------
     InputError
-        A camera with distortion, or of another image size.
+        A camera of another image size.
     """
     from neurocal_cli.io.camera_files import read_intrinsics
 
     camera = read_intrinsics(path)
-    if any(camera.distortion):
-        raise InputError(
-            f"{path}: a given camera with lens distortion is not supported yet; undistort the points "
-            "first and set the file's distortion coefficients to 0"
-        )
     if camera.image_size is not None:
         if points.image_size is None:
             points = replace(points, image_size=camera.image_size)
@@ -163,7 +160,7 @@ def given_intrinsics(path: str, points: Correspondences) -> tuple[Correspondence
                 f"{points.source} has {points.image_size[0]} x {points.image_size[1]}; give the camera "
                 "at the size of the points"
             )
-    return points, camera.intrinsics
+    return points, camera
 
 
 def estimation_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -267,9 +264,9 @@ _OPTIONS = [
     ),
     click.option(
         "--distortion",
-        type=click.Choice(["none"]),
+        type=click.Choice(["none", "k1", "k1k2", "plumb_bob", "rational", "fisheye"]),
         default="none",
-        help="Lens distortion model; none is the pinhole camera.",
+        help="Lens model, estimated with everything else, coefficients as in OpenCV; none is the pinhole.",
     ),
     click.option(
         "--no-skew",

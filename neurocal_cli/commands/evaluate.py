@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.estimation import given_intrinsics
+from neurocal_cli.commands.estimation import given_camera
 from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
 from neurocal_cli.commands.streams import check_one_stdin, is_terminal, note, warn
 from neurocal_cli.errors import FormatError
@@ -97,11 +97,11 @@ def _evaluate(name: str, points: Correspondences | None) -> CameraEvaluation:
         if points is None or name == "-":
             raise
         try:
-            points, intrinsics = given_intrinsics(name, points)
+            points, camera = given_camera(name, points)
         except FormatError:
             raise error from None  # no camera file of any kind: tell why it is no calibration
-        note([f"only the intrinsic parameters are used: {error}"])
-    return evaluate_camera(intrinsics, points)
+        note([f"only the intrinsic parameters and the lens are used: {error}"])
+    return evaluate_camera(camera, points)
 
 
 def _tell(evaluation: CameraEvaluation) -> None:

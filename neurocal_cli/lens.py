@@ -1,0 +1,267 @@
+"""Lenses that bend: distortion of normalised image coordinates, its derivatives and its inverse.
+
+A camera's point (x, y) = (Xc_1, Xc_2) / Xc_3 goes to (x', y') and then through A. The models and the
+order of coefficients are OpenCV's:
+
+    k1, k1k2, plumb_bob, rational
+        x' = x R + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = y R + p1 (r^2 + 2 y^2) + 2 p2 x y,
+        R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6);
+        coefficients k1, k2, p1, p2, k3, k4, k5, k6, of which the simpler models have the first
+        1, 2, 5 and 8                                             (Brown 1971; Heikkila 2000)
+    fisheye
+        (x', y') = (x, y) theta (1 + k1 theta^2 + ... + k4 theta^8) / r,  theta = atan(r)
+                                                                  (Kannala and Brandt 2006)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = ["MODELS", "Lens", "bend", "coefficient_names", "distort", "fold_radius", "undistort"]
+
+MODELS = {
+    "none": (),
+    "k1": ("k1",),
+    "k1k2": ("k1", "k2"),
+    "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
+    "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "fisheye": ("k1", "k2", "k3", "k4"),
+}
+
+_TINY = 1e-12  # squared radius below which a fisheye is its own tangent
+_NEWTON_STEPS = 50
+_INVERSE_TOLERANCE = 1e-14
+
+
+def coefficient_names(model: str) -> tuple[str, ...]:
+    """Names of a model's coefficients, in order.
+
+    Raises
+    ------
+    InputError
+        There is no such model.
+    """
+    if model not in MODELS:
+        raise InputError(f"distortion must be one of {', '.join(MODELS)}, not {model!r}")
+    return MODELS[model]
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A distortion model with its coefficients; without arguments, none.
+
+    Parameters
+    ----------
+    model : str
+        One of `MODELS`.
+    coefficients : sequence of float
+        As many as the model has; missing ones are 0.
+
+    Raises
+    ------
+    InputError
+        An unknown model, too many coefficients, or one that is not finite.
+    """
+
+    model: str = "none"
+    coefficients: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        names = coefficient_names(self.model)
+        values = np.array(self.coefficients, dtype=float).ravel()
+        if values[len(names) :].any() or not np.isfinite(values).all():
+            raise InputError(f"the lens model {self.model} has {len(names)} finite coefficients")
+        padded = np.zeros(len(names))
+        padded[: len(values)] = values[: len(names)]
+        padded.setflags(write=False)
+        object.__setattr__(self, "coefficients", padded)
+
+    @property
+    def bends(self) -> bool:
+        """Whether it changes anything; a fisheye always does."""
+        return bool(self.coefficients.any()) or self.model == "fisheye"
+
+
+# A number, or an array that broadcasts against the points.
+Coefficients = Sequence[Any] | Array
+
+
+def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
+    """Bend normalised image points.
+
+    Parameters
+    ----------
+    model : str
+    k : sequence of coefficients
+        Each a number or an array that broadcasts against x.
+    x, y : arrays of one shape
+
+    Returns
+    -------
+    x', y' : arrays of that shape
+    """
+    return bend(model, k, x, y)[0]
+
+
+def bend(
+    model: str, k: Coefficients, x: Array, y: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array, Array, Array], list[tuple[Array, Array]]]:
+    """Bend points, with derivatives.
+
+    Returns
+    -------
+    point : (x', y')
+    by_point : four arrays
+        dx'/dx, dx'/dy, dy'/dx, dy'/dy.
+    by_coefficient : list of pairs of arrays
+        dx', dy' by each coefficient.
+    """
+    if model == "fisheye":
+        return _bend_fisheye(k, x, y)
+    return _bend_polynomial(k, x, y)
+
+
+def _bend_polynomial(
+    k: Coefficients, x: Array, y: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array, Array, Array], list[tuple[Array, Array]]]:
+    count = len(k)
+    full: list[Any] = [*k, *[0.0] * (8 - count)]
+    k1, k2, p1, p2, k3, k4, k5, k6 = full
+    r2 = x * x + y * y
+    r4 = r2 * r2
+    r6 = r4 * r2
+    top = 1 + k1 * r2 + k2 * r4 + k3 * r6
+    inverse: Array | float = 1.0
+    slope = k1 + 2 * k2 * r2 + 3 * k3 * r4  # dR / d(r^2)
+    R = top
+    if count > 5:
+        inverse = 1.0 / (1 + k4 * r2 + k5 * r4 + k6 * r6)
+        R = top * inverse
+        slope = (slope - R * (k4 + 2 * k5 * r2 + 3 * k6 * r4)) * inverse
+    cross = 2 * x * y * slope
+    xx, yy = R + 2 * x * x * slope, R + 2 * y * y * slope
+    bent_x, bent_y = x * R, y * R
+    by: list[tuple[Array, Array]] = []
+    for power in (r2, r4)[: min(count, 2)]:
+        by.append((x * power * inverse, y * power * inverse))
+    if count > 2:
+        xy2 = 2 * x * y
+        bent_x = bent_x + p1 * xy2 + p2 * (r2 + 2 * x * x)
+        bent_y = bent_y + p1 * (r2 + 2 * y * y) + p2 * xy2
+        mixed = 2 * (p1 * x + p2 * y)
+        cross = cross + mixed
+        xx, yy = xx + 2 * p1 * y + 6 * p2 * x, yy + 6 * p1 * y + 2 * p2 * x
+        by += [(xy2, r2 + 2 * y * y), (r2 + 2 * x * x, xy2), (x * r6 * inverse, y * r6 * inverse)]
+    if count > 5:
+        by += [(-x * R * p * inverse, -y * R * p * inverse) for p in (r2, r4, r6)]
+    return (bent_x, bent_y), (xx, cross, cross, yy), by
+
+
+def _bend_fisheye(
+    k: Coefficients, x: Array, y: Array
+) -> tuple[tuple[Array, Array], tuple[Array, Array, Array, Array], list[tuple[Array, Array]]]:
+    k1, k2, k3, k4 = k
+    r2 = np.maximum(x * x + y * y, _TINY)
+    r = np.sqrt(r2)
+    theta = np.arctan(r)
+    t2 = theta * theta
+    bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    growth = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    scale = bent / r
+    slope = (growth / (1 + r2) - scale) / r2  # d(scale) / dr / r
+    by = []
+    power = theta * t2 / r
+    for _ in range(4):
+        by.append((x * power, y * power))
+        power = power * t2
+    cross = x * y * slope
+    return (x * scale, y * scale), (scale + x * x * slope, cross, cross, scale + y * y * slope), by
+
+
+def undistort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
+    """Straighten bent points, the inverse of `distort`, by damped Newton steps.
+
+    Parameters
+    ----------
+    model : str
+    k : sequence of float
+    x, y : arrays of one shape
+        Bent normalised points.
+
+    Returns
+    -------
+    x, y : arrays of that shape
+        ``nan`` where no straight point bends to the given one.
+    """
+    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    sx, sy = x.copy(), y.copy()
+    with np.errstate(all="ignore"):
+        if model == "fisheye":
+            # The start within the hemisphere that the model can see.
+            r = np.hypot(x, y)
+            stretch = np.tan(np.minimum(r, 1.4)) / np.maximum(r, 1e-300)
+            sx, sy = np.where(r > 0, x * stretch, x), np.where(r > 0, y * stretch, y)
+        (bx, by), J, _ = bend(model, k, sx, sy)
+        error = np.hypot(bx - x, by - y)
+        for _ in range(_NEWTON_STEPS):
+            if np.nanmax(error, initial=0.0) < _INVERSE_TOLERANCE:
+                break
+            det = J[0] * J[3] - J[1] * J[2]
+            step_x = (J[3] * (x - bx) - J[1] * (y - by)) / det
+            step_y = (J[0] * (y - by) - J[2] * (x - bx)) / det
+            sx, sy, (bx, by), J, error = _shortened(model, k, (x, y), (sx, sy), (step_x, step_y), error)
+        good = error < 1e-9 * (1 + np.hypot(x, y))
+    return np.where(good, sx, np.nan), np.where(good, sy, np.nan)
+
+
+def _shortened(
+    model: str,
+    k: Coefficients,
+    target: tuple[Array, Array],
+    start: tuple[Array, Array],
+    step: tuple[Array, Array],
+    error: Array,
+) -> tuple[Array, Array, tuple[Array, Array], tuple[Array, Array, Array, Array], Array]:
+    """One step for each point, halved until it lowers the point's error."""
+    length = np.where(np.isfinite(step[0] + step[1]), 1.0, 0.0)
+    whole = np.where(length > 0, step[0], 0.0), np.where(length > 0, step[1], 0.0)
+    for _ in range(6):
+        sx, sy = start[0] + length * whole[0], start[1] + length * whole[1]
+        bent, J, _ = bend(model, k, sx, sy)
+        new = np.hypot(bent[0] - target[0], bent[1] - target[1])
+        worse = ~(new <= error)
+        if not worse.any():
+            break
+        length = np.where(worse, 0.5 * length, length)
+    return sx, sy, bent, J, new
+
+
+def fold_radius(model: str, k: Coefficients, largest: float) -> float:
+    """Radius of straight points from which on the lens maps back inwards.
+
+    Parameters
+    ----------
+    model : str
+    k : sequence of float
+    largest : float
+        Radius up to which to look.
+
+    Returns
+    -------
+    radius : float
+        infinity when the image grows monotonically up to `largest`; tangential terms are left out.
+    """
+    names = coefficient_names(model)
+    radial = [0.0 if name in ("p1", "p2") else float(c) for name, c in zip(names, k, strict=True)]
+    r = np.linspace(0.0, largest, 2001)[1:]
+    _, (xx, _, _, yy), _ = bend(model, radial, r, np.zeros_like(r))
+    # Along a ray the image must grow, and across it must not pass through 0.
+    folded = ~((xx > 0) & (yy > 0))
+    return float(r[np.argmax(folded)]) if folded.any() else float("inf")
