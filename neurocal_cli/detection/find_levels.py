@@ -1,0 +1,112 @@
+"""An image at several sizes, with the second derivatives that show where two edges cross.
+
+Pixel (u, v) of a level is pixel (2 u, 2 v) of the level below it: `cv2.pyrDown` keeps the even ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["Level", "levels_of", "sampled"]
+
+Image = NDArray[np.float32]
+
+_SMOOTHING = 1.0  # px; of the picture that is looked at, against noise and jagged edges
+_SMALLEST = 48  # px; the shorter side of the smallest level
+_LEAST_NOISE = 0.12  # DN of a second derivative; what rounding to 8 bits leaves
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """A reduced image.
+
+    Attributes
+    ----------
+    image : (height, width) float32 array
+        In grey levels of an 8-bit image.
+    scale : int
+        Pixels of the original per pixel.
+    """
+
+    image: Image
+    scale: int
+
+    @cached_property
+    def smooth(self) -> Image:
+        """The image without its finest grain."""
+        return np.asarray(cv2.GaussianBlur(self.image, (0, 0), _SMOOTHING), dtype=np.float32)
+
+    @cached_property
+    def curvature(self) -> tuple[Image, Image, Image]:
+        """Second derivatives uu, uv and vv of `smooth` [DN/px^2]."""
+        uu, uv, vv = (
+            cv2.Sobel(self.smooth, cv2.CV_32F, *order, ksize=3, scale=0.25)
+            for order in ((2, 0), (1, 1), (0, 2))
+        )
+        return uu, uv, vv
+
+    @cached_property
+    def noise(self) -> float:
+        """Standard deviation of the second derivatives where nothing is [DN/px^2]."""
+        sparse = np.abs(self.curvature[1][::3, ::3])
+        return max(float(np.median(sparse)) / 0.6745, _LEAST_NOISE)
+
+
+def levels_of(image: NDArray[np.generic]) -> list[Level]:
+    """Halve an image again and again.
+
+    Parameters
+    ----------
+    image : (height, width) array
+        8 or 16 bits, or real numbers of any range.
+
+    Returns
+    -------
+    levels : list of Level
+        The original first; empty when the image is too small to hold a board.
+    """
+    levels = []
+    current, scale = _grey(image), 1
+    while min(current.shape) >= (16 if scale == 1 else _SMALLEST):
+        levels.append(Level(current, scale))
+        current, scale = cv2.pyrDown(current), 2 * scale
+    return levels
+
+
+def _grey(image: NDArray[np.generic]) -> Image:
+    """Grey levels of 8 bits as real numbers."""
+    if image.dtype == np.uint8:
+        return image.astype(np.float32)
+    if image.dtype == np.uint16:
+        return np.asarray(image.astype(np.float32) * np.float32(1 / 257))
+    if image.size == 0:
+        return np.zeros(image.shape, dtype=np.float32)
+    real = image.astype(float)
+    finite = np.isfinite(real)
+    if not finite.any():
+        return np.zeros(image.shape, dtype=np.float32)
+    low, high = float(real[finite].min()), float(real[finite].max())
+    with np.errstate(over="ignore", invalid="ignore"):
+        scaled = (np.where(finite, real, low) - low) * (255 / (high - low)) if high > low else 0 * real
+    return np.asarray(np.nan_to_num(scaled), dtype=np.float32)
+
+
+def sampled(image: Image, points: Array) -> Array:
+    """Interpolate an image at points of any shape (..., 2) [px]; outside the border goes on."""
+    flat = points.reshape(-1, points.shape[-2], 2) if points.ndim > 2 else points.reshape(-1, 1, 2)
+    maps = flat.astype(np.float32)
+    out = np.empty(maps.shape[:2], dtype=np.float32)
+    # The interpolation's tables count rows in 16 bits.
+    for start in range(0, len(maps), 32000):
+        part = np.ascontiguousarray(maps[start : start + 32000])
+        out[start : start + 32000] = cv2.remap(
+            image, part[..., 0], part[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+        )
+    return out.reshape(points.shape[:-1]).astype(float)

@@ -1,0 +1,116 @@
+"""All chessboards in a picture, whatever their size: `find_grids`.
+
+Saddles of the brightness are linked along edges; blocks of 3 x 3 linked vertices grow into grids
+on a reduced picture, and are completed and made precise on finer and finer ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.find_grow import Lattice, cleaned, grown, smoothing
+from neurocal_cli.detection.find_levels import Level, levels_of
+from neurocal_cli.detection.find_refine import settle
+from neurocal_cli.detection.find_saddles import Saddles, find_saddles
+from neurocal_cli.detection.find_seeds import find_links, find_seeds
+from neurocal_cli.detection.grid import Grid
+
+__all__ = ["find_grids"]
+
+_SEARCHED = 1.4e6  # px; the largest level that is searched when smaller ones gave something
+_REFINED = 1.4e6  # px; the largest level that grids grow on
+_TRIES = 12  # seeds per level that come to nothing
+
+
+def find_grids(image: NDArray[np.generic]) -> list[Grid]:
+    """Find every chessboard in a picture.
+
+    Parameters
+    ----------
+    image : (height, width) array
+        Grey, of 8 or 16 bits or real numbers of any range.
+
+    Returns
+    -------
+    grids : list of Grid
+        The one with the most vertices first. Vertices are good to a few tenths of a pixel. Planes
+        that meet at a fold are grids of their own. A grid has at least 3 x 3 vertices: anything
+        smaller can be seen in clutter too, and its lines are not tested by a vertex between others.
+    """
+    lattices: list[Lattice] = []
+    levels = levels_of(image)
+    for level in reversed(levels):
+        lattices = [x for x in (_finer(level, x) for x in lattices) if _is_board(x)]
+        if level.image.size <= _SEARCHED or not lattices:
+            lattices += _new(level, lattices)
+    found = [Grid(x.pixels, x.dark) for x in lattices]
+    return sorted(found, key=lambda grid: -int(grid.seen.sum()))
+
+
+def _new(level: Level, known: list[Lattice]) -> list[Lattice]:
+    """Grids of a level that are not among the known ones."""
+    saddles = find_saddles(level, _covered(level, known) if known else None)
+    if len(saddles) < 9:
+        return []
+    seeds, _ = find_seeds(saddles, find_links(level, saddles))
+    found: list[Lattice] = []
+    free = np.ones(len(saddles), dtype=bool)
+    tries = 0
+    for seed in seeds:
+        if tries >= _TRIES:
+            break
+        if not free[seed].all():
+            continue
+        free[seed] = False
+        lattice = cleaned(grown(level, _planted(level, saddles, seed)))
+        if _is_board(lattice):
+            found.append(lattice)
+            free &= _covered(level, [lattice])[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
+        else:
+            tries += 1
+    return found
+
+
+def _planted(level: Level, saddles: Saddles, seed: NDArray[np.intp]) -> Lattice:
+    return Lattice(saddles.points[seed], saddles.contrast[seed], 0)
+
+
+def _finer(level: Level, lattice: Lattice) -> Lattice:
+    """The same grid on the next level, completed there."""
+    lattice = replace(lattice, pixels=2 * lattice.pixels)
+    row, col = np.nonzero(lattice.seen)
+    pixels = lattice.pixels.copy()
+    settled = settle(level.image, pixels[row, col], smoothing(lattice.width))
+    close = np.hypot(*(settled - pixels[row, col]).T) < 2
+    pixels[row, col] = np.where(close[:, None], settled, pixels[row, col])
+    lattice = replace(lattice, pixels=pixels)
+    if level.image.size <= _REFINED:
+        lattice = grown(level, lattice)
+    return cleaned(lattice)
+
+
+def _covered(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
+    """Paint the squares of grids, and a little around them."""
+    mask = np.zeros(level.image.shape, dtype=np.uint8)
+    for lattice in lattices:
+        p = lattice.pixels
+        quads = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2).reshape(-1, 4, 2)
+        quads = quads[np.isfinite(quads).all(axis=(1, 2))]
+        thickness = max(1, round(0.4 * lattice.width))
+        whole = np.rint(quads).astype(np.int32)
+        cv2.fillPoly(mask, list(whole), 255)
+        cv2.polylines(mask, list(whole), True, 255, thickness)
+    return mask
+
+
+def _is_board(lattice: Lattice) -> bool:
+    """Whether a block of 3 x 3 vertices is known."""
+    seen = lattice.seen
+    if min(seen.shape) < 3:
+        return False
+    rows = seen[:-2] & seen[1:-1] & seen[2:]
+    return bool((rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]).any())
