@@ -38,6 +38,7 @@ def check_points(views: Views, known: Known) -> None:
         _check_each_view(views)
     if known.type in (1, 2):
         _check_planes(views, known)
+        _check_helpers(views, known)
     unknowns, equations = parameter_count(known, views.n_views), 2 * int(views.distinct.sum())
     if equations <= unknowns:
         raise DegenerateGeometryError(
@@ -87,6 +88,24 @@ def _check_planes(views: Views, known: Known) -> None:
     views_text = "one view" if len(flat) == 1 else f"{len(flat)} views"
     raise DegenerateGeometryError(
         f"{views_text} of one plane cannot tell {names} apart; give {', '.join(ways[:-1])} or {ways[-1]}"
+    )
+
+
+def _check_helpers(views: Views, known: Known) -> None:
+    """Views with too few points of their own join the others, which must tell the camera alone.
+
+    All together might have the equations for it, but from the wrong camera that they begin with they
+    mostly end in a wrong minimum, and nothing shows it.
+    """
+    able = views.distinct >= np.where(views.nearly_flat, 4, 6)
+    needed = -(-int(known.free.sum()) // 2)
+    if able.all() or not able.any() or (able & ~views.nearly_flat).any() or able.sum() >= needed:
+        return
+    which = int(np.argmin(able))
+    raise DegenerateGeometryError(
+        f"view {views.names[which]!r} has only {views.distinct[which]} different points, and the views of one "
+        f"plane cannot tell the camera without it; give it at least 6 points, or {needed} views of the board "
+        "from different angles"
     )
 
 
