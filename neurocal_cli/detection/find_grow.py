@@ -21,7 +21,7 @@ _SEARCHED = 0.24  # squares to either side of where a vertex is expected
 _STEPS = 9
 _MOST_SPREAD = 5.0  # of an expectation that is worth looking at
 _OFF, _OFF_SPREAD, _OFF_PX = 0.06, 0.03, 0.45  # squares, squares per spread, px: see `_tolerance`
-_WEAKEST = 0.3  # least contrast over the neighbours'
+_WEAKEST = 0.5  # least contrast over the neighbours'
 _LAYERS = 200
 
 
@@ -190,25 +190,39 @@ def _searched(level: Level, at: Expected, dark: Array) -> Array:
 
 
 def cleaned(lattice: Lattice) -> Lattice:
-    """Take out vertices that are not where their neighbours put them, the worst of each place first."""
+    """Take out vertices that are not where their neighbours put them, and such as close no square."""
     pixels = lattice.pixels.copy()
     for _ in range(12):
-        row, col = np.nonzero(np.isfinite(pixels[..., 0]))
+        row, col = np.nonzero(_squared(np.isfinite(pixels[..., 0])))
+        pixels, before = np.full_like(pixels, np.nan), pixels
+        pixels[row, col] = before[row, col]
         if not len(row):
             break
         at = expected(pixels, row, col)
-        off = np.abs(at.in_squares(pixels[row, col] - at.points)).max(axis=1)
-        excess = off / _tolerance(at)
-        excess = np.where((at.area > 0) & (at.spread < 2 * _MOST_SPREAD), excess, np.inf)
-        if not (excess > 1).any():
+        off = np.abs(at.in_squares(pixels[row, col] - at.points)).max(axis=1) / _tolerance(at)
+        off = np.where((at.area > 0) & (at.spread < 2 * _MOST_SPREAD), off, np.inf)
+        if not (off > 1).any():
             break
+        # Next to a bad vertex good ones look bad too: only the worst of each place goes.
         worst = np.zeros(pixels.shape[:2])
-        worst[row, col] = excess
-        framed = np.zeros((worst.shape[0] + 2, worst.shape[1] + 2))
-        framed[1:-1, 1:-1] = worst
-        top = np.max(
-            [framed[i : i + worst.shape[0], j : j + worst.shape[1]] for i in range(3) for j in range(3)], 0
-        )
-        pixels[(worst > 1) & (worst >= top)] = np.nan
+        worst[row, col] = off
+        pixels[(worst > 1) & (worst >= _largest_around(worst))] = np.nan
     contrast = np.where(np.isfinite(pixels[..., 0]), lattice.contrast, np.nan)
     return cropped(replace(lattice, pixels=pixels, contrast=contrast))
+
+
+def _squared(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which vertices are corners of a square with four known corners."""
+    whole = seen[:-1, :-1] & seen[:-1, 1:] & seen[1:, :-1] & seen[1:, 1:]
+    squared = np.zeros_like(seen)
+    for part in (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]):
+        squared[part] |= whole
+    return squared
+
+
+def _largest_around(values: Array) -> Array:
+    """Maximum over the 3 x 3 places around each."""
+    framed = np.zeros((values.shape[0] + 2, values.shape[1] + 2))
+    framed[1:-1, 1:-1] = values
+    rows = np.maximum(np.maximum(framed[:-2], framed[1:-1]), framed[2:])
+    return np.asarray(np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:]))

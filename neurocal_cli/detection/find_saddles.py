@@ -23,6 +23,7 @@ _BORDER = 4  # px
 _RADII = (5.0, 3.0)  # px; of the rings, the better one first
 _RAYS = 32
 _MOST_BENT = np.radians(22)  # of a line on its way through the vertex
+_MOST_DIFFERENT = np.radians(14)  # between two rings
 _NARROWEST = np.radians(14)
 _PER_MEGAPIXEL = 4000  # saddles that are looked at ...
 _MOST = 1400  # ... and kept
@@ -72,6 +73,9 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     noise = level.noise
     rings = [_ring(sampled(level.smooth, points[:, None] + r * _DIRECTIONS), noise) for r in _RADII]
     (ports, contrast, good), (ports_small, contrast_small, good_small) = rings
+    # Where squares are small, the large ring reaches into the next ones: then both rings differ.
+    differ = np.abs(_wrapped(ports - ports_small)).max(axis=1) > _MOST_DIFFERENT
+    good &= ~(good_small & differ)
     ports = np.where(good[:, None], ports, ports_small)
     contrast = np.where(good, contrast, contrast_small)
     kept = np.flatnonzero(good | good_small)
@@ -81,6 +85,11 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
 
 _ANGLES = 2 * np.pi / _RAYS * np.arange(_RAYS)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+
+
+def _wrapped(angle: Array) -> Array:
+    """Angles from -pi to pi."""
+    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:

@@ -22,7 +22,8 @@ Index = NDArray[np.intp]
 _WIDEST = 0.26  # rad; between a port and the way to the neighbour
 _SHARE = 0.4  # the same as a share of the vertex's narrower angle
 _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
-_IRREGULAR = 0.16  # second differences of a seed, in squares
+_IRREGULAR = 0.12  # squares; how much a seed's second differences may vary ...
+_BENT = 0.4  # ... as a share of what they may be
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ def find_seeds(saddles: Saddles, links: Links) -> tuple[Index, Array]:
     members : (S, 3, 3) int array
         Saddles of each block; ``[.., r, c]`` with c along port 0 of the middle one, r along port 1.
     irregularity : (S,) array
-        Largest second difference, in squares.
+        How little the block is like a smooth map, in squares.
     """
     closed = _closed(links)
     centre = np.flatnonzero(closed.all(axis=1))
@@ -155,21 +156,22 @@ def _closed(links: Links) -> NDArray[np.bool_]:
 
 
 def _irregularity(grid: Array) -> Array:
-    """Largest second difference of (S, 3, 3, 2) blocks, in squares' own coordinates."""
+    """How little (S, 3, 3, 2) blocks are like a smooth map, in squares; (S,) array.
+
+    Perspective and lenses make squares grow steadily, alike in neighbouring rows.
+    """
     if not len(grid):
         return np.zeros(0)
     c = 0.5 * (grid[:, 1, 2] - grid[:, 1, 0])
     r = 0.5 * (grid[:, 2, 1] - grid[:, 0, 1])
-    bent = np.concatenate(
-        [
-            grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1],
-            grid[:, 0] + grid[:, 2] - 2 * grid[:, 1],
-            (grid[:, 0, 0] + grid[:, 2, 2] - grid[:, 0, 2] - grid[:, 2, 0])[:, None],
-        ],
-        axis=1,
-    )
     area = c[:, 0] * r[:, 1] - c[:, 1] * r[:, 0]
     area = np.where(area > 1e-6, area, 1e-6)[:, None]
-    along = (bent[..., 0] * r[:, None, 1] - bent[..., 1] * r[:, None, 0]) / area
-    across = (c[:, None, 0] * bent[..., 1] - c[:, None, 1] * bent[..., 0]) / area
-    return np.asarray(np.maximum(np.abs(along), np.abs(across)).max(axis=1))
+    along_c = grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]
+    along_r = grid[:, 0] + grid[:, 2] - 2 * grid[:, 1]
+    worst = np.zeros(len(grid))
+    for bent in (along_c, along_r):
+        for part, weight in ((bent, _BENT), (np.diff(bent, axis=1), 1.0)):
+            along = (part[..., 0] * r[:, None, 1] - part[..., 1] * r[:, None, 0]) / area
+            across = (c[:, None, 0] * part[..., 1] - c[:, None, 1] * part[..., 0]) / area
+            worst = np.maximum(worst, weight * np.maximum(np.abs(along), np.abs(across)).max(axis=1))
+    return worst

@@ -15,8 +15,8 @@ __all__ = ["Look", "look"]
 
 _INTO = 0.3  # squares; from the vertex into the four squares around it
 _ALONG, _ASIDE = 0.36, 0.16  # squares; along its edges, and to either side of them
-_FLATTEST = 0.35  # least contrast of the worst pair of squares over the mean contrast
-_FAINTEST = 0.12  # the same for an edge
+_FLATTEST = 0.5  # least contrast of the worst pair of squares over the mean contrast
+_FAINTEST = 0.3  # the same for an edge
 
 
 @dataclass(frozen=True, eq=False)
