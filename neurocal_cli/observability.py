@@ -103,9 +103,9 @@ def _check_helpers(views: Views, known: Known) -> None:
         return
     which = int(np.argmin(able))
     raise DegenerateGeometryError(
-        f"view {views.names[which]!r} has only {views.distinct[which]} different points, and the views of one "
-        f"plane cannot tell the camera without it; give it at least 6 points, or {needed} views of the board "
-        "from different angles"
+        f"view {views.names[which]!r} has only {views.distinct[which]} different points, and the views of "
+        f"one plane cannot tell the camera without it; give it at least 6 points, or {needed} views of the "
+        "board from different angles"
     )
 
 

@@ -99,12 +99,13 @@ class Correspondences:
         if self.covariance is not None:
             self._check_covariance(_matrix("covariance", self.covariance, 3))
         if self.image_size is not None:
-            width, height = (int(s) for s in self.image_size)
-            if width <= 0 or height <= 0:
+            width, height = _pair(self.image_size)
+            if not (width >= 1 and height >= 1 and width % 1 == 0 and height % 1 == 0):
                 raise InputError(f"{self.source}: image_size must be two positive whole numbers")
+            width, height = int(width), int(height)
             self._set(image_size=(width, height))
         if self.image_center is not None:
-            u0, v0 = (float(c) for c in self.image_center)
+            u0, v0 = _pair(self.image_center)
             if not np.isfinite([u0, v0]).all():
                 raise InputError(f"{self.source}: image_center must be two finite numbers")
             self._set(image_center=(u0, v0))
@@ -186,6 +187,15 @@ def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
     return array
 
 
+def _pair(values: ArrayLike) -> tuple[float, float]:
+    """Two numbers; nan for whatever is not."""
+    try:
+        first, second = np.array(values, dtype=float)
+        return float(first), float(second)
+    except (TypeError, ValueError):
+        return float("nan"), float("nan")
+
+
 def _frozen(array: NDArray[Any]) -> NDArray[Any]:
     array.setflags(write=False)
     return array
@@ -202,7 +212,10 @@ def _factorise(
         return (_ONLY_VIEW,), np.zeros(n, dtype=np.int64)
     labels = np.asarray(labels)
     starts = np.flatnonzero(np.concatenate([[True], labels[1:] != labels[:-1]]))
-    distinct, first, inverse = np.unique(labels[starts], return_index=True, return_inverse=True)
+    try:
+        distinct, first, inverse = np.unique(labels[starts], return_index=True, return_inverse=True)
+    except TypeError as error:
+        raise InputError("the views' labels must be all text or all numbers") from error
     order = np.argsort(first, kind="stable")
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))

@@ -158,7 +158,10 @@ def _centre(points: Correspondences, image_center: tuple[float, float] | None) -
         centre = ((points.image_size[0] - 1) / 2, (points.image_size[1] - 1) / 2)
     if centre is None:
         raise UsageError("type 2 needs the image centre; give it, or put image_center into the points file")
-    values = np.array(centre, dtype=float)
+    try:
+        values = np.array(centre, dtype=float)
+    except (TypeError, ValueError):
+        values = np.zeros(0)
     if values.shape != (2,) or not np.isfinite(values).all():
         raise InputError("the image centre must be two finite numbers")
     return values
@@ -172,6 +175,8 @@ def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> di
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise InputError(
             f"the extrinsics have no view named {missing[0]!r}{more}; they have "
-            f"{', '.join(repr(name) for name in list(extrinsics)[:5])}"
+            f"{', '.join(repr(name) for name in list(extrinsics)[:5]) or 'none'}"
         )
+    if not all(isinstance(extrinsics[name], Pose) for name in points.view_names):
+        raise UsageError("the extrinsics must be a dict with a Pose for each view")
     return {name: extrinsics[name] for name in points.view_names}
