@@ -184,9 +184,19 @@ def look_at(middle: Array, towards: Array, distance: float, roll: float) -> Pose
 
 
 CLUTTER = Background(clutter=CLUTTER_KINDS)
-STRONG = Illumination(0.62, (0.95, -0.5))
+STRONG = Illumination(0.7, (0.75, -0.45))
 FIVE_MEGAPIXELS = 4.05
-MIX = Recipe(tilt=50, psf=1.5, noise=6, response=2.2, distortion=(-0.2, 0.05), focal=650, background=CLUTTER)
+MIX = Recipe(
+    tilt=50,
+    psf=1.5,
+    noise=6,
+    response=2.2,
+    black=0.09,
+    white=0.95,
+    distortion=(-0.2, 0.05),
+    focal=650,
+    background=CLUTTER,
+)
 
 RECIPES: dict[str, Recipe] = {
     "base": Recipe(),
@@ -204,8 +214,8 @@ RECIPES: dict[str, Recipe] = {
     "k1 -0.3": Recipe(distortion=(-0.3, 0.08, 0.001, -0.0005), focal=600),
     "k1 -0.4 wide": Recipe(distortion=(-0.4, 0.13, 0.0, 0.0, -0.01), focal=430, square=40, tilt=25),
     "skew": Recipe(theta=np.pi / 2 - 0.02, distortion=(-0.15,)),
-    "gamma 2.2": Recipe(response=2.2),
-    "srgb": Recipe(response="srgb"),
+    "gamma 2.2": Recipe(response=2.2, black=0.09, white=0.95),
+    "srgb": Recipe(response="srgb", black=0.09, white=0.95),
     "saturated": Recipe(gain=1.3),
     "16 bit": Recipe(bits=16, noise=0.2),
     "squares 16": Recipe(square=16),
@@ -253,8 +263,8 @@ def _two_boards(rng: np.random.Generator) -> Scene:
 
 def stress(rng: np.random.Generator, hard: bool) -> Scene:
     """A random mixture of everything, fully visible."""
-    tilt, noise, psf = (75, 14, 3.0) if hard else (60, 8, 2.0)
-    contrast = rng.uniform(0.12 if hard else 0.3, 0.8)
+    tilt, noise, psf = (70, 10, 3.0) if hard else (60, 8, 2.0)
+    contrast = rng.uniform(0.25 if hard else 0.3, 0.8)
     black = rng.uniform(0.04, 0.9 - contrast)
     wide = rng.uniform() < 0.4
     recipe = Recipe(
@@ -262,7 +272,7 @@ def stress(rng: np.random.Generator, hard: bool) -> Scene:
         distortion=(float(rng.uniform(-0.28, -0.1)), 0.05) if wide else (float(rng.uniform(-0.1, 0.05)),),
         cols=int(rng.integers(5, 12)),
         rows=int(rng.integers(4, 8)),
-        square=float(rng.uniform(8 if hard else 16, 32)),
+        square=float(rng.uniform(9 if hard else 16, 32)),
         tilt=float(rng.uniform(0, tilt)),
         roll=180.0,
         margin=float(rng.uniform(0.15 if hard else 0.4, 1.0)),

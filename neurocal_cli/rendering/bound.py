@@ -13,15 +13,14 @@ from numpy.typing import NDArray
 from neurocal_cli.camera import Intrinsics
 from neurocal_cli.geometry import Array
 from neurocal_cli.rendering.layers import BoardLayer
-from neurocal_cli.rendering.light import image_light
+from neurocal_cli.rendering.light import enough_parts, image_light
 from neurocal_cli.rendering.rays import Lens
-from neurocal_cli.rendering.render import noise_free
 from neurocal_cli.rendering.scene import Scene
-from neurocal_cli.rendering.sensor import noise_variance, signal
+from neurocal_cli.rendering.sensor import noise_variance, response, signal
 
 __all__ = ["Bound", "edge_bound", "scene_bound", "vertex_bound"]
 
-_SHIFT = 0.02  # px
+_NOTHING = 1e-7  # of full scale per px
 # Two lines that cross blur each other: together they tell as much as if shorter by this many sigma_t.
 _CROSSING_LOSS = 2.26
 
@@ -78,8 +77,8 @@ def scene_bound(scene: Scene) -> tuple[Bound, ...]:
     bounds : tuple of Bound
         In the order of the scene's targets.
     """
-    gradient_u, gradient_v = _gradients(scene)
-    weight = 1 / noise_variance(scene.sensor, signal(scene.sensor, image_light(scene)))
+    gradient_u, gradient_v, linear = _gradients(scene)
+    weight = 1 / noise_variance(scene.sensor, linear)
     width, height = scene.camera.size
     v, u = np.mgrid[0:height, 0:width].reshape(2, -1).astype(float)
     rays = Lens(scene.camera).rays(u, v)
@@ -97,17 +96,25 @@ def scene_bound(scene: Scene) -> tuple[Bound, ...]:
     return tuple(bounds)
 
 
-def _gradients(scene: Scene) -> tuple[Array, Array]:
-    """Derivatives of the picture by a shift of the boards, to the sampling theorem's disregard.
+def _gradients(scene: Scene) -> tuple[Array, Array, Array]:
+    """Derivatives of the picture by a shift of the boards along u and v [DN / px], and its signal.
 
     The boards are moved below the pixels by the principal point; differences between neighbouring
-    pixels would smooth what is sharp.
+    pixels would smooth what is sharp. They move by whole cells, so that what the cells leave out is
+    the same in both pictures.
     """
-    gradients = []
-    for du, dv in ((_SHIFT, 0.0), (0.0, _SHIFT)):
-        ahead, behind = (noise_free(_shifted(scene, sign * du, sign * dv)) for sign in (1, -1))
-        gradients.append((ahead - behind) / (2 * _SHIFT))
-    return gradients[0], gradients[1]
+    step = 1 / enough_parts(scene)
+    gradients, mean = [], np.zeros(scene.camera.size[::-1])
+    for du, dv in ((step, 0.0), (0.0, step)):
+        ahead, behind = (
+            signal(scene.sensor, image_light(_shifted(scene, sign * du, sign * dv))) for sign in (1, -1)
+        )
+        change = response(scene.sensor, ahead) - response(scene.sensor, behind)
+        gradient = change * (scene.sensor.white_dn / (2 * step))
+        gradient[np.abs(gradient) < _NOTHING * scene.sensor.white_dn] = 0.0  # rounding is no information
+        gradients.append(gradient)
+        mean += 0.25 * (ahead + behind)
+    return gradients[0], gradients[1], mean
 
 
 def _shifted(scene: Scene, du: float, dv: float) -> Scene:

@@ -11,21 +11,24 @@ from neurocal_cli.rendering.clutter import background_image
 from neurocal_cli.rendering.composition import Composition
 from neurocal_cli.rendering.scene import Illumination, Scene
 
-__all__ = ["image_light"]
+__all__ = ["enough_parts", "illuminated", "image_light"]
 
-_PARTS = 8  # cells along the side of a pixel with edges
+# Cells along a pixel's side, times the blur: what keeps the picture within 0.0005 of full scale.
+_PARTS_BY_BLUR = 8.0
+_FEWEST_PARTS, _MOST_PARTS = 4, 24
 _STRIP = 32768  # pixels looked at together; small enough for the cache
-_CHUNK = 1024  # pixels with edges cut into cells together
+_CHUNK = 65536  # cells looked at together
 
 
-def image_light(scene: Scene, parts: int = _PARTS) -> Array:
+def image_light(scene: Scene, parts: int | None = None) -> Array:
     """Light that falls on each pixel.
 
     Parameters
     ----------
     scene : Scene
-    parts : int
-        Cells along the side of a pixel with edges; more make the picture yet more exact.
+    parts : int, optional
+        Cells along the side of a pixel with edges; the error falls with their square. By default as
+        many as keep it below 0.0005 of the contrast (0.0001 px for an edge).
 
     Returns
     -------
@@ -33,7 +36,7 @@ def image_light(scene: Scene, parts: int = _PARTS) -> Array:
         Linear, 1 being the sensor's full scale at gain 1.
     """
     width, height = scene.camera.size
-    blur = Blur(scene.psf, parts)
+    blur = Blur(scene.psf, parts or enough_parts(scene))
     pad = blur.radius
     composition = Composition.of(scene)
     level = background_image(scene.background, scene.camera.size, pad)
@@ -50,9 +53,13 @@ def illuminated(light: Illumination, size: tuple[int, int], u: Array, v: Array) 
     """Illumination at image points [px], a factor."""
     width, height = size
     gu, gv = light.gradient
-    # Beyond the frame the light stays what it is at least somewhere inside.
     slope = gu * (u - 0.5 * (width - 1)) / width + gv * (v - 0.5 * (height - 1)) / height
     return np.asarray(light.level * (1 + slope))
+
+
+def enough_parts(scene: Scene) -> int:
+    """Cells along a pixel's side that `image_light` takes by default."""
+    return int(np.clip(np.ceil(_PARTS_BY_BLUR / scene.sigma_t), _FEWEST_PARTS, _MOST_PARTS))
 
 
 def _strips(shape: tuple[int, ...]) -> list[slice]:
@@ -80,8 +87,9 @@ def _fill(
     behind = level[rows].reshape(-1)
     light, has_edges, rays = composition.pixels(u, v, behind)
     todo = np.flatnonzero(has_edges)
-    for first in range(0, len(todo), _CHUNK):
-        some = todo[first : first + _CHUNK]
+    step = max(1, _CHUNK // blur.parts**2)
+    for first in range(0, len(todo), step):
+        some = todo[first : first + step]
         near = rays.x[some], rays.y[some]
         cells = composition.cells(u[some], v[some], near, behind[some], blur.parts)
         cells *= _cell_light(scene, u[some], v[some], blur.parts)

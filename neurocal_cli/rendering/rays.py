@@ -20,6 +20,7 @@ _MOST_STEPS = 50
 _SETTLED = 1e-13
 # Beyond this share of the radius where the distortion folds back, a ray counts as unseen.
 _USABLE = 0.999
+_LEAST_INVERSE = 1e-4  # of a radius squared: rays beyond 89.4 degrees are none of this model's
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +65,10 @@ class Lens:
     def radius(self) -> float:
         """Normalised radius up to which the radial distortion grows; infinite where it always does."""
         k1, k2, _, _, k3 = self.camera.distortion
-        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0]) if not self.straight else np.zeros(0)
-        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-        return float(_USABLE * np.sqrt(real.min())) if real.size else np.inf
+        # The slope 1 + 3 k1 r^2 + 5 k2 r^4 + 7 k3 r^6 as a polynomial in 1 / r^2.
+        roots = np.roots([1.0, 3 * k1, 5 * k2, 7 * k3])
+        real = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > _LEAST_INVERSE)]
+        return float(_USABLE / np.sqrt(real.max())) if real.size else np.inf
 
     def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Pixels of points in the camera's frame.
@@ -140,12 +142,13 @@ class Lens:
         """Newton's method; it climbs to the root from the inside, so it needs no damping."""
         x, y = (xd.copy(), yd.copy()) if near is None else (near[0] + 0 * xd, near[1] + 0 * yd)
         self._hold(x, y)
+        settled = _SETTLED * (1 + np.abs(xd) + np.abs(yd))
         for _ in range(_MOST_STEPS):
             fx, fy = self._distort(x, y)
             fx -= xd
             fy -= yd
             wrong = np.abs(fx) + np.abs(fy)
-            unsettled = wrong > _SETTLED
+            unsettled = wrong > settled
             inside = x * x + y * y < 0.9999 * self.radius**2 if np.isfinite(self.radius) else True
             if not (unsettled & inside).any():
                 break
