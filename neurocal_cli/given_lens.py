@@ -1,8 +1,8 @@
-"""Stage 4, for lenses that bend: distortion joins on the pixel error (3), or is given.
+"""Lenses at the ends of a calibration: a given one taken off the pixels, any one checked.
 
-The first three stages know a pinhole only. A lens that is estimated starts where the pinhole ended,
-with coefficients that leave it a pinhole, and everything is refined together. A lens that is given
-has been taken off the pixels for the first stages; the last step is on the pixels as they were seen.
+The networks know a pinhole only. A lens that is given is taken off the pixels before they train, and
+the last step is on the pixels as they were seen. A lens that is estimated joins in the last stage
+(`Job.refine`).
 """
 
 from __future__ import annotations
@@ -18,12 +18,9 @@ from neurocal_cli.lens import Lens, fold_radius, undistort
 from neurocal_cli.pixel_error import ENTRIES
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, intrinsic_matrix
-from neurocal_cli.rivals import try_mirrored
 
-__all__ = ["learn_lens", "straighten"]
+__all__ = ["check_lens", "straighten"]
 
-# Coefficients with which a fisheye is a pinhole to the ninth order: tan(theta) over theta.
-_FISHEYE_PINHOLE = (1 / 3, 2 / 15, 17 / 315, 62 / 2835)
 _BORDER = 33  # points along each side of the image at which the lens is checked
 
 
@@ -49,13 +46,13 @@ def straighten(points: Correspondences, known: Known) -> Correspondences:
     return replace(points, pixels=straight)
 
 
-def learn_lens(job: Job, solution: Solution, points: Correspondences) -> tuple[Job, Solution]:
-    """Refine with the lens.
+def check_lens(job: Job, solution: Solution, points: Correspondences) -> tuple[Job, Solution]:
+    """Take the last step on the pixels as they were seen, if the lens was given, and check the lens.
 
     Parameters
     ----------
     job, solution
-        Of the pinhole.
+        With a given lens, of the straightened pixels.
     points : Correspondences
         As they were seen.
 
@@ -67,22 +64,15 @@ def learn_lens(job: Job, solution: Solution, points: Correspondences) -> tuple[J
     known, lens = job.known, job.known.lens
     if lens.model == "none":
         return job, solution
-    k = lens.coefficients
-    if known.free_lens:
-        k = np.array(_FISHEYE_PINHOLE) if lens.model == "fisheye" else np.zeros(len(k))
-    else:
+    if not known.free_lens:
         order = slice(None) if job.views.order is None else job.views.order
         seen = (points.pixels[order] - job.views.pixel_centre) / job.views.pixel_scale
         job = replace(job, views=replace(job.views, pixels=seen), tally=job.tally)
-    job.progress("refining with the lens", 0.0)
-    refined = job.refine(replace(solution.refined.state, lens=lens.model, k=k))
-    if known.free_poses:
-        refined = try_mirrored(job, refined)
-    learnt = Lens(lens.model, refined.state.k)
-    A = known.matrix(refined.state.entries[0], job.views)
-    _refuse_fold(learnt, A, points)
-    job.progress("refining with the lens", 1.0)
-    return job, Solution(refined, job.tally)
+        state = replace(solution.refined.state, lens=lens.model, k=lens.coefficients)
+        solution = Solution(job.refine(state), job.tally)
+    state = solution.refined.state
+    _refuse_fold(Lens(lens.model, state.k), known.matrix(state.entries[0], job.views), points)
+    return job, solution
 
 
 def _straight_pixels(lens: Lens, A: Array, pixels: Array) -> Array:

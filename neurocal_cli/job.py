@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.lens import pinhole_coefficients
 from neurocal_cli.problems import Known
 from neurocal_cli.refine import CameraState, Refined, refine
 from neurocal_cli.starts import Agreement
@@ -16,6 +17,8 @@ from neurocal_cli.training import Task, Trained, Trainer
 from neurocal_cli.views import Views
 
 __all__ = ["Job", "Solution", "Strategy", "Tally"]
+
+_PINHOLE_STEPS = 4  # enough to make the points agree on a camera; a bent image has no exact one
 
 
 @dataclass(frozen=True)
@@ -133,8 +136,21 @@ class Job:
         return self.known.normalised_entries(self.views)
 
     def refine(self, state: CameraState, max_iterations: int = 200) -> Refined:
-        """The last step (3) from a state, entered in the tally."""
+        """The last stage (3) from a state, entered in the tally.
+
+        A lens that is to be estimated joins after a few steps of the pinhole, with coefficients that
+        leave it one.
+        """
+        known = self.known
+        if known.free_lens and state.lens == "none":
+            state = self._count(self._refined(state, _PINHOLE_STEPS)).state
+            state = replace(state, lens=known.lens.model, k=pinhole_coefficients(known.lens.model))
+        return self._count(self._refined(state, max_iterations))
+
+    def _refined(self, state: CameraState, steps: int) -> Refined:
         free = self.known.free if state.lens == "none" else self.known.free_camera
-        refined = refine(self.views.tiles, state, free, self.known.free_poses, max_iterations)
+        return refine(self.views.tiles, state, free, self.known.free_poses, steps)
+
+    def _count(self, refined: Refined) -> Refined:
         self.tally.refinements += refined.iterations
         return refined

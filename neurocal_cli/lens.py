@@ -24,7 +24,16 @@ import numpy as np
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
-__all__ = ["MODELS", "Lens", "bend", "coefficient_names", "distort", "fold_radius", "undistort"]
+__all__ = [
+    "MODELS",
+    "Lens",
+    "bend",
+    "coefficient_names",
+    "distort",
+    "fold_radius",
+    "pinhole_coefficients",
+    "undistort",
+]
 
 MODELS = {
     "none": (),
@@ -91,6 +100,16 @@ class Lens:
 
 # A number, or an array that broadcasts against the points.
 Coefficients = Sequence[Any] | Array
+
+
+def pinhole_coefficients(model: str) -> Array:
+    """Coefficients with which a lens does not bend.
+
+    For a fisheye to the ninth order, where tan(theta) = theta (1 + theta^2 / 3 + ...).
+    """
+    if model == "fisheye":
+        return np.array([1 / 3, 2 / 15, 17 / 315, 62 / 2835])
+    return np.zeros(len(coefficient_names(model)))
 
 
 def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:

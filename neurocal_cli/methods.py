@@ -13,13 +13,13 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.errors import UsageError
 from neurocal_cli.geometry import Array
+from neurocal_cli.given_lens import check_lens, straighten
 from neurocal_cli.job import Job, Strategy
 from neurocal_cli.lens import MODELS, Lens, coefficient_names
 from neurocal_cli.neuro import solve
 from neurocal_cli.observability import check_points
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, KnownCamera, known_for
-from neurocal_cli.stage_lens import learn_lens, straighten
 from neurocal_cli.starts import Agreement
 from neurocal_cli.training import Task, Trained
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
@@ -110,7 +110,7 @@ def calibrate(
     check_points(views, known)
     report = progress or (lambda stage, share: None)
     job = Job(views, known, _strategy(trainer, starts, backprop, report), np.random.default_rng(seed), report)
-    job, solution = learn_lens(job, solve(job), points)
+    job, solution = check_lens(job, solve(job), points)
     return assemble(job, points, solution, trainer=trainer, method=method, seed=seed, name=camera_name)
 
 

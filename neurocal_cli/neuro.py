@@ -14,6 +14,7 @@ free network cannot tell, begin at random cameras instead (`random_cameras`).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,7 +131,7 @@ def _helped_by_others(job: Job, able: NDArray[np.bool_]) -> Refined:
     job.tally.refinements, job.tally.curve = part.tally.refinements, part.tally.curve
     R, t = np.zeros((views.n_views, 3, 3)), np.zeros((views.n_views, 3))
     R[helpers], t[helpers] = known.R, known.t
-    state = _with_random_poses(job, CameraState(known.entries, R, t), ~able)
+    state = _with_random_poses(job, replace(known, R=R, t=t), ~able)
     return try_mirrored(job, job.refine(state))
 
 
@@ -157,4 +158,4 @@ def _with_random_poses(job: Job, state: CameraState, which: NDArray[np.bool_]) -
     job.tally.note(members, found.agreed, found.starts, found.iterations)
     R, t = state.R.copy(), state.t.copy()
     R[members], t[members] = found.state.R, found.state.t
-    return CameraState(state.entries, R, t)
+    return replace(state, R=R, t=t)
