@@ -11,7 +11,7 @@ import numpy as np
 from neurocal_cli.assembly import assemble
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Intrinsics, Pose
-from neurocal_cli.errors import UsageError
+from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.given_lens import check_lens, straighten
 from neurocal_cli.job import Job, Strategy
@@ -106,12 +106,19 @@ def calibrate(
     known = known_for(points, type, image_center, camera, extrinsics, skew)
     known = _with_lens(known, distortion, lens)
     ideal = straighten(points, known)
-    views = arrange(ideal)
-    check_points(views, known)
     report = progress or (lambda stage, share: None)
-    job = Job(views, known, _strategy(trainer, starts, backprop, report), np.random.default_rng(seed), report)
-    job, solution = check_lens(job, solve(job), points)
-    return assemble(job, points, solution, trainer=trainer, method=method, seed=seed, name=camera_name)
+    try:
+        views = arrange(ideal)
+        check_points(views, known)
+        strategy = _strategy(trainer, starts, backprop, report)
+        job = Job(views, known, strategy, np.random.default_rng(seed), report)
+        job, solution = check_lens(job, solve(job), points)
+        return assemble(job, points, solution, trainer=trainer, method=method, seed=seed, name=camera_name)
+    except DegenerateGeometryError as error:
+        # Views and normal matrices do not know the file that the user should look at.
+        if points.lines is None or str(error).startswith(points.source):
+            raise
+        raise DegenerateGeometryError(f"{points.source}: {error}") from error
 
 
 def _given_camera(given: Intrinsics | KnownCamera | Array | None) -> tuple[Intrinsics | None, Lens]:

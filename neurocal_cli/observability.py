@@ -23,7 +23,7 @@ _NEARLY_PARALLEL = 5.0  # degrees
 
 def parameter_count(known: Known, n_views: int) -> int:
     """Number of unknowns."""
-    return int(known.free.sum()) + (6 * n_views if known.free_poses else 0)
+    return int(known.free_camera.sum()) + (6 * n_views if known.free_poses else 0)
 
 
 def check_points(views: Views, known: Known) -> None:
@@ -52,6 +52,7 @@ def _check_each_view(views: Views) -> None:
     few = views.distinct < 4
     line = views.extent[:, 1] <= _COLLINEAR * views.extent[:, 0]
     for bad, reason in (
+        (views.counts == 1, "there is only one point; give at least 4 (6 for a solid target of type 1)"),
         (views.distinct < 2, "all points are the same world point; check the columns X,Y,Z"),
         (line, "all points lie on one line; give points that spread over a plane or in space"),
         (_on_one_line(views), "all pixels u,v lie on one line; check the columns"),
