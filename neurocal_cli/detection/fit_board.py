@@ -1,0 +1,241 @@
+"""The fits of all edges of a board, stage by stage: from vertices known to half a pixel to the limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fit_edges import (
+    BLUR,
+    CONTRAST,
+    MEAN,
+    OFFSET,
+    EdgeData,
+    EdgeFit,
+    Prior,
+    edge_data,
+    fit_edges,
+    moments,
+    with_weight,
+)
+from neurocal_cli.detection.fit_gate import believable
+from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fit_noise import level_prior, noise_weight, profile_shape
+from neurocal_cli.detection.fit_profile import SHAPE_ORDERS, box_kurtosis
+from neurocal_cli.detection.fit_robust import MapFit, Rows, choose_map, fit_map
+from neurocal_cli.detection.fit_shading import Levels, Shading, fit_shading, square_levels
+from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.geometry import Array
+
+__all__ = ["Board", "Edges", "Fitted", "fit_board"]
+
+Image = NDArray[np.generic]
+
+_START_SIGMA = 0.3  # px, of the found vertices' coordinates
+_ANCHOR = 2.0  # px; later they only hold what the edges leave open
+_MOMENT_SIGMA = 0.05  # px, of offsets from moments
+_REACH = 4.0  # sigma on both sides of an edge
+_SLACK = 0.5  # px, for starts that are off
+_NEAREST = 0.5  # sigma from the crossing lines
+_WIDEST = 12.0  # px, of the strips for moments
+_LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations before anything is known
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """The edges between neighbouring vertices of a grid, those along c first.
+
+    Attributes
+    ----------
+    index : (E, 2) int array
+        First vertex, (c, r).
+    vertical : (E,) bool array
+    centre : (E, 2) array [squares]
+    light : (E,) array
+        +1 where the light side is that of growing r (c for vertical ones), else -1.
+    """
+
+    index: NDArray[np.int64]
+    vertical: NDArray[np.bool_]
+    centre: Array
+    light: Array
+
+    @classmethod
+    def of(cls, grid: Grid) -> Edges:
+        """All whose both vertices are seen."""
+        seen = grid.seen
+        along_c = np.argwhere(seen[:, :-1] & seen[:, 1:])[:, ::-1]
+        along_r = np.argwhere(seen[:-1] & seen[1:])[:, ::-1]
+        index = np.concatenate([along_c, along_r])
+        vertical = np.arange(len(index)) >= len(along_c)
+        centre = index + np.where(vertical[:, None], [0.0, 0.5], [0.5, 0.0])
+        light = np.where((index.sum(axis=1) + grid.dark) % 2 == 1, 1.0, -1.0)
+        return cls(index.astype(np.int64), vertical, centre, light)
+
+
+@dataclass(frozen=True, eq=False)
+class Board:
+    """What is to be fitted.
+
+    Attributes
+    ----------
+    image : (H, W) array [DN]
+    grid : Grid
+    edges : Edges
+    anchors : Rows
+        The found vertices.
+    floor : float [DN^2]
+        Variance of the pixels that is always there, by rounding.
+    """
+
+    image: Image
+    grid: Grid
+    edges: Edges
+    anchors: Rows
+    floor: float
+
+    @classmethod
+    def of(cls, image: Image, grid: Grid, floor: float) -> Board:
+        """From an image and a grid in it."""
+        vertices = np.argwhere(grid.seen)[:, ::-1].astype(float)
+        anchors = Rows.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
+        return cls(image, grid, Edges.of(grid), anchors, floor)
+
+    def lines(self, at: SmoothMap) -> Lines:
+        """The edges as a map sees them."""
+        return grid_lines(at, self.edges.centre, self.edges.vertical, self.edges.light)
+
+    def rows(self, lines: Lines, offset: Array, variance: Array) -> Rows:
+        """Edges as what a map is fitted to; moved by an unknown common shift to the light side."""
+        value = (lines.middle * lines.normal).sum(axis=1) + offset
+        edges = Rows(self.edges.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
+        anchors = replace(self.anchors, variance=np.full_like(self.anchors.variance, _ANCHOR**2))
+        return edges.and_(anchors)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Fitted edges and what they share.
+
+    Attributes
+    ----------
+    lines : Lines
+    fit : EdgeFit
+    data : EdgeData
+    map : MapFit
+    shading : Shading
+    shape : (E, 5) array
+        Of the profiles.
+    noise : float [DN^2]
+    good : (E,) bool array
+        Edges to be believed.
+    """
+
+    lines: Lines
+    fit: EdgeFit
+    data: EdgeData
+    map: MapFit
+    shading: Shading
+    shape: Array
+    noise: float
+    good: NDArray[np.bool_]
+
+
+def fit_board(board: Board) -> Fitted:
+    """All stages: map of the found vertices, moments, a first fit, what edges share, the last fit."""
+    frame = Frame.of(board.anchors.grid, (board.image.shape[1], board.image.shape[0]))
+    n = len(board.anchors.grid) // 2
+    points = board.anchors.value.reshape(2, n).T
+    start = homography_start(frame, board.anchors.grid[:n], points)
+    found = choose_map(start, board.anchors, np.zeros(1))
+    dark, light = square_levels(board.image, board.grid, found.map)
+    shading = fit_shading(frame, dark, light)
+    noise = max(float(np.median(np.concatenate([dark.noise, light.noise]))), board.floor)
+    mapped, sigma = _by_moments(board, found, shading)
+    first = _first_fit(board, mapped, sigma, shading, noise)
+    return _last_fit(board, first)
+
+
+def _by_moments(board: Board, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
+    """Map through the edges' moments, and their blur [px]."""
+    lines = board.lines(found.map)
+    half = np.clip(0.35 * np.minimum(lines.width, lines.length), 2.0, _WIDEST)
+    strips = gather(board.image, lines, half, 0.2 * lines.length, 2)
+    offset, _, blur = moments(strips, half, *shading.at(lines.middle))
+    sigma = float(np.clip(np.median(blur), 0.33, 0.25 * np.median(lines.width)))
+    rows = board.rows(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
+    return fit_map(found.map, rows, found.shift), sigma
+
+
+def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noise: float) -> Fitted:
+    """Edges fitted with free levels and a Gaussian profile, and the map through them."""
+    lines = board.lines(mapped.map)
+    mean, contrast = shading.at(lines.middle)
+    blur = np.full(len(mean), sigma)
+    data = _pixels(board, lines, blur, shading, _REACH * blur + _SLACK, 2)
+    data = with_weight(data, np.full_like(data.weight, 1 / noise))
+    known = np.stack([mean, contrast, blur], axis=-1)
+    spread = known * [0.0, 0.0, _LOOSE_BLUR] + contrast[:, None] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
+    prior = Prior(known, (1 / spread**2)[:, :, None] * np.eye(3))
+    shape = np.zeros((len(mean), len(SHAPE_ORDERS)))
+    shape[:, 1] = box_kurtosis(lines.normal, blur)
+    offset = mapped.residual[: len(mean)] + mapped.shift[0]
+    start = np.concatenate([offset[:, None], np.zeros((len(mean), 1)), known], axis=1)
+    fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, 2)
+    rows = board.rows(lines, fit.values[:, OFFSET], fit.covariance[:, OFFSET, OFFSET])
+    chosen = choose_map(mapped.map, rows, mapped.shift)
+    good = chosen.weight[: len(mean)] > 0
+    return Fitted(lines, fit, data, chosen, shading, shape, noise, good)
+
+
+def _last_fit(board: Board, first: Fitted) -> Fitted:
+    """Edges fitted with what all of them share, and the map through them."""
+    fit, good, n = first.fit, first.good, len(first.good)
+    shading = _shading(first)
+    sigma = np.full(n, float(np.median(fit.values[good, BLUR])))
+    lines = board.lines(first.map.map)
+    reach = _REACH * sigma
+    data = _pixels(board, lines, sigma, shading, reach, 1)
+    data = with_weight(data, np.full_like(data.weight, 1 / first.noise))
+    prior = level_prior(shading, lines.middle, sigma, first.noise)
+    offset = first.map.residual[:n] + first.map.shift[0]
+    start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
+    half_length = 0.5 * lines.length
+    fit = fit_edges(data, start, prior, half_length, first.shape, 1)
+    shape = first.shape + profile_shape(data, fit, good)
+    fit = fit_edges(data, fit.values, prior, half_length, shape, 2)
+    weight = noise_weight(data, fit, board.floor)
+    noise = 1 / float(weight[weight > 0].mean())
+    data = with_weight(data, weight)
+    shape = shape + profile_shape(data, fit, good)
+    fit = fit_edges(data, fit.values, prior, half_length, shape, 2)
+    fit = fit.scaled(float(np.median(fit.chi2[good] / fit.count[good])))
+    variance = fit.covariance[:, OFFSET, OFFSET]
+    mapped = fit_map(first.map.map, board.rows(lines, fit.values[:, OFFSET], variance), first.map.shift)
+    strip = 2 * np.minimum(reach, 0.5 * lines.width) * (lines.length - 2 * _NEAREST * sigma)
+    expected = variance + mapped.map.variance(board.edges.centre, lines.normal)
+    good = believable(fit, mapped.residual[:n], expected * max(mapped.excess, 1.0), strip)
+    return Fitted(lines, fit, data, mapped, shading, shape, noise, good)
+
+
+def _pixels(
+    board: Board, lines: Lines, sigma: Array, shading: Shading, reach: Array, stride: int
+) -> EdgeData:
+    half = np.minimum(reach, 0.5 * lines.width)
+    strips = gather(board.image, lines, half, np.zeros(len(half)), stride)
+    contrast = shading.at(lines.middle)[1]
+    return edge_data(strips, lines, sigma, shading.slopes(lines.middle), contrast, _NEAREST)
+
+
+def _shading(first: Fitted) -> Shading:
+    """Levels of the whole board from those of its edges."""
+    covariance, values, good = first.fit.covariance, first.fit.values, first.good
+    both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]
+    cross = 2 * covariance[:, MEAN, CONTRAST]
+    place = first.lines.middle[good]
+    dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
+    light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
+    return fit_shading(first.shading.frame, dark, light)

@@ -1,0 +1,46 @@
+"""Which fits to believe."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fit_edges import BLUR, CONTRAST, EdgeFit
+from neurocal_cli.geometry import Array
+
+__all__ = ["believable"]
+
+_LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # of what is expected
+_MOST_BLUR = 2.0  # times what is expected, or its inverse
+_LEAST_PIXELS = 0.7  # of the strip
+_LEAST_COUNT = 8
+_LIMIT = 6.0  # standard deviations
+_ROUGH = 0.5  # relative excess of chi2 that is never held against a fit
+_MOST_STEP = 1.0  # standard deviations that the last step may have
+
+
+def believable(fit: EdgeFit, residual: Array, variance: Array, expected: Array) -> NDArray[np.bool_]:
+    """(E,) whether fits agree with their pixels, the rest of the board, and the map.
+
+    Parameters
+    ----------
+    fit : EdgeFit
+    residual : (E,) array [px]
+        Of the offset, from the map and the polarity.
+    variance : (E,) array [px^2]
+        Expected of it.
+    expected : (E,) array
+        Pixels of the whole strip.
+    """
+    contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, 1]
+    blur = fit.values[:, BLUR] / fit.prior.mean[:, 2]
+    good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
+    good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
+    good &= (fit.count >= _LEAST_PIXELS * expected) & (fit.count >= _LEAST_COUNT)
+    good &= fit.step < _MOST_STEP
+    good &= np.abs(residual) < _LIMIT * np.sqrt(variance)
+    rough = fit.chi2 / np.maximum(fit.count, 1)
+    middle = float(np.median(rough[good])) if good.any() else 1.0
+    scatter = 1.4826 * float(np.median(np.abs(rough[good] - middle))) if good.any() else 0.0
+    chance = middle * np.sqrt(2 / np.maximum(fit.count, 1))
+    return good & (rough - middle < _LIMIT * np.maximum(scatter, chance) + _ROUGH * middle)

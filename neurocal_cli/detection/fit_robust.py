@@ -1,0 +1,213 @@
+"""Fitting the smooth map to points known along directions, against outliers, and choosing its form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fit_map import SmoothMap
+from neurocal_cli.geometry import Array
+
+__all__ = ["FORMS", "MapFit", "Rows", "choose_map", "fit_map"]
+
+# Forms of the map from the simplest on: (radial parameters, degree of the polynomial rest).
+FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (2, 3), (2, 4), (2, 5), (2, 6))
+
+_STEPS = 6
+_SHIFT_PRIOR = 1e-2  # 1/px^2
+_SETTLED = 0.02  # standard deviations
+_TUKEY = 6.0  # standard deviations beyond which a row counts as an outlier
+# A richer form must lower the chi2 by so much for each of its parameters; chance alone gives 1.
+_PRICE = 3.0
+_BARREN = 2  # richer forms without gain after which the search ends
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Positions known along one direction each: ``direction . p = value``.
+
+    Attributes
+    ----------
+    grid : (N, 2) array [squares]
+    direction : (N, 2) array
+        Unit vectors.
+    value : (N,) array [px]
+    variance : (N,) array [px^2]
+    shift : (N, K) array
+        What else moves the values, linearly, by unknowns that are found along with the map.
+    """
+
+    grid: Array
+    direction: Array
+    value: Array
+    variance: Array
+    shift: Array
+
+    @classmethod
+    def of_points(cls, grid: Array, pixels: Array, sigma: float, shifts: int = 0) -> Rows:
+        """Both coordinates of points (N, 2)."""
+        n = len(grid)
+        return cls(
+            np.tile(grid, (2, 1)),
+            np.repeat(np.eye(2), n, axis=0),
+            pixels.T.reshape(-1),
+            np.full(2 * n, sigma**2),
+            np.zeros((2 * n, shifts)),
+        )
+
+    def and_(self, other: Rows) -> Rows:
+        """Both together."""
+        names = ("grid", "direction", "value", "variance", "shift")
+        return Rows(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+
+
+@dataclass(frozen=True, eq=False)
+class MapFit:
+    """A map fitted to rows.
+
+    Attributes
+    ----------
+    map : SmoothMap
+    shift : (K,) array [px]
+        Unknowns of `Rows.shift`.
+    shift_variance : (K,) array [px^2]
+    residual : (N,) array [px]
+        Value minus map and shift.
+    weight : (N,) array
+        From 1 down to 0 for outliers.
+    chi2 : float
+        Tukey's loss, about the number of good rows less that of parameters.
+    excess : float
+        Variance of the good rows, as a multiple of what they claim.
+    """
+
+    map: SmoothMap
+    shift: Array
+    shift_variance: Array
+    residual: Array
+    weight: Array
+    chi2: float
+    excess: float
+
+
+def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> MapFit:
+    """Gauss-Newton steps with Tukey's weights from a start that is nearly right.
+
+    Parameters
+    ----------
+    start : SmoothMap
+        Whose form is kept.
+    rows : Rows
+    shift : (K,) array [px]
+        Start of the shifts.
+    steps : int
+        At most.
+    """
+    free = start.free
+    k = rows.shift.shape[1]
+    values, shift = start.parameters.copy(), shift.copy()
+    prior = np.concatenate([start.prior[free], np.full(k, _SHIFT_PRIOR)])
+    for turn in range(steps):
+        now = replace(start, parameters=values)
+        residual, jacobian = _residual(now, rows, shift, free)
+        z = residual / np.sqrt(rows.variance)
+        # Before the first step everything may be off, the shifts above all.
+        weight = _tukey(z / _scale(z)) if turn else np.ones(len(z))
+        weight /= rows.variance
+        normal = (jacobian.T * weight) @ jacobian
+        gradient = jacobian.T @ (weight * residual) - prior * np.concatenate([values[free], shift])
+        normal[np.diag_indices_from(normal)] += prior
+        step = _solved(normal, gradient)
+        values[free] += step[: len(free)]
+        shift += step[len(free) :]
+        if turn and float(step @ gradient) < _SETTLED**2 * len(free):
+            break
+    return _finished(replace(start, parameters=values), rows, shift)
+
+
+def choose_map(start: SmoothMap, rows: Rows, shift: Array) -> MapFit:
+    """The map of the simplest form that the rows do not contradict.
+
+    Parameters
+    ----------
+    start : SmoothMap
+        Of any form.
+    rows : Rows
+    shift : (K,) array [px]
+    """
+    best: MapFit | None = None
+    barren, now, worth = 0, start, np.inf
+    for radial, degree in FORMS:
+        now = now.shaped(radial, degree)
+        if best is not None and len(now.free) + len(shift) > 0.5 * len(rows.value):
+            break
+        fit = fit_map(now, rows, shift)
+        now, shift = fit.map, fit.shift
+        cost = _loss(fit.residual / np.sqrt(rows.variance)) + _PRICE * len(now.free)
+        if cost < worth:
+            best, worth, barren = fit, cost, 0
+        else:
+            barren += 1
+        if barren >= _BARREN:
+            break
+    assert best is not None
+    return best
+
+
+def _loss(z: Array) -> float:
+    """Chi2 that grows no more beyond what no good row reaches."""
+    return float(np.minimum(z * z, 1e4).sum())
+
+
+def _tukey(z: Array) -> Array:
+    return np.asarray(np.clip(1 - (z / _TUKEY) ** 2, 0, None) ** 2)
+
+
+def _scale(z: Array) -> float:
+    """How much larger than claimed the residuals of most rows are; at least 1.
+
+    What the map cannot follow must not count as outliers as long as most rows have their share in it.
+    """
+    return max(1.0, 1.5 * float(np.median(np.abs(z))))
+
+
+def _residual(now: SmoothMap, rows: Rows, shift: Array, free: NDArray[np.intp]) -> tuple[Array, Array]:
+    pixels, derivatives = now.derivatives(rows.grid)
+    residual = rows.value - (rows.direction * pixels).sum(axis=1) - rows.shift @ shift
+    along = np.einsum("ni,nip->np", rows.direction, derivatives)[:, free]
+    return residual, np.concatenate([along, rows.shift], axis=1)
+
+
+def _solved(normal: Array, gradient: Array) -> Array:
+    """Solution of normal equations whose parameters have very different sizes."""
+    size = 1 / np.sqrt(np.diag(normal))
+    return np.asarray(size * np.linalg.solve(normal * size[:, None] * size, gradient * size))
+
+
+def _finished(now: SmoothMap, rows: Rows, shift: Array) -> MapFit:
+    free = now.free
+    residual, jacobian = _residual(now, rows, shift, free)
+    z = residual / np.sqrt(rows.variance)
+    weight = _tukey(z / _scale(z))
+    good = weight > 0
+    normal = (jacobian.T * (good / rows.variance)) @ jacobian
+    normal[np.diag_indices_from(normal)] += np.concatenate(
+        [now.prior[free], np.full(len(shift), _SHIFT_PRIOR)]
+    )
+    size = 1 / np.sqrt(np.diag(normal))
+    inverse = np.linalg.inv(normal * size[:, None] * size) * size[:, None] * size
+    chi2 = float((z[good] ** 2).sum())
+    excess = chi2 / max(int(good.sum()) - len(free) - len(shift), 1)
+    covariance = np.zeros((len(now.parameters),) * 2)
+    covariance[np.ix_(free, free)] = inverse[: len(free), : len(free)]
+    return MapFit(
+        replace(now, covariance=covariance),
+        shift,
+        np.diag(inverse)[len(free) :].copy(),
+        residual,
+        weight,
+        chi2,
+        float(excess),
+    )

@@ -1,0 +1,172 @@
+"""The pixels along lines of a chessboard: where the lines run, and windows of pixels around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fit_map import SmoothMap
+from neurocal_cli.geometry import Array
+
+__all__ = ["Lines", "Strips", "gather", "grid_lines"]
+
+Single = NDArray[np.float32]
+
+_AROUND = np.array([[0, 0], [-0.5, 0], [0.5, 0], [-0.5, -0.2], [-0.5, 0.2], [0.5, -0.2], [0.5, 0.2]])
+_NEIGHBOURS = np.array([[0.0, -0.5], [0.0, 0.5]])
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Pieces of grid lines in the image, one cell long, each with the frame that its pixels are seen in.
+
+    Attributes
+    ----------
+    middle : (E, 2) array [px]
+        Where the map sees the middle of the piece; origin of the frame.
+    tangent, normal : (E, 2) arrays
+        Unit vectors; the normal points to the light side.
+    curvature : (E,) array [1/px]
+        The line is ``d = curvature s^2 / 2`` in the frame.
+    ends : (E, 2) array [px]
+        Tangential coordinates of the two ends.
+    crossing : (E, 2, 2) array
+        Unit normals of the lines that cross at the two ends, pointing into the piece.
+    width : (E,) array [px]
+        Distance to the next parallel lines, the smaller one.
+    """
+
+    middle: Array
+    tangent: Array
+    normal: Array
+    curvature: Array
+    ends: Array
+    crossing: Array
+    width: Array
+
+    @property
+    def length(self) -> Array:
+        """(E,) from end to end [px]."""
+        return self.ends[:, 1] - self.ends[:, 0]
+
+
+def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light: Array) -> Lines:
+    """Lines of a grid as a map sees them.
+
+    Parameters
+    ----------
+    at : SmoothMap
+    centre : (E, 2) array [squares]
+        Grid coordinates of the middles; a piece reaches half a square to both sides.
+    vertical : (E,) bool array
+        Whether the line runs along r.
+    light : (E,) array
+        +1 where the light side is that of growing r (of growing c for vertical ones), else -1.
+    """
+    swap = vertical[:, None, None]
+    offsets = np.concatenate([_AROUND, 2 * _NEIGHBOURS])
+    offsets = np.where(swap, offsets[:, ::-1], offsets)
+    points = at.at(centre[:, None] + offsets)
+    middle, first, last = points[:, 0], points[:, 1], points[:, 2]
+    tangent = last - first
+    tangent /= np.hypot(*tangent.T)[:, None]
+    turned = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
+    normal = turned * (light * np.where(vertical, -1, 1))[:, None]
+    ends = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], tangent)
+    sag = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], normal)
+    # The parabola through both ends, its slope at the origin folded into the frame.
+    curvature = 2 * (sag[:, 1] / ends[:, 1] - sag[:, 0] / ends[:, 0]) / (ends[:, 1] - ends[:, 0])
+    slope = sag[:, 0] / ends[:, 0] - 0.5 * curvature * ends[:, 0]
+    tangent, normal = tangent + slope[:, None] * normal, normal - slope[:, None] * tangent
+    across = points[:, [4, 6]] - points[:, [3, 5]]
+    crossing = np.stack([-across[..., 1], across[..., 0]], axis=-1)
+    crossing /= np.hypot(crossing[..., 0], crossing[..., 1])[..., None]
+    inward = np.einsum("eki,ei->ek", crossing, tangent) * [1.0, -1.0]
+    crossing *= np.sign(inward)[..., None]
+    apart = np.einsum("eki,ei->ek", points[:, 7:9] - middle[:, None], normal)
+    return Lines(middle, tangent, normal, curvature, ends, crossing, np.abs(apart).min(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class Strips:
+    """Pixels around lines, padded to the same number for all; float32.
+
+    Attributes
+    ----------
+    s, d : (E, N) arrays [px]
+        Tangential and normal coordinate, the latter less the line's curve.
+    value : (E, N) array [DN]
+    inside : (E, N) bool array
+        False for the padding and for pixels outside the strip or the image.
+    u, v : (E, N) arrays [px]
+        Relative to the line's middle.
+    """
+
+    s: Single
+    d: Single
+    value: Single
+    inside: NDArray[np.bool_]
+    u: Single
+    v: Single
+
+
+def gather(
+    image: NDArray[np.generic], lines: Lines, half_width: Array, trim: Array, stride: int = 1
+) -> Strips:
+    """Pixels of the strips ``|d| <= half_width`` between the ends of lines.
+
+    Each strip is a parallelogram of whole pixels: columns along the line, where it is more horizontal
+    than vertical (else rows), and in each column the pixels around the line.
+
+    Parameters
+    ----------
+    image : (H, W) array
+    lines : Lines
+    half_width : (E,) array [px]
+    trim : (E,) array [px]
+        What is left out at both ends.
+    stride : int
+        Only every so manieth column.
+    """
+    steep = np.abs(lines.tangent[:, 1]) > np.abs(lines.tangent[:, 0])
+    order = np.where(steep[:, None], [[1, 0]], [[0, 1]])
+    t = np.take_along_axis(lines.tangent, order, axis=1)
+    middle = np.take_along_axis(lines.middle, order, axis=1)
+    low, high = lines.ends[:, 0] + trim, lines.ends[:, 1] - trim
+    reach = 0.5 * (high - low) * np.abs(t[:, 0]) + half_width * np.abs(t[:, 1])
+    centre = middle + (0.5 * (low + high))[:, None] * t
+    count = int(np.ceil((2 * reach.max() + 1) / stride))
+    first = np.ceil(centre[:, 0] - reach)
+    column = first[:, None] + stride * np.arange(count)
+    along = (column - middle[:, :1]) / t[:, :1]
+    # The chord's height over the tangent, to the first order: columns are cut straight.
+    normal_b = np.take_along_axis(lines.normal, order, axis=1)[:, 1:]
+    height = middle[:, 1:] + along * t[:, 1:] + 0.5 * lines.curvature[:, None] * along**2 / normal_b
+    spread = half_width / np.abs(t[:, 0])
+    rows = int(np.ceil(2 * spread.max() + 1))
+    top = np.ceil(height - spread[:, None])
+    row = top[:, :, None] + np.arange(rows)
+    a, b = np.broadcast_arrays(column[:, :, None], row)
+    flat = (len(lines.middle), -1)
+    a, b = a.reshape(flat), b.reshape(flat)
+    u, v = np.where(steep[:, None], b, a), np.where(steep[:, None], a, b)
+    return _seen(image, lines, half_width, low, high, u, v)
+
+
+def _seen(
+    image: NDArray[np.generic], lines: Lines, half_width: Array, low: Array, high: Array, u: Array, v: Array
+) -> Strips:
+    height, width = image.shape
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    place = np.where(inside, v * width + u, 0).astype(np.intp)
+    value = image.reshape(-1)[place].astype(np.float32)
+    du = (u - lines.middle[:, :1]).astype(np.float32)
+    dv = (v - lines.middle[:, 1:]).astype(np.float32)
+    t, n = lines.tangent.astype(np.float32), lines.normal.astype(np.float32)
+    s = du * t[:, :1] + dv * t[:, 1:]
+    d = du * n[:, :1] + dv * n[:, 1:]
+    d -= (0.5 * lines.curvature[:, None]).astype(np.float32) * s * s
+    inside &= (np.abs(d) <= half_width[:, None]) & (s >= low[:, None]) & (s <= high[:, None])
+    return Strips(s, d, value, inside, du, dv)

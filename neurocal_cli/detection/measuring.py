@@ -1,0 +1,99 @@
+"""Mid-points or vertices of a found grid, measured as well as the pixels' noise allows.
+
+Every edge is fitted with all the pixels around it. A smooth map from grid to pixels through all the
+edges tells the mid-points' coordinates along the edges, and how the edges are bent; across, each
+mid-point has only its own edge's word. What moves all edges towards the dark or the light side shows
+as an alternating shift between edges and map, and is taken off.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fit_board import Board, Fitted, fit_board
+from neurocal_cli.detection.fit_edges import OFFSET, TILT
+from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Grid, Measured
+from neurocal_cli.geometry import Array
+
+__all__ = ["measure"]
+
+_ROUNDING = 1 / 12  # DN^2
+
+
+def measure(
+    image: NDArray[np.generic],
+    grid: Grid,
+    points: Literal["midpoints", "vertices"] = "midpoints",
+    gamma: float | None = None,
+) -> Measured:
+    """Measure the mid-points of all edges between seen vertices, or the vertices.
+
+    Parameters
+    ----------
+    image : (H, W) array of uint8, uint16 or float
+        Grey.
+    grid : Grid
+        Vertices known to about half a pixel.
+    points : {"midpoints", "vertices"}
+    gamma : float, optional
+        The image is light^(1 / gamma), which is undone first. Without, whatever the response does to
+        the edges is measured.
+
+    Returns
+    -------
+    measured : Measured
+        With points that failed the quality gate left out.
+    """
+    light = image if gamma is None else _linear(image, gamma)
+    floor = _ROUNDING if np.issubdtype(light.dtype, np.integer) else 0.0
+    board = Board.of(light, grid, floor)
+    fitted = fit_board(board)
+    vertices = np.full(grid.pixels.shape, np.nan)
+    seen = grid.seen
+    vertices[seen] = fitted.map.map.at(np.argwhere(seen)[:, ::-1].astype(float))
+    pixels, covariance = _midpoints(board, fitted)
+    good = fitted.good
+    return Measured(
+        kind=np.where(board.edges.vertical, EDGE_V, EDGE_H)[good].astype(np.int64),
+        index=board.edges.index[good],
+        pixels=pixels[good],
+        covariance=covariance[good],
+        vertices=vertices,
+        rejected=int((~good).sum()),
+        polarity=-float(fitted.map.shift[0]),
+    )
+
+
+def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
+    """Pixels (E, 2) and covariances (E, 3): along the edges from the map, across from the edges."""
+    lines, fit, mapped = fitted.lines, fitted.fit, fitted.map
+    centre = board.edges.centre
+    s = ((mapped.map.at(centre) - lines.middle) * lines.tangent).sum(axis=1)
+    d = fit.values[:, OFFSET] + fit.values[:, TILT] * s / (0.5 * lines.length)
+    d += 0.5 * lines.curvature * s * s - mapped.shift[0]
+    pixels = lines.middle + s[:, None] * lines.tangent + d[:, None] * lines.normal
+    along = mapped.map.variance(centre, lines.tangent) * max(mapped.excess, 1.0)
+    across = fit.covariance[:, OFFSET, OFFSET] + mapped.shift_variance[0]
+    (tu, tv), (nu, nv) = lines.tangent.T, lines.normal.T
+    covariance = np.stack(
+        [
+            along * tu * tu + across * nu * nu,
+            along * tu * tv + across * nu * nv,
+            along * tv * tv + across * nv * nv,
+        ],
+        axis=-1,
+    )
+    return pixels, covariance
+
+
+def _linear(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:
+    """Light that made an image, in units of the image's own full scale."""
+    if np.issubdtype(image.dtype, np.integer):
+        full = float(np.iinfo(image.dtype).max)  # type: ignore[type-var]
+        table = full * (np.arange(full + 1) / full) ** gamma
+        return np.asarray(table.astype(np.float32)[image])
+    full = float(np.max(image))
+    return np.asarray(full * (np.clip(image.astype(np.float32), 0, None) / full) ** gamma, dtype=np.float32)
