@@ -89,10 +89,9 @@ def scene_bound(scene: Scene) -> tuple[Bound, ...]:
         a, b, w = layer.grid(rays)
         with np.errstate(divide="ignore", invalid="ignore"):
             slopes = layer.slopes(rays, a, b, w)
-        plane = target.plane
-        on = np.flatnonzero((w > 0) & (np.abs(a - (plane.cols - 1) / 2) < plane.cols) & (np.abs(b) < 2000))
-        parts = (x[on] for x in (a, b, *slopes, *information))
-        bounds.append(_plane_bound(plane.cols, plane.rows, *parts))
+        cols, rows = target.plane.cols, target.plane.rows
+        on = np.flatnonzero((w > 0) & (a > -1) & (a < cols) & (b > -1) & (b < rows))
+        bounds.append(_plane_bound(cols, rows, *(x[on] for x in (a, b, *slopes, *information))))
     return tuple(bounds)
 
 

@@ -77,10 +77,11 @@ class _Canvas:
     def gradient(self, centre: Array, size: float, angle: float, step: float) -> None:
         """Add a smooth hill that rises along one direction."""
         rows, columns, du, dv = self._window(centre, 3 * size)
-        along = (np.cos(angle) * du + np.sin(angle) * dv) / size
-        hill = step * along * np.exp(-0.5 * (du**2 + dv**2) / size**2)
-        window = self.image[rows, columns]
-        self.image[rows, columns] = np.clip(window + hill, 0.02, 1.0)
+        if not du.size:
+            return
+        x, y = du[:1] / size, dv[:, :1] / size
+        hill = (np.cos(angle) * x + np.sin(angle) * y) * (step * np.exp(-0.5 * x**2)) * np.exp(-0.5 * y**2)
+        self.image[rows, columns] = np.clip(self.image[rows, columns] + hill, 0.02, 1.0)
 
     def _blend(
         self, centre: Array, reach: float, share: Callable[[Array, Array], Array], level: float
@@ -129,10 +130,12 @@ def _decoy(canvas: _Canvas, rng: np.random.Generator, place: Array, scale: float
     for j in range(rows):
         for i in range(columns):
             local = side * np.array([i - 0.5 * (columns - 1), j - 0.5 * (rows - 1)])
-            if kind == 2:  # every square out of place, so that no two edges go on in one another
-                local += rng.uniform(-0.25, 0.25, 2) * side
+            size, turn = np.full(2, side), 0.0
+            if kind == 2:  # every square out of place and shape, so that no edge goes on in another
+                local += rng.uniform(-0.3, 0.3, 2) * side
+                size, turn = side * rng.uniform(0.6, 1.1, 2), rng.uniform(-0.4, 0.4)
             where = place + np.array([c * local[0] - s * local[1], s * local[0] + c * local[1]])
-            canvas.rectangle(where, np.full(2, side), angle, dark if (i + j) % 2 else bright)
+            canvas.rectangle(where, size, angle + turn, dark if (i + j) % 2 else bright)
 
 
 _DRAW: dict[ClutterKind, Callable[[_Canvas, np.random.Generator, Array, float], None]] = {

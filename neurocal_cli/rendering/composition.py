@@ -64,14 +64,11 @@ class Composition:
             return behind.copy(), edges
         for cover in covers:
             edges += cover.edges
-        order: NDArray[np.intp] | None = None
+        alphas, lights = np.stack([c.alpha for c in covers]), np.stack([c.light for c in covers])
         if len(self.boards) > 1:
-            order = np.argsort([cover.depth for cover in covers], axis=0, kind="stable")
-        for place in range(len(covers)):
-            alpha, own = covers[place].alpha, covers[place].light
-            if order is not None:
-                alpha = np.choose(order[place], [cover.alpha for cover in covers])
-                own = np.choose(order[place], [cover.light for cover in covers])
+            order = np.argsort([c.depth for c in covers], axis=0, kind="stable")
+            alphas, lights = (np.take_along_axis(x, order, axis=0) for x in (alphas, lights))
+        for alpha, own in zip(alphas, lights, strict=True):
             # What is nearer covers another part of the cell, not the same share of every part:
             # so two planes that meet at a fold leave no gap between them.
             taken = np.minimum(alpha, open_share)
