@@ -13,7 +13,7 @@ from neurocal_cli.detection.find_refine import settle
 from neurocal_cli.detection.find_verify import look
 from neurocal_cli.geometry import Array
 
-__all__ = ["Lattice", "cleaned", "cropped", "grown", "signs", "smoothing"]
+__all__ = ["Lattice", "cleaned", "cropped", "framed", "frontier", "grown", "signs", "smoothing"]
 
 Index = NDArray[np.intp]
 
@@ -21,7 +21,8 @@ _SEARCHED = 0.24  # squares to either side of where a vertex is expected
 _STEPS = 9
 _MOST_SPREAD = 5.0  # of an expectation that is worth looking at
 _OFF, _OFF_SPREAD, _OFF_PX = 0.06, 0.03, 0.45  # squares, squares per spread, px: see `_tolerance`
-_WEAKEST = 0.5  # least contrast over the neighbours'
+_WEAKEST = 0.55  # least contrast over the neighbours'
+_EVEN_ALONE = 0.85  # of a vertex that closes no square
 _LAYERS = 200
 
 
@@ -65,15 +66,16 @@ def smoothing(width: float) -> float:
     return float(np.clip(np.round(0.15 * width / 0.25) * 0.25, 0.75, 2.0))
 
 
-def grown(level: Level, lattice: Lattice) -> Lattice:
-    """Add vertices around and between the known ones until none fits any more."""
+def grown(level: Level, lattice: Lattice, outwards: bool = True) -> Lattice:
+    """Add vertices between and, unless told otherwise, around the known ones until none fits any more."""
     sigma = smoothing(lattice.width)
     tried: set[tuple[int, int, int]] = set()
     origin = np.zeros(2, dtype=np.intp)
     for _ in range(_LAYERS):
-        lattice, shift = _framed(lattice)
-        origin = origin + shift
-        row, col = _frontier(lattice)
+        if outwards:
+            lattice, shift = framed(lattice)
+            origin = origin + shift
+        row, col = frontier(lattice)
         # A place is looked at again only when it has more neighbours than before.
         support = _support(lattice.seen, row, col)
         keys = list(
@@ -90,7 +92,7 @@ def grown(level: Level, lattice: Lattice) -> Lattice:
     return cropped(lattice)
 
 
-def _framed(lattice: Lattice) -> tuple[Lattice, Index]:
+def framed(lattice: Lattice) -> tuple[Lattice, Index]:
     """Give a lattice room of one place on every side; how far its vertices moved."""
     rows, cols = lattice.contrast.shape
     seen = lattice.seen
@@ -124,7 +126,7 @@ def _around(values: NDArray[np.generic]) -> Array:
     return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])
 
 
-def _frontier(lattice: Lattice) -> tuple[Index, Index]:
+def frontier(lattice: Lattice) -> tuple[Index, Index]:
     """Unknown places with a known neighbour along an edge and another one near."""
     seen = lattice.seen
     beside = np.zeros_like(seen)
@@ -189,25 +191,31 @@ def _searched(level: Level, at: Expected, dark: Array) -> Array:
     return np.asarray(places[np.arange(len(places)), steepness.argmax(axis=1)])
 
 
-def cleaned(lattice: Lattice) -> Lattice:
-    """Take out vertices that are not where their neighbours put them, and such as close no square."""
+def cleaned(level: Level, lattice: Lattice) -> Lattice:
+    """Take out vertices that look wrong or are not where their neighbours put them."""
     pixels = lattice.pixels.copy()
+    contrast = lattice.contrast.copy()
     for _ in range(12):
-        row, col = np.nonzero(_squared(np.isfinite(pixels[..., 0])))
-        pixels, before = np.full_like(pixels, np.nan), pixels
-        pixels[row, col] = before[row, col]
+        row, col = np.nonzero(np.isfinite(pixels[..., 0]))
         if not len(row):
             break
+        points = pixels[row, col]
         at = expected(pixels, row, col)
-        off = np.abs(at.in_squares(pixels[row, col] - at.points)).max(axis=1) / _tolerance(at)
+        off = np.abs(at.in_squares(points - at.points)).max(axis=1) / _tolerance(at)
         off = np.where((at.area > 0) & (at.spread < 2 * _MOST_SPREAD), off, np.inf)
+        sight = look(level, points, at, signs(row, col, lattice.dark))
+        # One that closes no square has little that speaks for it.
+        closes = _squared(np.isfinite(pixels[..., 0]))[row, col]
+        plain = sight.like & (closes | ((sight.even > _EVEN_ALONE) & (off < 0.5)))
+        off = np.where(plain, off, np.inf)
+        contrast[row, col] = sight.contrast
         if not (off > 1).any():
             break
         # Next to a bad vertex good ones look bad too: only the worst of each place goes.
         worst = np.zeros(pixels.shape[:2])
         worst[row, col] = off
         pixels[(worst > 1) & (worst >= _largest_around(worst))] = np.nan
-    contrast = np.where(np.isfinite(pixels[..., 0]), lattice.contrast, np.nan)
+    contrast[np.isnan(pixels[..., 0])] = np.nan
     return cropped(replace(lattice, pixels=pixels, contrast=contrast))
 
 

@@ -15,8 +15,8 @@ __all__ = ["Look", "look"]
 
 _INTO = 0.3  # squares; from the vertex into the four squares around it
 _ALONG, _ASIDE = 0.36, 0.16  # squares; along its edges, and to either side of them
-_FLATTEST = 0.5  # least contrast of the worst pair of squares over the mean contrast
-_FAINTEST = 0.3  # the same for an edge
+_LEAST_EVEN = 0.6  # a board in plain sight has 0.9 and more, blurred or noisy or not
+_LEAST_EDGE = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,11 +27,14 @@ class Look:
     ----------
     contrast : (N,) array [DN]
         Bright minus dark squares around the vertex; negative when their colours are the other way.
+    even : (N,) array
+        Darkest bright minus brightest dark square, over the contrast: 1 for an ideal vertex.
     like : (N,) bool array
         Two bright and two dark squares, and an edge between every two.
     """
 
     contrast: Array
+    even: Array
     like: NDArray[np.bool_]
 
 
@@ -63,10 +66,11 @@ def look(level: Level, points: Array, at: Expected, dark: Array) -> Look:
     value = sampled(level.smooth, places) * -dark[:, None]
     even, odd = value[:, 0:4:2], value[:, 1:4:2]
     contrast = even.mean(axis=1) - odd.mean(axis=1)
-    worst = even.min(axis=1) - odd.max(axis=1)
+    scale = np.maximum(np.abs(contrast), 1e-9)
+    flat = (even.min(axis=1) - odd.max(axis=1)) / scale
     edges = (value[:, 4:8] - value[:, 8:12]) * np.array([1.0, -1.0, 1.0, -1.0])
-    like = (contrast > 0) & (worst > _FLATTEST * contrast) & (edges.min(axis=1) > _FAINTEST * contrast)
+    like = (contrast > 0) & (flat > _LEAST_EVEN) & (edges.min(axis=1) > _LEAST_EDGE * contrast)
     height, width = level.image.shape
     # The places beyond the border repeat it and tell nothing.
     inside = ((places > -1) & (places < np.array([width, height]))).all(axis=(1, 2))
-    return Look(contrast, like & inside)
+    return Look(contrast, flat, like & inside)

@@ -12,12 +12,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.find_claims import disputed, distinct
+from neurocal_cli.detection.find_fold import joined, unfolded
 from neurocal_cli.detection.find_grow import Lattice, cleaned, grown, smoothing
 from neurocal_cli.detection.find_levels import Level, levels_of
 from neurocal_cli.detection.find_refine import settle
 from neurocal_cli.detection.find_saddles import Saddles, find_saddles
 from neurocal_cli.detection.find_seeds import find_links, find_seeds
 from neurocal_cli.detection.grid import Grid
+from neurocal_cli.geometry import Array
 
 __all__ = ["find_grids"]
 
@@ -37,18 +40,36 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
     Returns
     -------
     grids : list of Grid
-        The one with the most vertices first. Vertices are good to a few tenths of a pixel. Planes
+        The one that fills most of the picture first. Vertices are good to a few tenths of a pixel. Planes
         that meet at a fold are grids of their own. A grid has at least 3 x 3 vertices: anything
         smaller can be seen in clutter too, and its lines are not tested by a vertex between others.
     """
     lattices: list[Lattice] = []
     levels = levels_of(image)
+    growing = [level for level in levels if level.image.size <= _REFINED]
     for level in reversed(levels):
-        lattices = [x for x in (_finer(level, x) for x in lattices) if _is_board(x)]
+        lattices = [_finer(level, x) for x in lattices]
+        if level in growing:
+            lattices = [grown(level, x) for x in lattices]
+        lattices = [y for x in lattices for y in _boards(cleaned(level, x))]
         if level.image.size <= _SEARCHED or not lattices:
             lattices += _new(level, lattices)
-    found = [Grid(x.pixels, x.dark) for x in lattices]
-    return sorted(found, key=lambda grid: -int(grid.seen.sum()))
+        if level is levels[0] or level is growing[0]:
+            lattices = _separated(level, lattices)
+    return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
+
+
+def _separated(level: Level, lattices: list[Lattice]) -> list[Lattice]:
+    """Grids of one plane each, every vertex in one of them."""
+    flat = [part for x in lattices for part in unfolded(x) if _is_board(part)]
+    whole = [cleaned(level, grown(level, x, outwards=False)) for x in disputed(distinct(flat))]
+    return [x for x in whole if _is_board(x)]
+
+
+def _area(pixels: Array) -> float:
+    """Of all whole squares [px^2]."""
+    p, q = pixels[1:, 1:] - pixels[:-1, :-1], pixels[1:, :-1] - pixels[:-1, 1:]
+    return float(np.nansum(np.abs(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])) / 2)
 
 
 def _new(level: Level, known: list[Lattice]) -> list[Lattice]:
@@ -66,31 +87,28 @@ def _new(level: Level, known: list[Lattice]) -> list[Lattice]:
         if not free[seed].all():
             continue
         free[seed] = False
-        lattice = cleaned(grown(level, _planted(level, saddles, seed)))
-        if _is_board(lattice):
-            found.append(lattice)
-            free &= _covered(level, [lattice])[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
+        boards = _boards(cleaned(level, grown(level, _planted(saddles, seed))))
+        if boards:
+            found += boards
+            free &= _covered(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
         else:
             tries += 1
     return found
 
 
-def _planted(level: Level, saddles: Saddles, seed: NDArray[np.intp]) -> Lattice:
+def _planted(saddles: Saddles, seed: NDArray[np.intp]) -> Lattice:
     return Lattice(saddles.points[seed], saddles.contrast[seed], 0)
 
 
 def _finer(level: Level, lattice: Lattice) -> Lattice:
-    """The same grid on the next level, completed there."""
+    """The same grid on the next level."""
     lattice = replace(lattice, pixels=2 * lattice.pixels)
     row, col = np.nonzero(lattice.seen)
     pixels = lattice.pixels.copy()
     settled = settle(level.image, pixels[row, col], smoothing(lattice.width))
     close = np.hypot(*(settled - pixels[row, col]).T) < 2
     pixels[row, col] = np.where(close[:, None], settled, pixels[row, col])
-    lattice = replace(lattice, pixels=pixels)
-    if level.image.size <= _REFINED:
-        lattice = grown(level, lattice)
-    return cleaned(lattice)
+    return replace(lattice, pixels=pixels)
 
 
 def _covered(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
@@ -105,6 +123,11 @@ def _covered(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
         cv2.fillPoly(mask, list(whole), 255)
         cv2.polylines(mask, list(whole), True, 255, thickness)
     return mask
+
+
+def _boards(lattice: Lattice) -> list[Lattice]:
+    """Parts of a lattice that are boards."""
+    return [part for part in joined(lattice) if _is_board(part)]
 
 
 def _is_board(lattice: Lattice) -> bool:

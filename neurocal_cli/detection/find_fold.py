@@ -1,0 +1,107 @@
+"""Lattices that run over a fold from one plane to another are cut there.
+
+Along a line of vertices in one plane second differences change slowly, however tilted the plane and
+bent the lens. At a fold they jump: at one vertex if the fold goes through it, else at the two
+beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.find_grow import Lattice, cropped
+from neurocal_cli.detection.find_predict import expected
+from neurocal_cli.geometry import Array
+
+__all__ = ["joined", "unfolded"]
+
+_BENT, _BENT_PX = 0.09, 0.25  # squares, and px: the least bend that is a fold ...
+_OUTSTANDING = 4.0  # ... and its ratio to the bends of the rows far from it ...
+_UNKNOWN = 0.04  # ... or to this where none is far
+_LEAST_ROWS = 4
+_BETWEEN = 1.4  # what a bend shared by two rows counts more, to be as large as that of one row
+
+
+def unfolded(lattice: Lattice) -> list[Lattice]:
+    """Cut a lattice into the parts that are joined and have no fold.
+
+    Vertices on a fold go to neither side: they belong to both planes, and their edges bend there.
+    """
+    whole = joined(lattice)
+    if len(whole) != 1:
+        return [part for piece in whole for part in unfolded(piece)]
+    lattice = whole[0]
+    row, col = _fold(lattice.pixels), _fold(lattice.pixels.transpose(1, 0, 2))
+    if row[1] == 0 and col[1] == 0:
+        return [lattice]
+    pixels = lattice.pixels if row[1] >= col[1] else lattice.pixels.transpose(1, 0, 2)
+    position = max(row, col, key=lambda fold: fold[1])[0]
+    index = np.arange(len(pixels))
+    parts = []
+    for side in (index < position - 0.25, index > position + 0.25):
+        kept = np.where(side[:, None, None], pixels, np.nan)
+        if pixels is not lattice.pixels:
+            kept = kept.transpose(1, 0, 2)
+        part = _restricted(lattice, np.isfinite(kept[..., 0]))
+        parts += unfolded(part) if part.seen.any() else []
+    return parts
+
+
+def _restricted(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:
+    pixels = np.where(kept[..., None], lattice.pixels, np.nan)
+    return cropped(replace(lattice, pixels=pixels, contrast=np.where(kept, lattice.contrast, np.nan)))
+
+
+def joined(lattice: Lattice) -> list[Lattice]:
+    """Parts whose vertices are neighbours of each other along rows and columns."""
+    count, label = cv2.connectedComponents(lattice.seen.astype(np.uint8), connectivity=4)
+    return [_restricted(lattice, label == k) for k in range(1, count)]
+
+
+def _fold(pixels: Array) -> tuple[float, float]:
+    """Position among the rows of the sharpest bend that is a fold, and its size; (0, 0) without."""
+    rows = len(pixels)
+    if rows < _LEAST_ROWS:
+        return 0.0, 0.0
+    second, width = _second_differences(pixels)
+    before, after = np.full_like(second, np.nan), np.full_like(second, np.nan)
+    before[1:], after[:-1] = second[:-1], second[1:]
+    at = _size(second - _either(before, after))
+    # Between row i and i + 1.
+    far = np.full_like(second, np.nan)
+    far[:-2] = second[2:]
+    between = _BETWEEN * _size(0.5 * (second + after) - _either(before, far))
+    size = np.stack([at, between], axis=-1).ravel()
+    best = int(size.argmax())
+    others = np.abs(np.arange(2 * rows) - best) > 3
+    far_off = size[others & (size > 0)]
+    usual = float(np.median(far_off)) if len(far_off) else _UNKNOWN
+    if size[best] < _BENT + _BENT_PX / width or size[best] < _OUTSTANDING * usual:
+        return 0.0, 0.0
+    return 0.5 * best, float(size[best])
+
+
+def _second_differences(pixels: Array) -> tuple[Array, float]:
+    """(rows, cols, 2) along the columns [squares], nan at the ends; and the squares' width [px]."""
+    second = np.full(pixels.shape, np.nan)
+    second[1:-1] = pixels[2:] - 2 * pixels[1:-1] + pixels[:-2]
+    row, col = np.nonzero(np.isfinite(pixels[..., 0]))
+    at = expected(pixels, row, col)
+    second[row, col] = at.in_squares(second[row, col])
+    return second, max(float(np.median(at.width)), 1.0)
+
+
+def _either(first: Array, second: Array) -> Array:
+    """Mean of two arrays, or the one that is known."""
+    return np.where(np.isnan(first), second, np.where(np.isnan(second), first, 0.5 * (first + second)))
+
+
+def _size(values: Array) -> Array:
+    """Root mean square of each row's vectors; 0 where fewer than two are known."""
+    square = (values**2).sum(axis=-1)
+    count = np.isfinite(square).sum(axis=1)
+    return np.where(count >= 2, np.sqrt(np.nansum(square, axis=1) / np.maximum(count, 1)), 0.0)
