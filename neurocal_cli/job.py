@@ -18,7 +18,7 @@ from neurocal_cli.views import Views
 
 __all__ = ["Job", "Solution", "Strategy", "Tally"]
 
-_PINHOLE_STEPS = 4  # enough to make the points agree on a camera; a bent image has no exact one
+_PINHOLE_STEPS = 2  # enough to make the points agree on a camera; a bent image has no exact one
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ def coefficient_names(model: str) -> tuple[str, ...]:
         There is no such model.
     """
     if model not in MODELS:
-        raise InputError(f"distortion must be one of {', '.join(MODELS)}, not {model!r}")
+        raise InputError(f"distortion model {model[:40]!r} is unknown; use one of {', '.join(MODELS)}")
     return MODELS[model]
 
 

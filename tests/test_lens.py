@@ -96,5 +96,5 @@ def test_the_fold_of_a_barrel_lens_is_found() -> None:
 
 
 def test_an_unknown_model_is_refused() -> None:
-    with pytest.raises(InputError, match="must be one of"):
+    with pytest.raises(InputError, match="unknown; use one of"):
         coefficient_names("brown")

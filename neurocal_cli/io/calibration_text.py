@@ -14,8 +14,9 @@ from neurocal_cli import __version__
 from neurocal_cli.calibration import Calibration, NetworkRecord
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
-from neurocal_cli.io.distortion_names import coefficient_names, to_ros
+from neurocal_cli.io.distortion_names import to_ros
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
+from neurocal_cli.lens import coefficient_names
 from neurocal_cli.points import Correspondences
 
 __all__ = ["FORMAT", "calibration_lines"]

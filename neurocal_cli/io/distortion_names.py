@@ -6,25 +6,13 @@ import numpy as np
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.lens import coefficient_names
 
-__all__ = ["coefficient_names", "from_ros", "own_length", "to_ros"]
+__all__ = ["from_ros", "own_length", "to_ros"]
 
-# Our name: ROS's name, coefficients in a ROS file, coefficients of ours.
-_MODELS = {
-    "none": ("plumb_bob", 5, 0),
-    "k1": ("plumb_bob", 5, 1),
-    "k1k2": ("plumb_bob", 5, 2),
-    "plumb_bob": ("plumb_bob", 5, 5),
-    "rational": ("rational_polynomial", 8, 8),
-    "fisheye": ("equidistant", 4, 4),
-}
-_OPENCV_ORDER = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-
-
-def coefficient_names(model: str) -> tuple[str, ...]:
-    """Name a model's coefficients, in order: ``k1, k2, p1, p2, k3, ...``; fisheye ``k1 ... k4``."""
-    names = ("k1", "k2", "k3", "k4") if model == "fisheye" else _OPENCV_ORDER
-    return names[: _entry(model)[2]]
+# ROS's names of our models: a plumb_bob has 5 coefficients, of which the simpler models use the first.
+_ROS = {"rational": "rational_polynomial", "fisheye": "equidistant"}
+_LENGTHS = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 
 
 def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
@@ -35,7 +23,9 @@ def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
     InputError
         An unknown model, or coefficients that it doesn't have.
     """
-    name, length, own = _entry(model)
+    own = own_length(model)
+    name = _ROS.get(model, "plumb_bob")
+    length = _LENGTHS[name]
     values = np.asarray(coefficients, dtype=float).ravel()
     if np.any(values[own:] != 0) or not np.isfinite(values).all():
         raise InputError(
@@ -74,10 +64,4 @@ def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
 
 def own_length(model: str) -> int:
     """Tell how many coefficients one of our models has."""
-    return _entry(model)[2]
-
-
-def _entry(model: str) -> tuple[str, int, int]:
-    if model not in _MODELS:
-        raise InputError(f"distortion model {model[:40]!r} is unknown; use one of {', '.join(_MODELS)}")
-    return _MODELS[model]
+    return len(coefficient_names(model))

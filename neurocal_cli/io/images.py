@@ -98,8 +98,8 @@ def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXE
     notes = []
     if header.orientation != 1:
         notes.append(
-            f"{source}: {_TURNS[header.orientation]} as its EXIF orientation says; pixel coordinates are "
-            "those of the turned image"
+            f"{_TURNS[header.orientation]}, as its EXIF orientation says and OpenCV does; pixel coordinates "
+            "are those of the turned image"
         )
     return Image(grey, source, tuple(notes))
 
