@@ -14,7 +14,7 @@ from neurocal_cli.geometry import Array
 __all__ = ["disputed", "distinct"]
 
 _SAME = 0.25  # of a square's width; between vertices that are the same
-_MEETS = 0.2  # of a square's width; between a vertex and where another lattice goes on
+_MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on
 _COPY = 0.5  # share of vertices in another lattice
 
 

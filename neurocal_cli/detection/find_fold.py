@@ -19,11 +19,14 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["joined", "unfolded"]
 
-_BENT, _BENT_PX = 0.09, 0.25  # squares, and px: the least bend that is a fold ...
-_OUTSTANDING = 4.0  # ... and its ratio to the bends of the rows far from it ...
-_UNKNOWN = 0.04  # ... or to this where none is far
+# The least bend that is a fold [squares] and its ratio to the bends of the rows far from it: paper
+# is bent too, and the less the better the board is otherwise.
+_FOLDS = ((0.13, 4.0), (0.06, 12.0))
+_BENT_PX = 0.2  # px; what imprecise vertices add to it
+_UNKNOWN = 0.03  # squares; the bend of the rows far from it where there is none
 _LEAST_ROWS = 4
 _BETWEEN = 1.4  # what a bend shared by two rows counts more, to be as large as that of one row
+_ONE_SIDED = 0.7  # what a bend counts that is compared with one side only
 
 
 def unfolded(lattice: Lattice) -> list[Lattice]:
@@ -41,6 +44,9 @@ def unfolded(lattice: Lattice) -> list[Lattice]:
     pixels = lattice.pixels if row[1] >= col[1] else lattice.pixels.transpose(1, 0, 2)
     position = max(row, col, key=lambda fold: fold[1])[0]
     index = np.arange(len(pixels))
+    if position in (1, len(pixels) - 2):
+        # A fold, or an outermost row that is wrong: only the latter is certain not to belong here.
+        position = 0.0 if position == 1 else len(pixels) - 1
     parts = []
     for side in (index < position - 0.25, index > position + 0.25):
         kept = np.where(side[:, None, None], pixels, np.nan)
@@ -70,17 +76,18 @@ def _fold(pixels: Array) -> tuple[float, float]:
     second, width = _second_differences(pixels)
     before, after = np.full_like(second, np.nan), np.full_like(second, np.nan)
     before[1:], after[:-1] = second[:-1], second[1:]
-    at = _size(second - _either(before, after))
+    at = _size(_against(second, before, after))
     # Between row i and i + 1.
     far = np.full_like(second, np.nan)
     far[:-2] = second[2:]
-    between = _BETWEEN * _size(0.5 * (second + after) - _either(before, far))
+    between = _BETWEEN * _size(_against(0.5 * (second + after), before, far))
     size = np.stack([at, between], axis=-1).ravel()
     best = int(size.argmax())
     others = np.abs(np.arange(2 * rows) - best) > 3
     far_off = size[others & (size > 0)]
-    usual = float(np.median(far_off)) if len(far_off) else _UNKNOWN
-    if size[best] < _BENT + _BENT_PX / width or size[best] < _OUTSTANDING * usual:
+    usual = float(np.percentile(far_off, 25)) if len(far_off) else _UNKNOWN
+    least = (max(bend + _BENT_PX / width, ratio * usual) for bend, ratio in _FOLDS)
+    if size[best] < min(least):
         return 0.0, 0.0
     return 0.5 * best, float(size[best])
 
@@ -95,9 +102,11 @@ def _second_differences(pixels: Array) -> tuple[Array, float]:
     return second, max(float(np.median(at.width)), 1.0)
 
 
-def _either(first: Array, second: Array) -> Array:
-    """Mean of two arrays, or the one that is known."""
-    return np.where(np.isnan(first), second, np.where(np.isnan(second), first, 0.5 * (first + second)))
+def _against(values: Array, first: Array, second: Array) -> Array:
+    """Differences from the mean of two arrays, reduced where one of them is unknown."""
+    both = values - 0.5 * (first + second)
+    one = _ONE_SIDED * (values - np.where(np.isnan(first), second, first))
+    return np.where(np.isnan(both), one, both)
 
 
 def _size(values: Array) -> Array:

@@ -60,9 +60,10 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
 
 
 def _separated(level: Level, lattices: list[Lattice]) -> list[Lattice]:
-    """Grids of one plane each, every vertex in one of them."""
+    """Grids of one plane each."""
+    lattices = disputed(distinct(lattices))
     flat = [part for x in lattices for part in unfolded(x) if _is_board(part)]
-    whole = [cleaned(level, grown(level, x, outwards=False)) for x in disputed(distinct(flat))]
+    whole = [cleaned(level, grown(level, x, outwards=False)) for x in distinct(flat)]
     return [x for x in whole if _is_board(x)]
 
 
