@@ -101,7 +101,7 @@ def calibrate(
     InputError, DegenerateGeometryError
         Points that cannot give an answer, with the reason.
     """
-    _check_options(method, trainer, distortion, outliers, starts)
+    _check_options(method, trainer, distortion, outliers, starts, seed)
     camera, lens = _given_camera(intrinsics)
     known = known_for(points, type, image_center, camera, extrinsics, skew)
     known = _with_lens(known, distortion, lens)
@@ -126,6 +126,8 @@ def _given_camera(given: Intrinsics | KnownCamera | Array | None) -> tuple[Intri
         return given, Lens()
     if isinstance(given, (np.ndarray, list, tuple)):
         return Intrinsics.from_matrix(np.asarray(given)), Lens()
+    if not isinstance(getattr(given, "intrinsics", None), Intrinsics):
+        raise UsageError("intrinsics must be an Intrinsics, a 3 x 3 matrix, a Calibration or a camera file")
     return given.intrinsics, Lens(given.distortion_model, given.distortion)
 
 
@@ -139,7 +141,7 @@ def _with_lens(known: Known, distortion: str, given: Lens) -> Known:
     return replace(known, lens=given, fixed=known.fixed | set(coefficient_names(given.model)))
 
 
-def _check_options(method: str, trainer: str, distortion: str, outliers: str, starts: int) -> None:
+def _check_options(method: str, trainer: str, distortion: str, outliers: str, starts: int, seed: int) -> None:
     for name, value, choices in (
         ("method", method, METHODS),
         ("trainer", trainer, TRAINERS),
@@ -148,8 +150,10 @@ def _check_options(method: str, trainer: str, distortion: str, outliers: str, st
     ):
         if value not in choices:
             raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
-    if starts < 2:
-        raise UsageError("starts must be at least 2: one start has nothing to agree with")
+    if not isinstance(starts, (int, np.integer)) or starts < 2:
+        raise UsageError("starts must be at least 2, a whole number: one start has nothing to agree with")
+    if not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise UsageError("seed must be a whole number from 0 on")
 
 
 def _strategy(trainer: str, starts: int, backprop: BackpropOptions | None, report: Progress) -> Strategy:

@@ -35,7 +35,7 @@ from neurocal_cli.rivals import (
 )
 from neurocal_cli.stage_cameras import cameras_from_products, candidate_intrinsics
 from neurocal_cli.stage_constraints import train_constrained
-from neurocal_cli.stage_networks import Group, begin_flat, train_networks
+from neurocal_cli.stage_networks import Group, begin_flat, refuse_few_conditions, train_networks
 
 __all__ = ["solve"]
 
@@ -78,6 +78,7 @@ def _begin(job: Job, state: CameraState) -> Refined:
 def _camera_and_poses(job: Job) -> Refined:
     """Types 1 and 2."""
     groups = train_networks(job, np.ones(job.views.n_views, dtype=bool))
+    refuse_few_conditions(job, groups)
     first, *others = candidate_intrinsics(job, groups)
     best = _begin(job, train_constrained(job, cameras_from_products(job, groups, first)))
     for entries in others:

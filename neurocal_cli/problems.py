@@ -24,6 +24,9 @@ from neurocal_cli.views import Views
 __all__ = ["Known", "KnownCamera", "intrinsic_matrix", "known_for"]
 
 
+_LARGEST = 1e9  # px; no image is larger
+
+
 class KnownCamera(Protocol):
     """A camera with a lens: a `Calibration`, or what `read_intrinsics` returns."""
 
@@ -121,7 +124,7 @@ def known_for(
     InputError
         Values that are not finite, extrinsics without one of the views.
     """
-    if type not in (1, 2, 3, 4):
+    if not isinstance(type, (int, np.integer)) or type not in (1, 2, 3, 4):
         raise UsageError(f"type must be 1, 2, 3 or 4, not {type!r}")
     for name, value, wanted in (
         ("image_center", image_center, 2),
@@ -144,6 +147,10 @@ def known_for(
         if intrinsics is None:
             raise UsageError("type 3 needs the intrinsics of the camera")
         entries = intrinsics.A[ENTRIES]
+        if not np.abs(entries[[0, 2]]).min() > 1 / _LARGEST or np.abs(entries).max() > _LARGEST:
+            raise InputError(
+                "the given intrinsics are no camera's: alpha and the centre must be of an image's size"
+            )
         free[:] = False
         fixed = set(INTRINSIC_NAMES)
     elif type == 4:
@@ -162,8 +169,8 @@ def _centre(points: Correspondences, image_center: tuple[float, float] | None) -
         values = np.array(centre, dtype=float)
     except (TypeError, ValueError):
         values = np.zeros(0)
-    if values.shape != (2,) or not np.isfinite(values).all():
-        raise InputError("the image centre must be two finite numbers")
+    if values.shape != (2,) or not (np.abs(values) < _LARGEST).all():  # False for nan as well
+        raise InputError("the image centre must be two finite numbers of an image's size")
     return values
 
 

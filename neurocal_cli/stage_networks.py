@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job
-from neurocal_cli.network import Patterns
+from neurocal_cli.network import Patterns, residual_jacobian
 from neurocal_cli.problems import intrinsic_matrix
 from neurocal_cli.starts import FixedWeights, learn
 from neurocal_cli.training import Task
 
-__all__ = ["Group", "begin_flat", "train_networks"]
+__all__ = ["Group", "begin_flat", "refuse_few_conditions", "train_networks"]
 
+# Eigenvalue of the product's normal matrix, as a share of the largest, that rounding leaves of 0.
+_NO_CONDITION = 1e-13
 _SMALL = 1500  # patterns in all up to which the starts may as well see every one
 
 
@@ -78,6 +82,33 @@ def _train_group(job: Job, members: NDArray[np.intp], flat: bool) -> Group:
     if members[0] == 0:
         tally.curve = learnt.curve
     return Group(members, flat, learnt.product, _pixel_error(job, members, flat, learnt.product, every))
+
+
+def refuse_few_conditions(job: Job, groups: Sequence[Group]) -> None:
+    """Refuse a single view whose points all but determine a plane.
+
+    However many they are, points of a plane put 8 conditions on the product W V, and each point off
+    it 2 more, up to 11. With no more conditions than unknowns another camera fits as well.
+
+    Raises
+    ------
+    DegenerateGeometryError
+    """
+    if job.views.n_views > 1 or groups[0].flat:
+        return
+    patterns = job.views.patterns(np.array([0]), False, job.strategy.finish_points)
+    product = groups[0].product
+    _, J = residual_jacobian(np.eye(3)[None], product / np.linalg.norm(product), patterns)
+    J = J.reshape(-1, 12)
+    values = np.linalg.eigvalsh(J.T @ J)
+    conditions = int((values > _NO_CONDITION * values[-1]).sum())
+    unknowns = int(job.known.free.sum()) + 6
+    if conditions < 11 and conditions <= unknowns:
+        raise DegenerateGeometryError(
+            f"view {job.views.names[0]!r}: nearly all points lie in one plane, which gives {conditions} "
+            f"conditions for {unknowns} unknowns; give more points off the plane, or more of the camera "
+            "(--type 2, --no-skew)"
+        )
 
 
 def _given_weights(job: Job) -> FixedWeights:

@@ -419,3 +419,33 @@ def test_any_numbers_are_answered_or_refused(seed: int) -> None:
 def test_very_many_numbers_are_answered_or_refused() -> None:
     for seed in range(1500):
         anything_is_answered_or_refused(seed)
+
+
+@pytest.mark.parametrize("skew", [True, False])
+def test_all_but_one_point_in_a_plane_do_not_determine_a_camera(skew: bool) -> None:
+    # Noise-free another camera fits as well: f = 1065 where the truth is 800.
+    world = np.vstack([BOARD, [[100.0, 100.0, 200.0]]])
+    pose = Pose.from_euler(0.4, 0.3, 0.1, np.array([-50.0, -40.0, 900.0]))
+    pixels, _ = project(Intrinsics(800, 820, 320, 240).A, pose, world)
+    with pytest.raises(DegenerateGeometryError, match="nearly all points lie in one plane"):
+        calibrate(Correspondences(world, pixels), skew=skew)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"seed": -1},
+        {"seed": 0.5},
+        {"starts": "a"},
+        {"starts": 2.5},
+        {"type": 3, "intrinsics": "a"},
+        {"type": np.array([1, 2])},
+        {"type": 2, "image_center": (1e300, 0)},
+        {"type": 3, "intrinsics": Intrinsics(1e300, 1e300, 0, 0)},
+        {"type": 3, "intrinsics": Intrinsics(1e-300, 1e-300, 0, 0)},
+    ],
+)
+def test_values_of_the_wrong_kind_are_named(options: dict[str, Any]) -> None:
+    points = Correspondences(FOLDED, FOLDED[:, :2])
+    with pytest.raises(NeurocalError, match=r"whole number|intrinsics|image centre|type must be"):
+        calibrate(points, **options)
