@@ -7,30 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_edges import (
-    BLUR,
-    CONTRAST,
-    MEAN,
-    OFFSET,
-    EdgeData,
-    EdgeFit,
-    Prior,
-    edge_data,
-    fit_edges,
-    moments,
-    with_weight,
-)
+from neurocal_cli.detection.fit_edges import OFFSET, EdgeData, edge_data, fit_edges, moments, with_weight
 from neurocal_cli.detection.fit_gate import believable
 from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
-from neurocal_cli.detection.fit_noise import level_prior, noise_weight, profile_shape
-from neurocal_cli.detection.fit_profile import SHAPE_ORDERS, box_kurtosis
+from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
+from neurocal_cli.detection.fit_noise import Noise, level_prior, profile_shape
+from neurocal_cli.detection.fit_profile import RESPONSE_TERMS, box_kurtosis
 from neurocal_cli.detection.fit_robust import MapFit, Rows, choose_map, fit_map
 from neurocal_cli.detection.fit_shading import Levels, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines
+from neurocal_cli.detection.fit_vertices import fit_vertices, vertex_data, vertex_lines
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
-__all__ = ["Board", "Edges", "Fitted", "fit_board"]
+__all__ = ["Board", "Edges", "Fitted", "fit_all_vertices", "fit_board"]
 
 Image = NDArray[np.generic]
 
@@ -123,24 +113,23 @@ class Fitted:
     Attributes
     ----------
     lines : Lines
-    fit : EdgeFit
+    fit : Fit
     data : EdgeData
     map : MapFit
     shading : Shading
-    shape : (E, 5) array
-        Of the profiles.
-    noise : float [DN^2]
+    shape : Shape
+    noise : Noise
     good : (E,) bool array
         Edges to be believed.
     """
 
     lines: Lines
-    fit: EdgeFit
+    fit: Fit
     data: EdgeData
     map: MapFit
     shading: Shading
-    shape: Array
-    noise: float
+    shape: Shape
+    noise: Noise
     good: NDArray[np.bool_]
 
 
@@ -180,15 +169,17 @@ def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noi
     known = np.stack([mean, contrast, blur], axis=-1)
     spread = known * [0.0, 0.0, _LOOSE_BLUR] + contrast[:, None] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
     prior = Prior(known, (1 / spread**2)[:, :, None] * np.eye(3))
-    shape = np.zeros((len(mean), len(SHAPE_ORDERS)))
-    shape[:, 1] = box_kurtosis(lines.normal, blur)
+    tails = box_kurtosis(lines.normal, blur)[:, None] * [1.0, 0.0]
+    shape = Shape(tails, np.zeros(RESPONSE_TERMS))
     offset = mapped.residual[: len(mean)] + mapped.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((len(mean), 1)), known], axis=1)
     fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, 2)
+    shape = profile_shape(data, fit, shape, np.ones(len(mean), dtype=np.bool_))
+    fit = fit_edges(data, fit.values, prior, 0.5 * lines.length, shape, 2)
     rows = board.rows(lines, fit.values[:, OFFSET], fit.covariance[:, OFFSET, OFFSET])
     chosen = choose_map(mapped.map, rows, mapped.shift)
     good = chosen.weight[: len(mean)] > 0
-    return Fitted(lines, fit, data, chosen, shading, shape, noise, good)
+    return Fitted(lines, fit, data, chosen, shading, shape, Noise(noise, noise, noise), good)
 
 
 def _last_fit(board: Board, first: Fitted) -> Fitted:
@@ -199,20 +190,18 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     lines = board.lines(first.map.map)
     reach = _REACH * sigma
     data = _pixels(board, lines, sigma, shading, reach, 1)
-    data = with_weight(data, np.full_like(data.weight, 1 / first.noise))
-    prior = level_prior(shading, lines.middle, sigma, first.noise)
+    data = with_weight(data, np.full_like(data.weight, 1 / first.noise.edge))
+    prior = level_prior(shading, lines.middle, sigma, first.noise.edge)
     offset = first.map.residual[:n] + first.map.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     half_length = 0.5 * lines.length
-    fit = fit_edges(data, start, prior, half_length, first.shape, 1)
-    shape = first.shape + profile_shape(data, fit, good)
+    fit = fit_edges(data, start, prior, half_length, first.shape, 2)
+    shape = profile_shape(data, fit, first.shape, good)
+    noise = Noise.of(fit, data.weight, board.floor)
+    data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
     fit = fit_edges(data, fit.values, prior, half_length, shape, 2)
-    weight = noise_weight(data, fit, board.floor)
-    noise = 1 / float(weight[weight > 0].mean())
-    data = with_weight(data, weight)
-    shape = shape + profile_shape(data, fit, good)
-    fit = fit_edges(data, fit.values, prior, half_length, shape, 2)
-    fit = fit.scaled(float(np.median(fit.chi2[good] / fit.count[good])))
+    scale = float(np.median(fit.chi2[good] / fit.count[good]))
+    fit, noise = fit.scaled(scale), noise.times(scale)
     variance = fit.covariance[:, OFFSET, OFFSET]
     mapped = fit_map(first.map.map, board.rows(lines, fit.values[:, OFFSET], variance), first.map.shift)
     strip = 2 * np.minimum(reach, 0.5 * lines.width) * (lines.length - 2 * _NEAREST * sigma)
@@ -228,6 +217,29 @@ def _pixels(
     strips = gather(board.image, lines, half, np.zeros(len(half)), stride)
     contrast = shading.at(lines.middle)[1]
     return edge_data(strips, lines, sigma, shading.slopes(lines.middle), contrast, _NEAREST)
+
+
+def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Lines], NDArray[np.bool_]]:
+    """Fits of all seen vertices after those of the edges, with their lines, and which to believe."""
+    grid = board.anchors.grid[: len(board.anchors.grid) // 2]
+    lines = vertex_lines(fitted.map.map, grid)
+    light = np.where((grid.sum(axis=1) + board.grid.dark) % 2 == 1, 1.0, -1.0)
+    middle = lines[0].middle
+    sigma = np.full(len(grid), float(np.median(fitted.fit.values[:, BLUR])))
+    contrast = fitted.shading.at(middle)[1]
+    slopes = fitted.shading.slopes(middle)
+    data = vertex_data(board.image, lines, light, sigma, _REACH, slopes, contrast)
+    tails = np.tile(np.median(fitted.shape.tails, axis=0), (len(grid), 1))
+    shape = Shape(tails, fitted.shape.bend)
+    prior = level_prior(fitted.shading, middle, sigma, fitted.noise.edge)
+    start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
+    half = (0.5 * lines[0].length, 0.5 * lines[1].length)
+    unit = replace(data, weight=data.weight / np.float32(fitted.noise.edge))
+    fit = fit_vertices(unit, start, prior, half, shape, 1)
+    weight = fitted.noise.weighted(fit.linear.x, data.weight)
+    fit = fit_vertices(replace(data, weight=weight), fit.values, prior, half, shape, 2)
+    fit = fit.scaled(float(np.median(fit.chi2 / np.maximum(fit.count, 1))))
+    return fit, lines, np.ones(len(grid), dtype=np.bool_)
 
 
 def _shading(first: Fitted) -> Shading:

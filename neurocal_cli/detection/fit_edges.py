@@ -2,12 +2,12 @@
 
 The light around an edge, with (s, d) the coordinates of `Lines` and z = (d - offset - tilt s) / sigma,
 
-    I = A(u, v) + B(u, v) (E(z) Q(s) + phi(z) R(s))
+    I = A(u, v) + B(u, v) F(x),   x = E(z) Q + phi(z) R
 
-A and B are mean level and half contrast, with slopes that are fixed; E is `fit_profile.profile`; Q fades
-the edge out where others cross it at both ends, ``Q = erf(t1) erf(t2)`` in the distances t1, t2 from
-these, and R corrects that for their angle: blurring sign(z) sign(t) gives erf erf + 4 rho phi phi + ...
-with rho the cosine between the normals.
+A and B are mean level and half contrast, with slopes that are fixed; E and F are `fit_profile.profile` and
+`response`; Q fades the edge out towards other lines, a product of erf(t) in the distances t from those that
+cross it at both ends and from its two parallel neighbours; R corrects that for the crossing angle: blurring
+sign(z) sign(t) gives erf erf + 4 rho phi phi + ... with rho the cosine between the normals.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_profile import erf_and_density, profile
+from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Linear, Prior, Shape, gauss_newton
+from neurocal_cli.detection.fit_profile import erf_and_density, profile, response
 from neurocal_cli.detection.fit_strips import Lines, Strips
 from neurocal_cli.geometry import Array
 
-__all__ = ["EdgeData", "EdgeFit", "Prior", "edge_data", "fit_edges", "moments"]
+__all__ = ["OFFSET", "TILT", "EdgeData", "edge_data", "fit_edges", "linearised", "moments", "with_weight"]
 
 Single = NDArray[np.float32]
 
-OFFSET, TILT, MEAN, CONTRAST, BLUR = range(5)
-_NOTHING = 1e-9  # information that keeps fits without pixels from dividing by 0
-_LEAST_BLUR = 0.3  # px, sigma_t; the box alone has 0.289
+OFFSET, TILT = 0, 1  # the first two values of an edge's fit
+_ALONE = 9.0  # sigma to the next parallel line, beyond which it cannot be noticed
 _BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
 
 
@@ -43,7 +43,6 @@ class EdgeData:
     gain : array
         B(u, v) relative to the edge's own.
     Q, R : arrays
-        Times `gain`.
     weight : array [1/DN^2]
         Inverse variance of the noise; 0 for pixels that are not used.
     """
@@ -51,65 +50,10 @@ class EdgeData:
     s: Single
     d: Single
     value: Single
+    gain: Single
     Q: Single
     R: Single
     weight: Single
-
-
-@dataclass(frozen=True, eq=False)
-class Prior:
-    """What is known of level, contrast and blur beforehand.
-
-    Attributes
-    ----------
-    mean : (E, 3) array [DN, DN, px]
-    precision : (E, 3, 3) array
-    """
-
-    mean: Array
-    precision: Array
-
-
-@dataclass(frozen=True, eq=False)
-class EdgeFit:
-    """Fitted edges.
-
-    Attributes
-    ----------
-    values : (E, 5) array
-        offset [px], tilt [px over the half length], A, B [DN], sigma_t [px].
-    information : (E, 5, 5) array
-        Fisher's, from the pixels alone.
-    prior : Prior
-    chi2, count : (E,) arrays
-        Weighted squares of the residuals and number of pixels.
-    step : (E,) array
-        The last step, in standard deviations.
-    model : (E, N) float32 array [DN]
-    residual : (E, N) float32 array [DN]
-    z : (E, N) float32 array
-    """
-
-    values: Array
-    information: Array
-    prior: Prior
-    chi2: Array
-    count: Array
-    step: Array
-    residual: Single
-    z: Single
-
-    @property
-    def covariance(self) -> Array:
-        """(E, 5, 5) of the values."""
-        total = self.information.copy()
-        total[:, MEAN:, MEAN:] += self.prior.precision
-        total[:, range(5), range(5)] += _NOTHING
-        return np.asarray(np.linalg.inv(total))
-
-    def scaled(self, noise: float) -> EdgeFit:
-        """The same fits, the pixels' variance being another by a factor."""
-        return replace(self, information=self.information / noise, chi2=self.chi2 / noise)
 
 
 def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:
@@ -181,86 +125,64 @@ def edge_data(
     value = strips.value - strips.u * slope_a[:, :1] - strips.v * slope_a[:, 1:]
     relative = slope_b / contrast.astype(np.float32)[:, None]
     gain = 1 + strips.u * relative[:, :1] + strips.v * relative[:, 1:]
-    return EdgeData(strips.s, strips.d, value, Q * gain, R * gain, used.astype(np.float32))
+    for side, width in ((-1, lines.width), (1, lines.width)):
+        close = width < _ALONE * sigma
+        if close.any():
+            t = (width[close, None].astype(np.float32) + side * strips.d[close]) * per_sigma[close]
+            Q[close] *= erf_and_density(t)[0]
+    return EdgeData(strips.s, strips.d, value, gain, Q, R, used.astype(np.float32))
 
 
 def fit_edges(
-    data: EdgeData, start: Array, prior: Prior, half_length: Array, shape: Array, steps: int
-) -> EdgeFit:
+    data: EdgeData, start: Array, prior: Prior, half_length: Array, shape: Shape, steps: int
+) -> Fit:
     """Gauss-Newton steps of all edges at once.
 
     Parameters
     ----------
     data : EdgeData
     start : (E, 5) array
-        As `EdgeFit.values`.
+        Offset [px], tilt [px over the half length], and the values of `Fit`.
     prior : Prior
     half_length : (E,) array [px]
-        Unit of the tilt's lever.
-    shape : (E, 5) array
-        Of the profile.
+    shape : Shape
     steps : int
     """
-    values = start.copy()
     lever = data.s / half_length.astype(np.float32)[:, None]
-    size = np.zeros(len(values))
-    for _ in range(steps):
-        jacobian, residual, _ = linearised(data, lever, values, shape)
-        information, gradient = _normal(jacobian, residual, data.weight)
-        pull = values[:, MEAN:] - prior.mean
-        gradient[:, MEAN:] -= (prior.precision @ pull[:, :, None])[:, :, 0]
-        information[:, MEAN:, MEAN:] += prior.precision
-        information[:, range(5), range(5)] *= 1 + 1e-9
-        information[:, range(5), range(5)] += _NOTHING
-        step = np.linalg.solve(information, gradient[:, :, None])[:, :, 0]
-        size = np.sqrt(np.maximum((step * gradient).sum(axis=1), 0))
-        values = _moved(values, np.asarray(step, dtype=float))
-    jacobian, residual, z = linearised(data, lever, values, shape)
-    information, _ = _normal(jacobian, residual, data.weight)
-    chi2 = np.einsum("en,en,en->e", residual, residual, data.weight).astype(float)
-    count = (data.weight > 0).sum(axis=1)
-    return EdgeFit(values, information, prior, chi2, count, size, residual, z)
+
+    def model(values: Array) -> Linear:
+        return linearised(data, lever, values, shape)
+
+    return gauss_newton(model, start, prior, data.weight, steps)
 
 
-def linearised(data: EdgeData, lever: Single, values: Array, shape: Array) -> tuple[Single, Single, Single]:
-    """Derivatives (E, 5, N) of the model by the values, residuals (E, N) and z (E, N)."""
+def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Linear:
+    """The model and its derivatives; ``lever`` is s over the half length."""
     offset, tilt, mean, contrast, sigma = (x.astype(np.float32)[:, None] for x in values.T)
     z = data.d - offset
     z -= tilt * lever
     z /= sigma
-    E, slope, density = profile(z, shape)
-    jacobian = np.empty((len(z), 5, z.shape[1]), dtype=np.float32)
-    light = jacobian[:, CONTRAST]
-    np.multiply(E, data.Q, out=light)
-    light += density * data.R
+    E, slope, density = profile(z, shape.tails)
+    x = E * data.Q
+    x += density * data.R
     slope *= data.Q
     slope -= z * density * data.R
+    if shape.bend.any():
+        F, steep = response(x, shape.bend)
+        slope *= steep
+    else:
+        F = x
+    slope *= data.gain
     slope *= -contrast / sigma
+    jacobian = np.empty((len(z), 5, z.shape[1]), dtype=np.float32)
     jacobian[:, OFFSET] = slope
     np.multiply(slope, lever, out=jacobian[:, TILT])
     jacobian[:, MEAN] = 1
+    np.multiply(F, data.gain, out=jacobian[:, CONTRAST])
     np.multiply(slope, z, out=jacobian[:, BLUR])
     residual = data.value - mean
-    residual -= contrast * light
-    return jacobian, residual, z
-
-
-def _normal(jacobian: Single, residual: Single, weight: Single) -> tuple[Array, Array]:
-    weighted = jacobian * weight[:, None, :]
-    information = weighted @ jacobian.swapaxes(1, 2)
-    gradient = weighted @ residual[:, :, None]
-    return information.astype(float), gradient[:, :, 0].astype(float)
-
-
-def _moved(values: Array, step: Array) -> Array:
-    """Values after a step, kept from leaving the range where the model is nearly linear."""
-    sigma = values[:, BLUR]
-    step = step.copy()
-    step[:, OFFSET] = np.clip(step[:, OFFSET], -sigma, sigma)
-    step[:, TILT] = np.clip(step[:, TILT], -sigma, sigma)
-    values = values + step
-    values[:, BLUR] = np.clip(values[:, BLUR], np.maximum(0.6 * sigma, _LEAST_BLUR), 1.6 * sigma)
-    return values
+    residual -= contrast * jacobian[:, CONTRAST]
+    return Linear(jacobian, residual, z, x)
 
 
 def with_weight(data: EdgeData, weight: Single) -> EdgeData:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_edges import BLUR, CONTRAST, EdgeFit
+from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, Fit
 from neurocal_cli.geometry import Array
 
 __all__ = ["believable"]
@@ -19,12 +19,12 @@ _ROUGH = 0.5  # relative excess of chi2 that is never held against a fit
 _MOST_STEP = 1.0  # standard deviations that the last step may have
 
 
-def believable(fit: EdgeFit, residual: Array, variance: Array, expected: Array) -> NDArray[np.bool_]:
+def believable(fit: Fit, residual: Array, variance: Array, expected: Array) -> NDArray[np.bool_]:
     """(E,) whether fits agree with their pixels, the rest of the board, and the map.
 
     Parameters
     ----------
-    fit : EdgeFit
+    fit : Fit
     residual : (E,) array [px]
         Of the offset, from the map and the polarity.
     variance : (E,) array [px^2]
@@ -32,8 +32,8 @@ def believable(fit: EdgeFit, residual: Array, variance: Array, expected: Array) 
     expected : (E,) array
         Pixels of the whole strip.
     """
-    contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, 1]
-    blur = fit.values[:, BLUR] / fit.prior.mean[:, 2]
+    contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, CONTRAST]
+    blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]
     good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
     good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
     good &= (fit.count >= _LEAST_PIXELS * expected) & (fit.count >= _LEAST_COUNT)

@@ -3,9 +3,11 @@
 With x the grid coordinates scaled to [-1, 1] and pixels relative to the image's centre in half diagonals,
 
     q = (h0 x + h1 y + h2, h3 x + h4 y + h5) / (1 + h6 x + h7 y)
-    p = q + (q - c) (k1 rho^2 + k2 rho^4) + sum_k a_k T_k(x, y),    rho = |q - c|
+    p = q + e (k1 rho + k2 rho^2) + sum_k a_k T_k(x, y),    e = q - c
+    rho = (1 + m) e_u^2 + 2 n e_u e_v + (1 - m) e_v^2
 
-with T_k products of Chebyshev's polynomials of a total degree from 2 on.
+with m and n for pixels that are not square, and T_k products of Chebyshev's polynomials of a total
+degree from 2 on.
 """
 
 from __future__ import annotations
@@ -19,11 +21,12 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Frame", "SmoothMap", "homography_start"]
 
-_HOMOGRAPHY, _LENS = 8, 4
-_FREE_LENS: tuple[tuple[int, ...], ...] = ((), (10,), (8, 9, 10, 11))
+_HOMOGRAPHY, _LENS = 8, 6
+_REST = _HOMOGRAPHY + _LENS
+_FREE_LENS: tuple[tuple[int, ...], ...] = ((), (10,), (8, 9, 10, 11), (8, 9, 10, 11, 12, 13))
 # Standard deviations of what is known beforehand: the centre of distortion [half diagonals], k1 and k2,
-# the polynomial's coefficients [half diagonals]. They only bind what the data leave open.
-_CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.1
+# m and n, the polynomial's coefficients [half diagonals]. They only bind what the data leave open.
+_CENTRE_PRIOR, _RADIAL_PRIOR, _PIXEL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.03, 0.1
 
 
 @dataclass(frozen=True)
@@ -61,9 +64,9 @@ class SmoothMap:
     ----------
     frame : Frame
     parameters : (P,) array
-        h0..h7, c_u, c_v, k1, k2, then a_k along u and along v.
+        h0..h7, c_u, c_v, k1, k2, m, n, then a_k along u and along v.
     radial : int
-        How many of k1 and k2 are free; with both the centre is free too.
+        What is free of the lens: nothing, k1, both and the centre, m and n as well.
     degree : int
         Of the polynomial rest, 0 without.
     covariance : (P, P) array
@@ -79,7 +82,7 @@ class SmoothMap:
     @property
     def free(self) -> NDArray[np.intp]:
         """Positions of the free parameters."""
-        free = (*range(_HOMOGRAPHY), *_FREE_LENS[self.radial], *range(12, len(self.parameters)))
+        free = (*range(_HOMOGRAPHY), *_FREE_LENS[self.radial], *range(_REST, len(self.parameters)))
         return np.array(free, dtype=np.intp)
 
     @property
@@ -93,12 +96,12 @@ class SmoothMap:
 
     def shaped(self, radial: int, degree: int) -> SmoothMap:
         """The map with other free parameters; new ones are 0 and old ones dropped."""
-        old = self.parameters[12:].reshape(2, -1)
+        old = self.parameters[_REST:].reshape(2, -1)
         rest = np.zeros((2, len(_orders(degree))))
         common = min(old.shape[1], rest.shape[1])
         rest[:, :common] = old[:, :common]
-        values = np.concatenate([self.parameters[:12], rest.reshape(-1)])
-        values[[k for k in range(8, 12) if k not in _FREE_LENS[radial]]] = 0.0
+        values = np.concatenate([self.parameters[:_REST], rest.reshape(-1)])
+        values[[k for k in range(_HOMOGRAPHY, _REST) if k not in _FREE_LENS[radial]]] = 0.0
         return replace(self, parameters=values, radial=radial, degree=degree, covariance=None)
 
     def at(self, grid: Array) -> Array:
@@ -108,11 +111,11 @@ class SmoothMap:
         q, _ = _project(values, scaled[..., 0], scaled[..., 1])
         if self.radial:
             e = q - values[8:10]
-            rho = (e * e).sum(axis=-1)[..., None]
+            rho = (e * (e @ self._metric)).sum(axis=-1)[..., None]
             q = q + e * (rho * (values[10] + values[11] * rho))
         if self.degree:
             terms = _rest(self.degree, scaled[..., 0], scaled[..., 1])
-            q = q + terms @ values[12:].reshape(2, -1).T
+            q = q + terms @ values[_REST:].reshape(2, -1).T
         return np.asarray(frame.centre + frame.unit * q)
 
     def derivatives(self, grid: Array) -> tuple[Array, Array]:
@@ -127,21 +130,29 @@ class SmoothMap:
         dq[:, :, 6] = -q * ground[:, :1]
         dq[:, :, 7] = -q * ground[:, 1:2]
         e = q - values[8:10]
-        rho = (e * e).sum(axis=-1)[:, None, None]
+        slope = e @ self._metric
+        rho = (e * slope).sum(axis=-1)[:, None]
         k1, k2 = values[10:12]
-        bent = np.eye(2) * (rho * (k1 + k2 * rho)) + (2 * k1 + 4 * k2 * rho) * e[:, :, None] * e[:, None, :]
+        stretch, growth = rho * (k1 + k2 * rho), k1 + 2 * k2 * rho
+        bent = np.eye(2) * stretch[:, :, None] + 2 * (growth * e)[:, :, None] * slope[:, None, :]
         out = np.zeros((n, 2, len(values)))
         out[:, :, :8] = dq + bent @ dq
         out[:, :, 8:10] = -bent
-        out[:, :, 10] = e * rho[:, :, 0]
-        out[:, :, 11] = e * rho[:, :, 0] ** 2
-        q = q + e * (rho * (k1 + k2 * rho))[:, :, 0]
+        out[:, :, 10], out[:, :, 11] = e * rho, e * rho**2
+        out[:, :, 12] = growth * e * (e[:, :1] ** 2 - e[:, 1:] ** 2)
+        out[:, :, 13] = growth * e * (2 * e[:, :1] * e[:, 1:])
+        q = q + e * stretch
         if self.degree:
             terms = _rest(self.degree, x, y)
             m = terms.shape[1]
-            out[:, 0, 12 : 12 + m] = out[:, 1, 12 + m :] = terms
-            q = q + terms @ values[12:].reshape(2, -1).T
+            out[:, 0, _REST : _REST + m] = out[:, 1, _REST + m :] = terms
+            q = q + terms @ values[_REST:].reshape(2, -1).T
         return frame.centre + frame.unit * q, frame.unit * out
+
+    @property
+    def _metric(self) -> Array:
+        m, n = self.parameters[12:14]
+        return np.array([[1 + m, n], [n, 1 - m]])
 
     def variance(self, grid: Array, direction: Array) -> Array:
         """Variance [px^2] of the map along unit vectors (N, 2) at grid points (N, 2)."""

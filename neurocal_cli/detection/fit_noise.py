@@ -2,86 +2,107 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_edges import BLUR, CONTRAST, MEAN, EdgeData, EdgeFit, Prior
-from neurocal_cli.detection.fit_profile import erf_and_density, shape_terms
+from neurocal_cli.detection.fit_edges import EdgeData
+from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
+from neurocal_cli.detection.fit_profile import (
+    RESPONSE_TERMS,
+    erf_and_density,
+    response,
+    response_terms,
+    tail_terms,
+)
 from neurocal_cli.detection.fit_shading import Shading
 from neurocal_cli.geometry import Array
 
-__all__ = ["level_prior", "noise_weight", "profile_shape"]
+__all__ = ["Noise", "level_prior", "profile_shape"]
 
 Single = NDArray[np.float32]
 
-_FLAT = 2.0  # sigma from the edge, where the profile has become level
+_FLAT = 0.95  # light, of -1 to 1, beyond which the levels are reached but for little
 # Noise that seems smaller than this share of the largest, as that of clipped pixels does, is not believed.
 _LEAST_SHARE = 0.3
 _BLUR_SPREAD = 0.05  # of single edges' blur around the board's
+_RIDGE = 1e-5
 _LEAST_SPREAD = 0.002  # of levels, in variances of the noise
 
 
-def noise_weight(data: EdgeData, fit: EdgeFit, floor: float) -> Single:
-    """Inverse variance of each pixel's noise, from the residuals on the dark side, the light one, between.
+@dataclass(frozen=True)
+class Noise:
+    """Variance of the pixels [DN^2] on the dark side, at the edge, on the light side."""
+
+    dark: float
+    edge: float
+    light: float
+
+    @classmethod
+    def of(cls, fit: Fit, weight: Single, floor: float) -> Noise:
+        """From the residuals of fits.
+
+        Parameters
+        ----------
+        fit : Fit
+        weight : (E, N) array
+            0 for pixels not used.
+        floor : float [DN^2]
+            Variance that rounding makes at least.
+        """
+        x, used = fit.linear.x, weight > 0
+        square = fit.linear.residual**2
+        variances = []
+        for part in (x < -_FLAT, np.abs(x) <= _FLAT, x > _FLAT):
+            mine = part & used
+            count = mine.sum(axis=1)
+            some = count >= min(8, int(count.max(initial=0)))
+            sums = np.einsum("en,en->e", square, mine.astype(np.float32))
+            # The median over the edges does not see those that are hidden.
+            variances.append(float(np.median(sums[some] / np.maximum(count[some], 1))) if some.any() else 0.0)
+        return cls(*(max(v, floor, _LEAST_SHARE * max(variances)) for v in variances))
+
+    def times(self, factor: float) -> Noise:
+        """All of it more by a factor."""
+        return Noise(factor * self.dark, factor * self.edge, factor * self.light)
+
+    def weighted(self, x: Single, used: Single) -> Single:
+        """Inverse variances [1/DN^2] of pixels at a light x between the levels; 0 where not used."""
+        at = np.clip(x, -1, 1)
+        variance = self.edge + np.where(at < 0, self.edge - self.dark, self.light - self.edge) * at
+        return np.where(used > 0, 1 / variance, 0).astype(np.float32)
+
+
+def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_]) -> Shape:
+    """Better shape of the profile from what the fits have left over, by least squares.
+
+    Shift, blur and levels are varied along with it, so that these don't hide what they cannot change.
 
     Parameters
     ----------
     data : EdgeData
-    fit : EdgeFit
-        Of these data.
-    floor : float [DN^2]
-        Variance that rounding makes at least.
-
-    Returns
-    -------
-    weight : (E, N) array [1/DN^2]
-        0 for pixels not used.
-    """
-    used = data.weight > 0
-    square = fit.residual**2
-    variances = []
-    for part in (fit.z < -_FLAT, np.abs(fit.z) <= _FLAT, fit.z > _FLAT):
-        mine = part & used
-        count = mine.sum(axis=1)
-        some = count >= min(8, int(count.max(initial=0)))
-        sums = np.einsum("en,en->e", square, mine.astype(np.float32))
-        # The median over the edges does not see those that are hidden.
-        variances.append(float(np.median(sums[some] / np.maximum(count[some], 1))) if some.any() else 0.0)
-    low, middle, high = np.maximum(variances, max(floor, _LEAST_SHARE * max(variances)))
-    at = np.clip(fit.z / np.float32(_FLAT), -1, 1)
-    variance = middle + np.where(at < 0, middle - low, high - middle) * at
-    return np.where(used, 1 / variance, 0).astype(np.float32)
-
-
-def profile_shape(data: EdgeData, fit: EdgeFit, good: NDArray[np.bool_]) -> Array:
-    """Correction of the profile's coefficients from what the fits have left over, by least squares.
-
-    Shift, blur and levels are varied along with them, so that these don't hide what they cannot change.
-
-    Parameters
-    ----------
-    data : EdgeData
-    fit : EdgeFit
+    fit : Fit
+    shape : Shape
+        With which these were fitted.
     good : (E,) bool array
         Edges to use.
-
-    Returns
-    -------
-    shape : (5,) array
-        To be added to `SHAPE_ORDERS`' coefficients.
     """
-    z = fit.z[good]
-    value, density = erf_and_density(z)
-    scale = fit.values[good, CONTRAST].astype(np.float32)[:, None] * data.Q[good]
-    shapes = shape_terms(z, density)
-    others = np.stack([density, density * z, value])
-    columns = np.concatenate([shapes * scale, others * scale, np.ones_like(z)[None]])
+    z, x, Q = fit.linear.z[good], fit.linear.x[good], data.Q[good]
+    _, density = erf_and_density(z)
+    scale = fit.values[good, CONTRAST].astype(np.float32)[:, None] * data.gain[good]
+    steep = response(x, shape.bend)[1] * Q
+    bends = response_terms(x)
+    tails = tail_terms(z, density) * steep
+    others = np.stack([density * steep, density * z * steep, x])
+    columns = np.concatenate([tails * scale, bends * scale, others * scale, np.ones_like(z)[None]])
     columns = columns.reshape(len(columns), -1)
     weighted = columns * data.weight[good].reshape(-1)
     normal = (weighted @ columns.T).astype(float)
-    right = (weighted @ fit.residual[good].reshape(-1)).astype(float)
-    normal[np.diag_indices_from(normal)] *= 1 + 1e-6
-    return np.asarray(np.linalg.solve(normal, right)[: len(shapes)])
+    right = (weighted @ fit.linear.residual[good].reshape(-1)).astype(float)
+    normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
+    step = np.linalg.solve(normal, right)
+    return Shape(shape.tails + step[:2], shape.bend + step[2 : 2 + RESPONSE_TERMS])
 
 
 def level_prior(shading: Shading, place: Array, sigma: Array, noise: float) -> Prior:
@@ -99,8 +120,7 @@ def level_prior(shading: Shading, place: Array, sigma: Array, noise: float) -> P
     low, high = 1 / (shading.spread + _LEAST_SPREAD * noise)
     precision = np.zeros((len(place), 3, 3))
     # Of A = (light + dark) / 2 and B = (light - dark) / 2, from those of dark and light.
-    a, b = MEAN - MEAN, CONTRAST - MEAN
-    precision[:, a, a] = precision[:, b, b] = high + low
-    precision[:, a, b] = precision[:, b, a] = high - low
-    precision[:, BLUR - MEAN, BLUR - MEAN] = 1 / (_BLUR_SPREAD * sigma) ** 2
+    precision[:, MEAN, MEAN] = precision[:, CONTRAST, CONTRAST] = high + low
+    precision[:, MEAN, CONTRAST] = precision[:, CONTRAST, MEAN] = high - low
+    precision[:, BLUR, BLUR] = 1 / (_BLUR_SPREAD * sigma) ** 2
     return Prior(np.stack([mean, contrast, sigma], axis=-1), precision)

@@ -2,11 +2,14 @@
 
 With z the distance from the edge in units of sigma_t, ``sigma_t^2 = psf^2 + 1/12``,
 
-    E(z) = erf(z / sqrt 2) + phi(z) sum_k a_k He_k(z)
+    E(z) = erf(z / sqrt 2) + phi(z) (a_3 He_3(z) + a_5 He_5(z))
 
-where phi is the normal density and He_k are Hermite's polynomials (Gram-Charlier's series). The sum
-holds what is not Gaussian: the pixel's box (known, see `box_kurtosis`), a response that is not linear,
-clipping, sharpening (all measured, the same along all edges of an image).
+where phi is the normal density and He_k are Hermite's polynomials (Gram-Charlier's series): the blur's
+tails, the pixel's box (known, see `box_kurtosis`), sharpening. A response that is not linear then makes
+
+    F(x) = x + (1 - x^2) (b_0 + b_1 x + b_2 x^2 + ...)
+
+of the light x between the levels -1 and +1: gamma, clipping. Both are the same along all edges of an image.
 """
 
 from __future__ import annotations
@@ -16,12 +19,19 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["PIXEL_VARIANCE", "SHAPE_ORDERS", "box_kurtosis", "erf_and_density", "profile", "shape_terms"]
+__all__ = [
+    "RESPONSE_TERMS",
+    "box_kurtosis",
+    "erf_and_density",
+    "profile",
+    "response",
+    "response_terms",
+    "tail_terms",
+]
 
 Real = NDArray[np.floating]
 
-PIXEL_VARIANCE = 1 / 12  # px^2, of the box that a pixel integrates over
-SHAPE_ORDERS = (2, 3, 4, 5, 6)  # 0 is a shift of the edge, 1 a change of its blur
+RESPONSE_TERMS = 4
 
 # erf(x) = 1 - exp(-x^2) sum_k C_k t^k, t = 1 / (1 + p x): the form of Hastings (Abramowitz and Stegun
 # 7.1.26) with seven terms, which Lawson's method has made minimax: at most 7.3e-10 off.
@@ -60,40 +70,54 @@ def erf_and_density(z: Real) -> tuple[Real, Real]:
     return value, bell
 
 
-def profile(z: Real, shape: Real) -> tuple[Real, Real, Real]:
+def profile(z: Real, tails: Real) -> tuple[Real, Real, Real]:
     """E(z), its derivative, and the normal density.
 
     Parameters
     ----------
     z : (E, N) array
-    shape : (E, 5) array
-        Coefficients a_k of `SHAPE_ORDERS`.
+    tails : (E, 2) array
+        Coefficients a_3 and a_5.
     """
     value, density = erf_and_density(z)
     slope = 2 * density
-    used = np.flatnonzero(shape.any(axis=0))
-    if used.size:
-        # He_{k+1} = z He_k - k He_{k-1};   d/dz phi He_k = -phi He_{k+1}
-        before, now = z, z * z - 1
-        even, steep = np.zeros_like(z), np.zeros_like(z)
-        for column in range(int(used[-1]) + 1):
-            after = z * now - SHAPE_ORDERS[column] * before
-            if shape[:, column].any():
-                factor = shape[:, column, None].astype(z.dtype)
-                even += factor * now
-                steep += factor * after
-            before, now = now, after
-        value += density * even
+    third, fifth = (tails[:, k, None].astype(z.dtype) for k in (0, 1))
+    if third.any() or fifth.any():
+        square = z * z
+        # d/dz phi He_k = -phi He_{k+1}
+        value += density * z * (third * (square - 3) + fifth * (square * (square - 10) + 15))
+        steep = third * (square * (square - 6) + 3)
+        steep += fifth * (square * (square * (square - 15) + 45) - 15)
         slope -= density * steep
     return value, slope, density
 
 
-def shape_terms(z: Real, density: Real) -> Real:
-    """The functions ``phi(z) He_k(z)`` of `SHAPE_ORDERS`; (5, ...) array."""
-    terms = [z, z * z - 1]
-    for k in SHAPE_ORDERS[:-1]:
-        terms.append(z * terms[-1] - k * terms[-2])
-    return np.stack(terms[1:]) * density
+def tail_terms(z: Real, density: Real) -> Real:
+    """The functions ``phi He_3`` and ``phi He_5``; (2, ...) array."""
+    square = z * z
+    odd = density * z
+    return np.stack([odd * (square - 3), odd * (square * (square - 10) + 15)])
+
+
+def response(x: Real, bend: Array) -> tuple[Real, Real]:
+    """F(x) and its derivative, for coefficients b_0, b_1, ..."""
+    rest = np.full_like(x, bend[-1])
+    steep = np.zeros_like(x)
+    for coefficient in bend[-2::-1]:
+        steep *= x
+        steep += rest
+        rest *= x
+        rest += x.dtype.type(coefficient)
+    room = 1 - x * x
+    return x + room * rest, 1 + room * steep - 2 * x * rest
+
+
+def response_terms(x: Real) -> Real:
+    """The functions ``(1 - x^2) x^k``; (RESPONSE_TERMS, ...) array."""
+    terms = [1 - x * x]
+    for _ in range(RESPONSE_TERMS - 1):
+        terms.append(terms[-1] * x)
+    return np.stack(terms)
 
 
 def box_kurtosis(normal: Array, sigma: Array) -> Array:

@@ -13,7 +13,7 @@ from neurocal_cli.geometry import Array
 __all__ = ["FORMS", "MapFit", "Rows", "choose_map", "fit_map"]
 
 # Forms of the map from the simplest on: (radial parameters, degree of the polynomial rest).
-FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (2, 3), (2, 4), (2, 5), (2, 6))
+FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
 
 _STEPS = 6
 _SHIFT_PRIOR = 1e-2  # 1/px^2
@@ -80,7 +80,7 @@ class MapFit:
     chi2 : float
         Tukey's loss, about the number of good rows less that of parameters.
     excess : float
-        Variance of the good rows, as a multiple of what they claim.
+        Variance of the good rows that tell something about the map, as a multiple of what they claim.
     """
 
     map: SmoothMap
@@ -199,7 +199,9 @@ def _finished(now: SmoothMap, rows: Rows, shift: Array) -> MapFit:
     size = 1 / np.sqrt(np.diag(normal))
     inverse = np.linalg.inv(normal * size[:, None] * size) * size[:, None] * size
     chi2 = float((z[good] ** 2).sum())
-    excess = chi2 / max(int(good.sum()) - len(free) - len(shift), 1)
+    telling = good & (rows.variance < 100 * np.median(rows.variance))
+    left = int(telling.sum()) - len(free) - len(shift)
+    excess = float((z[telling] ** 2).sum()) / max(left, 0.2 * len(z))
     covariance = np.zeros((len(now.parameters),) * 2)
     covariance[np.ix_(free, free)] = inverse[: len(free), : len(free)]
     return MapFit(

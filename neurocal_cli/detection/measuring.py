@@ -13,14 +13,18 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_board import Board, Fitted, fit_board
+from neurocal_cli.detection.fit_board import Board, Fitted, fit_all_vertices, fit_board
 from neurocal_cli.detection.fit_edges import OFFSET, TILT
-from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Grid, Measured
+from neurocal_cli.detection.fit_newton import BLUR
+from neurocal_cli.detection.fit_profile import profile, response
+from neurocal_cli.detection.fit_vertices import FIRST, SECOND
+from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.geometry import Array
 
 __all__ = ["measure"]
 
 _ROUNDING = 1 / 12  # DN^2
+_FAR, _HALVINGS = 3.0, 40  # sigma, for the search of the middle level
 
 
 def measure(
@@ -54,6 +58,8 @@ def measure(
     vertices = np.full(grid.pixels.shape, np.nan)
     seen = grid.seen
     vertices[seen] = fitted.map.map.at(np.argwhere(seen)[:, ::-1].astype(float))
+    if points == "vertices":
+        return _vertices(board, fitted, vertices)
     pixels, covariance = _midpoints(board, fitted)
     good = fitted.good
     return Measured(
@@ -63,7 +69,7 @@ def measure(
         covariance=covariance[good],
         vertices=vertices,
         rejected=int((~good).sum()),
-        polarity=-float(fitted.map.shift[0]),
+        polarity=_polarity(fitted),
     )
 
 
@@ -87,6 +93,39 @@ def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
         axis=-1,
     )
     return pixels, covariance
+
+
+def _polarity(fitted: Fitted) -> float:
+    """How far towards the dark side [px] the middle between the levels lies from the undisturbed edge."""
+    low, high = -_FAR, _FAR
+    for _ in range(_HALVINGS):
+        z = 0.5 * (low + high)
+        light, _, _ = profile(np.array([[z]]), fitted.shape.tails[:1])
+        low, high = (low, z) if response(light, fitted.shape.bend)[0] > 0 else (z, high)
+    sigma = float(np.median(fitted.fit.values[:, BLUR]))
+    return -float(fitted.map.shift[0]) - 0.5 * (low + high) * sigma
+
+
+def _vertices(board: Board, fitted: Fitted, vertices: Array) -> Measured:
+    fit, (first, second), good = fit_all_vertices(board, fitted)
+    # Where the two lines cross: n1 . p = offset1, n2 . p = offset2.
+    inverse = np.linalg.inv(np.stack([first.normal, second.normal], axis=1))
+    offsets = fit.values[:, [FIRST, SECOND]]
+    pixels = first.middle + (inverse @ offsets[:, :, None])[:, :, 0]
+    spread = fit.covariance[:, [[FIRST], [SECOND]], [FIRST, SECOND]]
+    spread = inverse @ spread @ inverse.swapaxes(1, 2)
+    covariance = np.stack([spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]], axis=-1)
+    index = np.argwhere(board.grid.seen)[:, ::-1]
+    vertices[tuple(index[:, ::-1].T)] = np.where(good[:, None], pixels, np.nan)
+    return Measured(
+        kind=np.full(int(good.sum()), VERTEX, dtype=np.int64),
+        index=index[good].astype(np.int64),
+        pixels=pixels[good],
+        covariance=covariance[good],
+        vertices=vertices,
+        rejected=int((~good).sum()),
+        polarity=_polarity(fitted),
+    )
 
 
 def _linear(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:

@@ -1,0 +1,186 @@
+"""Maximum-likelihood fits of the vertices, where two edges cross.
+
+With z1, z2 the distances from the two lines in sigma, towards growing r and growing c, the light is
+
+    x = +-(E(z1) E(z2) + 4 rho phi(z1) phi(z2) + ...) Q
+
+with the sign of the square between them, rho the cosine between the normals, and Q fading the edges out
+towards the parallel lines on both sides where these are near. The pixels are those of two strips along
+the two lines, each taking the pixels that are nearer to its own line: all that carry information.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fit_map import SmoothMap
+from neurocal_cli.detection.fit_newton import Fit, Linear, Prior, Shape, gauss_newton
+from neurocal_cli.detection.fit_profile import erf_and_density, profile, response
+from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines
+from neurocal_cli.geometry import Array
+
+__all__ = ["FIRST", "SECOND", "VertexData", "fit_vertices", "linearised", "vertex_data", "vertex_lines"]
+
+Single = NDArray[np.float32]
+
+# Values of a vertex's fit: offset [px] and tilt [px over the half length] of the line along c and of that
+# along r, then those of `Fit`.
+FIRST, SECOND = 0, 2
+_ALONE = 9.0  # sigma to the next parallel line, beyond which it cannot be noticed
+
+
+@dataclass(frozen=True, eq=False)
+class VertexData:
+    """What the fits need of the pixels; (V, N) float32 arrays.
+
+    Attributes
+    ----------
+    s1, d1, s2, d2 : arrays [px]
+        Tangential and normal coordinates of both lines.
+    value : array [DN]
+        Less the slopes' share of A.
+    gain : array
+        B(u, v) relative to the vertex's own.
+    Q : array
+        With the sign of the square.
+    rho : (V, 1) array
+    weight : array [1/DN^2]
+    """
+
+    s1: Single
+    d1: Single
+    s2: Single
+    d2: Single
+    value: Single
+    gain: Single
+    Q: Single
+    rho: Single
+    weight: Single
+
+
+def vertex_lines(at: SmoothMap, grid: Array) -> tuple[Lines, Lines]:
+    """The lines along c and along r through vertices (V, 2), half a square to both sides.
+
+    Their normals point to growing r and growing c.
+    """
+    ones = np.ones(len(grid))
+    flat = np.zeros(len(grid), dtype=np.bool_)
+    return grid_lines(at, grid, flat, ones), grid_lines(at, grid, ~flat, ones)
+
+
+def vertex_data(
+    image: NDArray[np.generic],
+    lines: tuple[Lines, Lines],
+    light: Array,
+    sigma: Array,
+    reach: float,
+    slopes: tuple[Array, Array],
+    contrast: Array,
+) -> VertexData:
+    """Gather pixels for fits.
+
+    Parameters
+    ----------
+    image : (H, W) array
+    lines : pair of Lines
+    light : (V,) array
+        +1 where the square between the two normals is light, else -1.
+    sigma : (V,) array [px]
+        sigma_t.
+    reach : float
+        Half the strips' width, in sigma.
+    slopes : pair of (V, 2) arrays [DN/px]
+        Of A and B.
+    contrast : (V,) array [DN]
+        B where the slopes hold.
+    """
+    parts = []
+    for k in (0, 1):
+        half = np.minimum(reach * sigma, 0.5 * lines[k].width)
+        parts.append(gather(image, lines[k], half, np.zeros(len(half))))
+    u, v, value, inside = (
+        np.concatenate([getattr(part, name) for part in parts], axis=1)
+        for name in ("u", "v", "value", "inside")
+    )
+    (s1, d1), (s2, d2) = (_coordinates(line, u, v) for line in lines)
+    mine = np.abs(d1) <= np.abs(d2)
+    mine[:, parts[0].u.shape[1] :] ^= True
+    Q = np.ones_like(d1) * light.astype(np.float32)[:, None]
+    for line, d in zip(lines, (d1, d2), strict=True):
+        close = line.width < _ALONE * sigma
+        for side in (-1, 1):
+            t = (line.width[close, None] + side * d[close]) / sigma[close, None]
+            Q[close] *= erf_and_density(t.astype(np.float32))[0]
+    slope_a, slope_b = (g.astype(np.float32) for g in slopes)
+    value = np.asarray(value - u * slope_a[:, :1] - v * slope_a[:, 1:], dtype=np.float32)
+    relative = slope_b / contrast.astype(np.float32)[:, None]
+    gain = 1 + u * relative[:, :1] + v * relative[:, 1:]
+    rho = (lines[0].normal * lines[1].normal).sum(axis=1).astype(np.float32)[:, None]
+    return VertexData(s1, d1, s2, d2, value, gain, Q, rho, (inside & mine).astype(np.float32))
+
+
+def _coordinates(lines: Lines, u: Single, v: Single) -> tuple[Single, Single]:
+    t, n = lines.tangent.astype(np.float32), lines.normal.astype(np.float32)
+    s = u * t[:, :1] + v * t[:, 1:]
+    d = u * n[:, :1] + v * n[:, 1:]
+    d -= (0.5 * lines.curvature[:, None]).astype(np.float32) * s * s
+    return s, d
+
+
+def fit_vertices(
+    data: VertexData, start: Array, prior: Prior, half_length: tuple[Array, Array], shape: Shape, steps: int
+) -> Fit:
+    """Gauss-Newton steps of all vertices at once.
+
+    Parameters
+    ----------
+    data : VertexData
+    start : (V, 7) array
+        Offset and tilt of the first and of the second line, and the values of `Fit`.
+    prior : Prior
+    half_length : pair of (V,) arrays [px]
+    shape : Shape
+        With the tails (V, 2) of the vertices.
+    steps : int
+    """
+    levers = (
+        data.s1 / half_length[0].astype(np.float32)[:, None],
+        data.s2 / half_length[1].astype(np.float32)[:, None],
+    )
+
+    def model(values: Array) -> Linear:
+        return linearised(data, levers, values, shape)
+
+    return gauss_newton(model, start, prior, data.weight, steps)
+
+
+def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, shape: Shape) -> Linear:
+    """The model and its derivatives; ``levers`` are s over the half lengths."""
+    offset1, tilt1, offset2, tilt2, mean, contrast, sigma = (x.astype(np.float32)[:, None] for x in values.T)
+    z1 = (data.d1 - offset1 - tilt1 * levers[0]) / sigma
+    z2 = (data.d2 - offset2 - tilt2 * levers[1]) / sigma
+    E1, slope1, density1 = profile(z1, shape.tails)
+    E2, slope2, density2 = profile(z2, shape.tails)
+    rho = data.rho
+    # The tetrachoric series of two correlated normal variables, to the second order.
+    both = 4 * rho * density1 * density2
+    series = both * (1 + 0.5 * rho * z1 * z2)
+    x = (E1 * E2 + series) * data.Q
+    by_z1 = (slope1 * E2 - z1 * series + 0.5 * both * rho * z2) * data.Q
+    by_z2 = (slope2 * E1 - z2 * series + 0.5 * both * rho * z1) * data.Q
+    F, steep = response(x, shape.bend)
+    factor = -contrast / sigma * steep * data.gain
+    by_z1 *= factor
+    by_z2 *= factor
+    jacobian = np.empty((len(x), 7, x.shape[1]), dtype=np.float32)
+    jacobian[:, FIRST], jacobian[:, FIRST + 1] = by_z1, by_z1 * levers[0]
+    jacobian[:, SECOND], jacobian[:, SECOND + 1] = by_z2, by_z2 * levers[1]
+    jacobian[:, 4] = 1
+    jacobian[:, 5] = F * data.gain
+    jacobian[:, 6] = by_z1 * z1 + by_z2 * z2
+    residual = data.value - mean - contrast * jacobian[:, 5]
+    z = np.where(np.abs(z1) < np.abs(z2), z1, z2)
+    return Linear(jacobian, residual, z, x)
