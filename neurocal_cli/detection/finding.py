@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.find_accept import has_block, is_board
 from neurocal_cli.detection.find_claims import disputed, distinct
 from neurocal_cli.detection.find_fold import joined, unfolded
 from neurocal_cli.detection.find_grow import Lattice, cleaned, grown, smoothing
@@ -62,9 +63,9 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
 def _separated(level: Level, lattices: list[Lattice]) -> list[Lattice]:
     """Grids of one plane each."""
     lattices = disputed(distinct(lattices))
-    flat = [part for x in lattices for part in unfolded(x) if _is_board(part)]
+    flat = [part for x in lattices for part in unfolded(x) if has_block(part)]
     whole = [cleaned(level, grown(level, x, outwards=False)) for x in distinct(flat)]
-    return [x for x in whole if _is_board(x)]
+    return [x for x in whole if is_board(level, x)]
 
 
 def _area(pixels: Array) -> float:
@@ -88,7 +89,8 @@ def _new(level: Level, known: list[Lattice]) -> list[Lattice]:
         if not free[seed].all():
             continue
         free[seed] = False
-        boards = _boards(cleaned(level, grown(level, _planted(saddles, seed))))
+        grid = cleaned(level, grown(level, _planted(saddles, seed)))
+        boards = [part for part in _boards(grid) if is_board(level, part)]
         if boards:
             found += boards
             free &= _covered(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
@@ -128,13 +130,4 @@ def _covered(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
 
 def _boards(lattice: Lattice) -> list[Lattice]:
     """Parts of a lattice that are boards."""
-    return [part for part in joined(lattice) if _is_board(part)]
-
-
-def _is_board(lattice: Lattice) -> bool:
-    """Whether a block of 3 x 3 vertices is known."""
-    seen = lattice.seen
-    if min(seen.shape) < 3:
-        return False
-    rows = seen[:-2] & seen[1:-1] & seen[2:]
-    return bool((rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]).any())
+    return [part for part in joined(lattice) if has_block(part)]

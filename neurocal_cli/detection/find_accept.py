@@ -1,0 +1,69 @@
+"""Whether a lattice is a chessboard, or something in the clutter that resembles one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.detection.find_grow import Lattice, signs
+from neurocal_cli.detection.find_levels import Level, sampled
+from neurocal_cli.detection.find_predict import expected
+from neurocal_cli.geometry import Array
+
+__all__ = ["has_block", "is_board"]
+
+_ASIDE = 0.16  # squares; to either side of an edge, half-way between two vertices
+_LEAST_EDGE = 0.3  # of the contrast, across an edge
+_EDGES = 0.9  # share of the edges that are seen
+# Vertices may be off from where their neighbours put them, rms, by so many squares and px, and by
+# so many px per ratio of the noise (of second derivatives) to the contrast.
+_OFF, _OFF_PX, _OFF_NOISE = 0.021, 0.09, 20.0
+
+
+def has_block(lattice: Lattice) -> bool:
+    """Whether a block of 3 x 3 vertices is known: below that no line is tested by a third vertex."""
+    seen = lattice.seen
+    if min(seen.shape) < 3:
+        return False
+    rows = seen[:-2] & seen[1:-1] & seen[2:]
+    return bool((rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]).any())
+
+
+def is_board(level: Level, lattice: Lattice) -> bool:
+    """Whether a lattice has a block of vertices, its edges are in the image and its map is smooth."""
+    if not has_block(lattice):
+        return False
+    return roughness(level, lattice) < 1 and edges_seen(level, lattice) >= _EDGES
+
+
+def roughness(level: Level, lattice: Lattice) -> float:
+    """How far vertices are from where their neighbours put them, over what is tolerated."""
+    row, col = np.nonzero(lattice.seen)
+    at = expected(lattice.pixels, row, col)
+    off = at.in_squares(lattice.pixels[row, col] - at.points) / np.maximum(at.spread, 1.0)[:, None]
+    contrast = max(float(np.nanmedian(lattice.contrast)), 1e-3)
+    tolerated = _OFF + (_OFF_PX + _OFF_NOISE * level.noise / contrast) / max(float(np.median(at.width)), 1.0)
+    return float(np.sqrt((off**2).mean())) / tolerated
+
+
+def edges_seen(level: Level, lattice: Lattice) -> float:
+    """Share of the edges between neighbouring vertices across which dark and bright are told apart."""
+    held = [
+        _held(level, lattice.pixels, lattice.contrast, lattice.dark),
+        # With rows and columns exchanged, the squares on either side are too.
+        _held(level, lattice.pixels.transpose(1, 0, 2), lattice.contrast.T, lattice.dark),
+    ]
+    return float(np.concatenate(held).mean())
+
+
+def _held(level: Level, pixels: Array, contrast: Array, dark: int) -> Array:
+    """Whether each edge along a row is seen."""
+    known = np.isfinite(pixels[..., 0])
+    row, col = np.nonzero(known[:, :-1] & known[:, 1:])
+    start, end = pixels[row, col], pixels[row, col + 1]
+    across = 0.5 * (expected(pixels, row, col).r + expected(pixels, row, col + 1).r)
+    middle = 0.5 * (start + end)
+    sides = np.stack([middle + _ASIDE * across, middle - _ASIDE * across], axis=1)
+    value = sampled(level.smooth, sides)
+    rise = (value[:, 1] - value[:, 0]) * signs(row, col, dark)
+    usual = np.minimum(contrast[row, col], contrast[row, col + 1])
+    return np.asarray(rise > _LEAST_EDGE * usual)
