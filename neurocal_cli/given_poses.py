@@ -8,8 +8,8 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.network import Patterns
+from neurocal_cli.pixel_error import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.problems import intrinsic_matrix
-from neurocal_cli.refine import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.starts import FixedWeights, learn
 from neurocal_cli.views import Views
 

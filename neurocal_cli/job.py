@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import pinhole_coefficients
+from neurocal_cli.pixel_error import CameraState
 from neurocal_cli.problems import Known
-from neurocal_cli.refine import CameraState, Refined, refine
+from neurocal_cli.refine import Refined, refine
 from neurocal_cli.starts import Agreement
 from neurocal_cli.training import Task, Trained, Trainer
 from neurocal_cli.views import Views

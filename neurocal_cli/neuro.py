@@ -23,8 +23,9 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.given_poses import solve_given_poses
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.observability import parameter_count
+from neurocal_cli.pixel_error import CameraState, normal_blocks
 from neurocal_cli.random_cameras import find_camera, find_poses
-from neurocal_cli.refine import CameraState, Refined, normal_blocks
+from neurocal_cli.refine import Refined
 from neurocal_cli.rivals import (
     better_by_view,
     reaches_bound,

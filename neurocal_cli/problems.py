@@ -17,8 +17,8 @@ from neurocal_cli.camera import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import Lens
+from neurocal_cli.pixel_error import ENTRIES
 from neurocal_cli.points import Correspondences
-from neurocal_cli.refine import ENTRIES
 from neurocal_cli.views import Views
 
 __all__ = ["Known", "KnownCamera", "intrinsic_matrix", "known_for"]

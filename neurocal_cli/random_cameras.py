@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.network import Patterns
-from neurocal_cli.refine import CameraState, refine
+from neurocal_cli.pixel_error import CameraState
+from neurocal_cli.refine import refine
 from neurocal_cli.tiles import Tiles
 from neurocal_cli.views import Views
 

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array, orthonormalised
-from neurocal_cli.pixel_error import ENTRIES, POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.pixel_error import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.tiles import Tiles
 
-__all__ = ["ENTRIES", "CameraState", "Refined", "normal_blocks", "refine"]
+__all__ = ["Refined", "refine"]
 
 _TOLERANCE = 1e-9  # a step that would lower E by a smaller share is the last
 _FLOOR = 1e-13  # rms in normalised pixels that rounding alone accounts for

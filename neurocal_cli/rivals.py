@@ -17,7 +17,8 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.job import Job
 from neurocal_cli.observability import parameter_count
-from neurocal_cli.refine import CameraState, Refined, normal_blocks, refine
+from neurocal_cli.pixel_error import CameraState, normal_blocks
+from neurocal_cli.refine import Refined, refine
 from neurocal_cli.stage_networks import Group
 
 __all__ = [

@@ -9,8 +9,8 @@ import numpy as np
 from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job
 from neurocal_cli.orthogonality import pose_from_product, shared_intrinsics
+from neurocal_cli.pixel_error import CameraState
 from neurocal_cli.problems import intrinsic_matrix
-from neurocal_cli.refine import CameraState
 from neurocal_cli.stage_networks import Group
 
 __all__ = ["cameras_from_products", "candidate_intrinsics"]

@@ -11,8 +11,8 @@ import numpy as np
 
 from neurocal_cli.geometry import nearest_rotation
 from neurocal_cli.job import Job
+from neurocal_cli.pixel_error import ENTRIES, CameraState
 from neurocal_cli.problems import intrinsic_matrix
-from neurocal_cli.refine import ENTRIES, CameraState
 from neurocal_cli.training import Task
 
 __all__ = ["train_constrained"]

@@ -8,9 +8,10 @@ import numpy as np
 
 from neurocal_cli.camera import Intrinsics, Pose, project
 from neurocal_cli.geometry import Array
+from neurocal_cli.pixel_error import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, known_for
-from neurocal_cli.refine import ENTRIES, CameraState, normal_blocks, refine
+from neurocal_cli.refine import refine
 from neurocal_cli.uncertainty import covariance
 from neurocal_cli.views import Views, arrange
 

@@ -7,7 +7,7 @@ from scenes import Scene, table_1
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array
-from neurocal_cli.refine import normal_blocks
+from neurocal_cli.pixel_error import normal_blocks
 from neurocal_cli.uncertainty import covariance
 from neurocal_cli.views import arrange
 

@@ -10,8 +10,8 @@ from scenes import table_1
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
+from neurocal_cli.pixel_error import ENTRIES
 from neurocal_cli.problems import known_for
-from neurocal_cli.refine import ENTRIES
 from neurocal_cli.views import arrange
 
 SCENE = table_1()

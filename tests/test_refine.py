@@ -10,8 +10,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.pixel_error import CameraState, normal_blocks
 from neurocal_cli.problems import intrinsic_matrix
-from neurocal_cli.refine import CameraState, normal_blocks, refine
+from neurocal_cli.refine import refine
 from neurocal_cli.tiles import Tiles, tile
 
 FREE = {

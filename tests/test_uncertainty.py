@@ -12,7 +12,7 @@ from neurocal_cli import Correspondences, calibrate
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
 from neurocal_cli.geometry import Array
-from neurocal_cli.refine import CameraState, normal_blocks
+from neurocal_cli.pixel_error import CameraState, normal_blocks
 from neurocal_cli.uncertainty import covariance
 from neurocal_cli.views import arrange
 
