@@ -9,7 +9,7 @@ from neurocal_cli.detection.find_levels import Level, sampled
 from neurocal_cli.detection.find_predict import expected
 from neurocal_cli.geometry import Array
 
-__all__ = ["has_block", "is_board"]
+__all__ = ["edges_seen", "has_block", "is_smooth"]
 
 _ASIDE = 0.16  # squares; to either side of an edge, half-way between two vertices
 _LEAST_EDGE = 0.3  # of the contrast, across an edge
@@ -28,11 +28,9 @@ def has_block(lattice: Lattice) -> bool:
     return bool((rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]).any())
 
 
-def is_board(level: Level, lattice: Lattice) -> bool:
-    """Whether a lattice has a block of vertices, its edges are in the image and its map is smooth."""
-    if not has_block(lattice):
-        return False
-    return roughness(level, lattice) < 1 and edges_seen(level, lattice) >= _EDGES
+def is_smooth(level: Level, lattice: Lattice) -> bool:
+    """Whether vertices are where their neighbours put them, as well as noise allows."""
+    return roughness(level, lattice) < 1
 
 
 def roughness(level: Level, lattice: Lattice) -> float:
@@ -45,14 +43,14 @@ def roughness(level: Level, lattice: Lattice) -> float:
     return float(np.sqrt((off**2).mean())) / tolerated
 
 
-def edges_seen(level: Level, lattice: Lattice) -> float:
-    """Share of the edges between neighbouring vertices across which dark and bright are told apart."""
+def edges_seen(level: Level, lattice: Lattice) -> bool:
+    """Whether dark and bright are told apart across the edges between neighbouring vertices."""
     held = [
         _held(level, lattice.pixels, lattice.contrast, lattice.dark),
         # With rows and columns exchanged, the squares on either side are too.
         _held(level, lattice.pixels.transpose(1, 0, 2), lattice.contrast.T, lattice.dark),
     ]
-    return float(np.concatenate(held).mean())
+    return float(np.concatenate(held).mean()) >= _EDGES
 
 
 def _held(level: Level, pixels: Array, contrast: Array, dark: int) -> Array:

@@ -35,6 +35,8 @@ def disputed(lattices: list[Lattice]) -> list[Lattice]:
     Of two planes that meet at a fold each may have grown to the fold and a little beyond it.
     """
     result = list(lattices)
+    if len(result) < 2:
+        return result
     for _ in range(2):
         claims = [_claim(x) for x in result]
         for i, lattice in enumerate(result):

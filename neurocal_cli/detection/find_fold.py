@@ -38,7 +38,7 @@ def unfolded(lattice: Lattice) -> list[Lattice]:
     if len(whole) != 1:
         return [part for piece in whole for part in unfolded(piece)]
     lattice = whole[0]
-    row, col = _fold(lattice.pixels), _fold(lattice.pixels.transpose(1, 0, 2))
+    row, col = _folds(lattice)
     if row[1] == 0 and col[1] == 0:
         return [lattice]
     pixels = lattice.pixels if row[1] >= col[1] else lattice.pixels.transpose(1, 0, 2)
@@ -68,18 +68,45 @@ def joined(lattice: Lattice) -> list[Lattice]:
     return [_restricted(lattice, label == k) for k in range(1, count)]
 
 
-def _fold(pixels: Array) -> tuple[float, float]:
-    """Position among the rows of the sharpest bend that is a fold, and its size; (0, 0) without."""
-    rows = len(pixels)
+def _folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The sharpest folds along a row and along a column, see `_fold`."""
+    pixels = lattice.pixels
+    row, col = np.nonzero(lattice.seen)
+    at = expected(pixels, row, col)
+    width = max(float(np.median(at.width)), 1.0)
+    folds = []
+    for axis in (0, 1):
+        line = np.moveaxis(pixels, axis, 0)
+        second = np.full(line.shape, np.nan)
+        second[1:-1] = line[2:] - 2 * line[1:-1] + line[:-2]
+        index = (row, col) if axis == 0 else (col, row)
+        second[index] = at.in_squares(second[index])
+        folds.append(_fold(second, width))
+    return folds[0], folds[1]
+
+
+def _fold(second: Array, width: float) -> tuple[float, float]:
+    """Find the sharpest bend that is a fold.
+
+    Parameters
+    ----------
+    second : (rows, cols, 2) array [squares]
+        Second differences along the columns, nan where unknown.
+    width : float [px]
+        Of the squares.
+
+    Returns
+    -------
+    position, size : float
+        Among the rows, and in squares; (0, 0) without a fold.
+    """
+    rows = len(second)
     if rows < _LEAST_ROWS:
         return 0.0, 0.0
-    second, width = _second_differences(pixels)
-    before, after = np.full_like(second, np.nan), np.full_like(second, np.nan)
-    before[1:], after[:-1] = second[:-1], second[1:]
+    before, after, far = (np.full_like(second, np.nan) for _ in range(3))
+    before[1:], after[:-1], far[:-2] = second[:-1], second[1:], second[2:]
     at = _size(_against(second, before, after))
     # Between row i and i + 1.
-    far = np.full_like(second, np.nan)
-    far[:-2] = second[2:]
     between = _BETWEEN * _size(_against(0.5 * (second + after), before, far))
     size = np.stack([at, between], axis=-1).ravel()
     best = int(size.argmax())
@@ -90,16 +117,6 @@ def _fold(pixels: Array) -> tuple[float, float]:
     if size[best] < min(least):
         return 0.0, 0.0
     return 0.5 * best, float(size[best])
-
-
-def _second_differences(pixels: Array) -> tuple[Array, float]:
-    """(rows, cols, 2) along the columns [squares], nan at the ends; and the squares' width [px]."""
-    second = np.full(pixels.shape, np.nan)
-    second[1:-1] = pixels[2:] - 2 * pixels[1:-1] + pixels[:-2]
-    row, col = np.nonzero(np.isfinite(pixels[..., 0]))
-    at = expected(pixels, row, col)
-    second[row, col] = at.in_squares(second[row, col])
-    return second, max(float(np.median(at.width)), 1.0)
 
 
 def _against(values: Array, first: Array, second: Array) -> Array:

@@ -18,7 +18,7 @@ __all__ = ["Lattice", "cleaned", "cropped", "framed", "frontier", "grown", "sign
 Index = NDArray[np.intp]
 
 _SEARCHED = 0.24  # squares to either side of where a vertex is expected
-_STEPS = 9
+_STEPS = 7
 _MOST_SPREAD = 5.0  # of an expectation that is worth looking at
 _OFF, _OFF_SPREAD, _OFF_PX = 0.06, 0.03, 0.45  # squares, squares per spread, px: see `_tolerance`
 _WEAKEST = 0.55  # least contrast over the neighbours'
@@ -52,8 +52,12 @@ class Lattice:
     @property
     def width(self) -> float:
         """Median of the squares' narrower widths [px]."""
-        row, col = np.nonzero(self.seen)
-        return float(np.median(expected(self.pixels, row, col).width))
+        p = self.pixels
+        c, r = p[:-1, 1:] - p[:-1, :-1], p[1:, :-1] - p[:-1, :-1]
+        area = np.abs(c[..., 0] * r[..., 1] - c[..., 1] * r[..., 0])
+        longest = np.sqrt(np.maximum((c**2).sum(axis=-1), (r**2).sum(axis=-1)))
+        known = np.isfinite(area) & (longest > 0)
+        return float(np.median(area[known] / longest[known])) if known.any() else 0.0
 
 
 def signs(row: Index, col: Index, dark: int) -> Array:
@@ -77,7 +81,7 @@ def grown(level: Level, lattice: Lattice, outwards: bool = True) -> Lattice:
             origin = origin + shift
         row, col = frontier(lattice)
         # A place is looked at again only when it has more neighbours than before.
-        support = _support(lattice.seen, row, col)
+        support = _around(lattice.seen)[row, col]
         keys = list(
             zip((row - origin[0]).tolist(), (col - origin[1]).tolist(), support.tolist(), strict=True)
         )
@@ -138,10 +142,6 @@ def frontier(lattice: Lattice) -> tuple[Index, Index]:
     return row, col
 
 
-def _support(seen: NDArray[np.bool_], row: Index, col: Index) -> Array:
-    return np.asarray(_around(_around(seen) > 0)[row, col] + 100 * _around(seen)[row, col])
-
-
 def _layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: float) -> tuple[Lattice, int]:
     """Look for vertices at places of a lattice."""
     at = expected(lattice.pixels, row, col)
@@ -150,7 +150,7 @@ def _layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: float)
     if not len(row):
         return lattice, 0
     dark = signs(row, col, lattice.dark)
-    points = settle(level.image, _searched(level, at, dark), sigma)
+    points = settle(level.image, _searched(level, at, dark), sigma, rounds=2)
     good = np.isfinite(points[:, 0])
     points = np.where(good[:, None], points, at.points)
     off = np.abs(at.in_squares(points - at.points)).max(axis=1)

@@ -19,7 +19,7 @@ __all__ = ["Level", "levels_of", "sampled"]
 Image = NDArray[np.float32]
 
 _SMOOTHING = 1.0  # px; of the picture that is looked at, against noise and jagged edges
-_SMALLEST = 48  # px; the shorter side of the smallest level
+_SMALLEST = 100  # px; the shorter side of the smallest level
 _LEAST_NOISE = 0.12  # DN of a second derivative; what rounding to 8 bits leaves
 
 
@@ -55,7 +55,7 @@ class Level:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of the second derivatives where nothing is [DN/px^2]."""
-        sparse = np.abs(self.curvature[1][::3, ::3])
+        sparse = np.abs(self.curvature[1][::4, ::4])
         return max(float(np.median(sparse)) / 0.6745, _LEAST_NOISE)
 
 

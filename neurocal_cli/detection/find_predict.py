@@ -19,7 +19,7 @@ __all__ = ["Expected", "expected"]
 
 _REACH = 3  # squares
 _WIDTH = 1.4  # squares; of the weights
-_HELD = np.array([0.0, 1e-3, 1e-3, 0.15, 0.15, 0.15])
+_HELD_BACK = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])
 
 _c, _r = (x.ravel().astype(float) for x in np.meshgrid(*[np.arange(-_REACH, _REACH + 1)] * 2))
 _BASIS = np.stack([np.ones_like(_c), _c, _r, 0.5 * _c**2, _c * _r, 0.5 * _r**2], axis=-1)
@@ -85,13 +85,15 @@ def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Exp
     framed[_REACH:-_REACH, _REACH:-_REACH] = pixels
     size = 2 * _REACH + 1
     near = sliding_window_view(framed, (size, size), axis=(0, 1))[row, col].reshape(len(row), 2, -1)
-    known = np.isfinite(near[:, 0])
-    total = np.maximum(known.sum(axis=1), 1)
-    near = np.where(known[:, None], near, 0.0)
-    origin = near.sum(axis=2) / total[:, None]
-    near = np.where(known[:, None], near - origin[:, :, None], 0.0)
+    unknown = np.isnan(near[:, 0])
+    known = 1.0 - unknown
+    # About the mean of the neighbours, for the sake of rounding.
+    near[np.broadcast_to(unknown[:, None], near.shape)] = 0.0
+    origin = near.sum(axis=2) / np.maximum(known.sum(axis=1), 1.0)[:, None]
+    near -= origin[:, :, None] * known[:, None]
     normal = (known @ _PRODUCTS).reshape(-1, 6, 6)
-    normal[:, range(6), range(6)] += _HELD + 1e-9
+    normal += _HELD_BACK
     inverse = np.linalg.inv(normal)
-    solution = inverse @ (near @ _RIGHT).transpose(0, 2, 1)
+    right = (near.reshape(-1, near.shape[2]) @ _RIGHT).reshape(-1, 2, 6)
+    solution = inverse @ right.transpose(0, 2, 1)
     return Expected(solution[:, 0] + origin, solution[:, 1], solution[:, 2], np.sqrt(inverse[:, 0, 0]))

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.find_accept import has_block, is_board
+from neurocal_cli.detection.find_accept import edges_seen, has_block, is_smooth
 from neurocal_cli.detection.find_claims import disputed, distinct
 from neurocal_cli.detection.find_fold import joined, unfolded
 from neurocal_cli.detection.find_grow import Lattice, cleaned, grown, smoothing
@@ -47,12 +47,11 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
     """
     lattices: list[Lattice] = []
     levels = levels_of(image)
-    growing = [level for level in levels if level.image.size <= _REFINED]
+    growing = [level for level in levels if level.image.size <= _REFINED] or levels[-1:]
     for level in reversed(levels):
         lattices = [_finer(level, x) for x in lattices]
-        if level in growing:
-            lattices = [grown(level, x) for x in lattices]
-        lattices = [y for x in lattices for y in _boards(cleaned(level, x))]
+        if level is growing[0]:
+            lattices = [y for x in lattices for y in _boards(cleaned(level, grown(level, x)))]
         if level.image.size <= _SEARCHED or not lattices:
             lattices += _new(level, lattices)
         if level is levels[0] or level is growing[0]:
@@ -62,10 +61,14 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
 
 def _separated(level: Level, lattices: list[Lattice]) -> list[Lattice]:
     """Grids of one plane each."""
-    lattices = disputed(distinct(lattices))
-    flat = [part for x in lattices for part in unfolded(x) if has_block(part)]
-    whole = [cleaned(level, grown(level, x, outwards=False)) for x in distinct(flat)]
-    return [x for x in whole if is_board(level, x)]
+    result = []
+    for lattice in disputed(distinct(lattices)):
+        planes = [part for part in unfolded(lattice) if has_block(part)]
+        if len(planes) > 1 or (planes and planes[0].seen.sum() < lattice.seen.sum()):
+            # What was taken out at a fold for lying between two planes may belong to one.
+            planes = [cleaned(level, grown(level, x, outwards=False)) for x in planes]
+        result += [x for x in planes if has_block(x) and is_smooth(level, x)]
+    return distinct(result)
 
 
 def _area(pixels: Array) -> float:
@@ -90,7 +93,7 @@ def _new(level: Level, known: list[Lattice]) -> list[Lattice]:
             continue
         free[seed] = False
         grid = cleaned(level, grown(level, _planted(saddles, seed)))
-        boards = [part for part in _boards(grid) if is_board(level, part)]
+        boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_seen(level, x)]
         if boards:
             found += boards
             free &= _covered(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
