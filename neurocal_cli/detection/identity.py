@@ -26,6 +26,7 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity_ends import End, board_ends
 from neurocal_cli.detection.identity_fit import fit_camera, is_flat, motion
 from neurocal_cli.detection.identity_placement import Placement, placements
+from neurocal_cli.detection.identity_trim import trimmed
 from neurocal_cli.detection.identity_words import LOOKS_THE_SAME, NoBoardError, another_size, several_ways
 from neurocal_cli.geometry import Array
 
@@ -33,8 +34,9 @@ __all__ = ["Identified", "Located", "NoBoardError", "identify"]
 
 _CLEARLY = 3.0  # how many times worse than the best an arrangement must fit to be ruled out
 _NOISE = 0.05  # px; errors below this do not rule anything out
-_MISFIT = 0.35  # squares by which planes may miss where the board says they are: distortion, a bent board
+_MISFIT = 0.25  # squares by which planes may miss where the board says they are: distortion, a bent board
 _SAMPLES = 25  # vertices of a grid that are enough to tell how it lies
+_NEARER = 1.5  # how many times larger the squares of the board before the others of its size must look
 _KEPT = 200  # arrangements that are followed up when a further grid joins
 
 
@@ -90,7 +92,14 @@ def identify(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> 
     if not grids:
         raise NoBoardError("no board found; show it whole, sharp and evenly lit")
     chosen = _candidates(board, grids, grey)
-    kept, warnings = _settled(board, chosen, _consistent(board, chosen))
+    whole = [candidate for candidate in chosen if candidate.whole]
+    try:
+        kept, warnings = _settled(board, chosen, _consistent(board, chosen))
+    except NoBoardError:
+        if len(whole) in (0, len(chosen)):
+            raise
+        chosen = whole  # the others are no part of the board, or too small a part of it
+        kept, warnings = _settled(board, chosen, _consistent(board, chosen))
     located = [Located(c.grid, board.planes[p.plane], p) for c, p in zip(chosen, kept, strict=True)]
     return Identified(tuple(sorted(located, key=lambda one: one.placement.plane)), warnings)
 
@@ -115,7 +124,7 @@ class _Way:
 
 def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> list[_Candidate]:
     """Grids that can lie on the board, whole planes first; at most one for each plane."""
-    every = [_candidate(board, grid, grey) for grid in grids]
+    every = [_candidate(board, trimmed(grid, board.planes), grey) for grid in grids]
     usable = sorted((c for c in every if c.ways), key=lambda c: (-c.whole, -int(c.grid.seen.sum())))
     largest = max(every, key=lambda c: int(c.grid.seen.sum()))
     if len(board.planes) == 1 and not largest.ways:
@@ -123,12 +132,26 @@ def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) 
         usable = [c for c in usable if c.whole and set(c.ends.values()) == {End.BOARD}]
     if not usable:
         raise NoBoardError(another_size(board, largest.grid, list(largest.ends.values())))
-    room = len(board.planes)
-    whole = [c for c in usable if c.whole]
-    if len(whole) > room:
-        size = " x ".join(map(str, whole[0].grid.shape))
-        raise NoBoardError(f"{len(whole)} boards of {size} inner vertices found; show only one of them")
-    return usable[:room]
+    return (_foremost(board, usable) + [c for c in usable if not c.whole])[: len(board.planes)]
+
+
+def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate]:
+    """Whole planes, of each size as many as the board has: the nearest, where there is no doubt.
+
+    A board on a screen behind, or mirrored in a window, looks much smaller than the one that is held
+    before the camera.
+    """
+    kept: list[_Candidate] = []
+    for size in sorted({tuple(sorted((plane.cols, plane.rows))) for plane in board.planes}):
+        room = sum(tuple(sorted((plane.cols, plane.rows))) == size for plane in board.planes)
+        alike = [c for c in candidates if c.whole and tuple(sorted(c.grid.shape)) == size]
+        alike.sort(key=lambda c: -_square(c.grid))
+        if len(alike) > room and _square(alike[room - 1].grid) < _NEARER * _square(alike[room].grid):
+            raise NoBoardError(
+                f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices found; show only one of them"
+            )
+        kept += alike[:room]
+    return sorted(kept, key=lambda c: -int(c.grid.seen.sum()))
 
 
 def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidate:
@@ -152,7 +175,7 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Way]:
     """Ways for all grids together that one camera can see, the best one first."""
     flat = is_flat(np.concatenate([_corners(plane) for plane in board.planes]))
     front = board.planes[0].normal if flat else None
-    ways = [_Way(())]
+    ways, before = [_Way(())], 0.0
     for count, candidate in enumerate(chosen, start=1):
         longer = [
             (*way.placements, placement)
@@ -164,6 +187,9 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Way]:
         ways = sorted((way for way in ways if np.isfinite(way.rms)), key=lambda way: way.rms)
         if not ways:
             raise NoBoardError("the grids found do not lie as on the board; check the board's planes")
+        if not candidate.whole and count > 2 and ways[0].rms > _CLEARLY * max(before, _NOISE):
+            raise NoBoardError("a grid does not lie as any plane of the board; hide what is not the board")
+        before = ways[0].rms
         # What is bad with two planes may become the best with three, but not what is hopeless.
         limit = (_CLEARLY if count == len(chosen) else _CLEARLY**2) * max(ways[0].rms, _NOISE)
         ways = [way for way in ways if way.rms <= limit][: None if count == len(chosen) else _KEPT]
@@ -196,7 +222,7 @@ def _settled(
     """Choose among ways that geometry cannot tell apart: by colours, then by the image."""
     grids = [candidate.grid for candidate in chosen]
     if not all(_same_board(board, grids, ways[0], way) for way in ways[1:]):
-        raise NoBoardError(several_ways(board, grids))
+        raise NoBoardError(several_ways(board, grids, ways[0].rms))
     colours = [_colours(grids, way) for way in ways]
     left = [way for way, colour in zip(ways, colours, strict=True) if colour == max(colours)]
     if len(left) == 1:

@@ -38,8 +38,8 @@ def another_size(board: Board, grid: Grid, ends: Sequence[End]) -> str:
     )
 
 
-def several_ways(board: Board, grids: Sequence[Grid]) -> str:
-    """What to say of grids that can lie on the board in more ways than one."""
+def several_ways(board: Board, grids: Sequence[Grid], rms: float) -> str:
+    """What to say of grids that can lie on the board in more ways than one, the best to `rms` px."""
     sizes = [sorted((plane.cols, plane.rows)) for plane in board.planes]
     part = next((grid for grid in grids if sorted(grid.shape) not in sizes), None)
     if part is not None:
@@ -52,7 +52,10 @@ def several_ways(board: Board, grids: Sequence[Grid]) -> str:
             f"only {len(grids)} of the {len(board.planes)} planes found, which does not tell how they lie; "
             "show more of them"
         )
-    return "the planes fit together in more ways than one; take the image from nearer or more from the side"
+    return (
+        f"the planes fit together in more ways than one, to {rms:.2g} px; check the board's origins and axes "
+        "or take the image from nearer"
+    )
 
 
 def _sizes(board: Board) -> str:

@@ -1,0 +1,205 @@
+"""From one image to labelled points, and from several images to what a calibration learns from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.board import Board, Plane
+from neurocal_cli.detection.finding import find_grids
+from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
+from neurocal_cli.detection.identity import Located, identify
+from neurocal_cli.detection.identity_words import NoBoardError
+from neurocal_cli.detection.measuring import measure
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+
+__all__ = ["Detection", "Labels", "Points", "detect_points", "gather", "label"]
+
+Points = Literal["midpoints", "vertices"]
+
+_STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # from a point's index to the other end of its edge, by kind
+_PREFIXES = ("h:", "v:", "")  # of its id, by kind
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Points of a plane.
+
+    Attributes
+    ----------
+    plane : Plane
+    kind : (N,) int array
+        `EDGE_H` along the plane's x axis, `EDGE_V` along its y axis, or `VERTEX`.
+    place : (N, 2) int array
+        The vertex (c, r) that the id names.
+    """
+
+    plane: Plane
+    kind: NDArray[np.int64]
+    place: NDArray[np.int64]
+
+    @property
+    def ids(self) -> list[str]:
+        """``[plane/]h:c:r``, ``[plane/]v:c:r`` or ``[plane/]c:r``."""
+        prefixes = [self.plane.prefix + prefix for prefix in _PREFIXES]
+        return [
+            f"{prefixes[kind]}{c}:{r}"
+            for kind, (c, r) in zip(self.kind.tolist(), self.place.tolist(), strict=True)
+        ]
+
+    @property
+    def world(self) -> Array:
+        """(N, 3) array [the board's unit]."""
+        return self.plane.at(self.place + 0.5 * _STEPS[self.kind])
+
+    @property
+    def order(self) -> NDArray[np.intp]:
+        """The board's own order: by kind, row by row."""
+        return np.lexsort((self.place[:, 0], self.place[:, 1], self.kind))
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """The board's points in one image.
+
+    Attributes
+    ----------
+    ids : tuple of N str
+        The same for the same point of the board in all images, unless `warnings` says otherwise.
+    world : (N, 3) array [the board's unit]
+    pixels : (N, 2) array [px]
+    covariance : (N, 3) array [px^2]
+        suu, suv, svv.
+    image_size : (width, height) [px]
+    located : tuple of Located
+        The grids that were found on the board.
+    measured : tuple of Measured
+        What was measured on each of them.
+    warnings : tuple of str
+    """
+
+    ids: tuple[str, ...]
+    world: Array
+    pixels: Array
+    covariance: Array
+    image_size: tuple[int, int]
+    located: tuple[Located, ...]
+    measured: tuple[Measured, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def rejected(self) -> int:
+        """Number of points whose fit was not good enough."""
+        return sum(measured.rejected for measured in self.measured)
+
+
+def detect_points(
+    image: NDArray[np.generic],
+    board: Board,
+    points: Points = "midpoints",
+    gamma: float | None = None,
+    grids: list[Grid] | None = None,
+) -> Detection:
+    """Find a board in an image and measure its points.
+
+    Parameters
+    ----------
+    image : (height, width) array
+        Grey, of 8 or 16 bits.
+    board : Board
+    points : {"midpoints", "vertices"}
+        Mid-points of the squares' edges, or the inner vertices.
+    gamma : float, optional
+        Of the camera, where known: pixels are ``light^(1 / gamma)``.
+    grids : list of Grid, optional
+        What `find_grids` found in the image, if that is known already.
+
+    Raises
+    ------
+    NoBoardError
+        The image does not show the board, or not enough of it; with the reason.
+    """
+    found = find_grids(image) if grids is None else grids
+    identified = identify(board, found, image)
+    located = identified.located
+    measured = tuple(measure(image, one.grid, points, gamma) for one in located)
+    labels = [label(one, points_of) for one, points_of in zip(located, measured, strict=True)]
+    orders = [one.order for one in labels]
+    if not any(map(len, orders)):
+        raise NoBoardError("the board is too blurred or too small to measure; show it sharper or nearer")
+
+    def joined(parts: Iterable[Array]) -> Array:
+        return np.concatenate([part[order] for part, order in zip(parts, orders, strict=True)])
+
+    height, width = image.shape
+    return Detection(
+        tuple(joined(np.array(one.ids, dtype=object) for one in labels).tolist()),
+        joined(one.world for one in labels),
+        joined(one.pixels for one in measured),
+        joined(one.covariance for one in measured),
+        (width, height),
+        located,
+        measured,
+        identified.warnings,
+    )
+
+
+def label(located: Located, measured: Measured) -> Labels:
+    """Which points of a plane the measured points of a grid are.
+
+    Parameters
+    ----------
+    located : Located
+        The points' grid.
+    measured : Measured
+    """
+    steps = _STEPS[measured.kind]
+    first = located.placement.apply(measured.index)
+    second = located.placement.apply(measured.index + steps)
+    start = np.rint(np.minimum(first, second)).astype(np.int64)
+    along_x, along_y = np.rint(np.abs(second - first)).astype(bool).T
+    kind = np.where(along_x, EDGE_H, np.where(along_y, EDGE_V, VERTEX))
+    return Labels(located.plane, kind, start)
+
+
+def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Correspondences:
+    """Points of several images of one camera as one set.
+
+    Parameters
+    ----------
+    detections : dict of Detection by the name of the view
+    unit : str
+        The board's.
+
+    Raises
+    ------
+    InputError
+        No image, or images of different size: one camera has one size, and another camera's points
+        belong in a calibration of their own.
+    """
+    if not detections:
+        raise InputError("there are no images with points; give at least one")
+    names, found = list(detections), list(detections.values())
+    for name, one in zip(names, found, strict=True):
+        if one.image_size != found[0].image_size:
+            sizes = ["{} x {}".format(*each.image_size) for each in (one, found[0])]
+            raise InputError(
+                f"the image {name} has {sizes[0]} px but {names[0]} has {sizes[1]} px; detect the images of "
+                "each camera by themselves"
+            )
+    return Correspondences(
+        np.concatenate([one.world for one in found]),
+        np.concatenate([one.pixels for one in found]),
+        view=np.repeat(names, [len(one.ids) for one in found]),
+        image_size=found[0].image_size,
+        point=np.array([name for one in found for name in one.ids]),
+        covariance=np.concatenate([one.covariance for one in found]),
+        unit=unit,
+        source="detected points",
+    )
