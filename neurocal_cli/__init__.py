@@ -9,11 +9,15 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from neurocal_cli.board import Board
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.camera import Intrinsics, Pose
+    from neurocal_cli.detection.detect import detect_points
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.evaluation import evaluate_camera
+    from neurocal_cli.io.board_yaml import read_board
     from neurocal_cli.io.calibration_yaml import read_calibration, write_calibration
+    from neurocal_cli.io.images import read_image
     from neurocal_cli.io.points_csv import read_points, write_points
     from neurocal_cli.methods import calibrate
     from neurocal_cli.points import Correspondences
@@ -21,28 +25,36 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Board": "board",
     "Calibration": "calibration",
     "Correspondences": "points",
     "Intrinsics": "camera",
     "NeurocalError": "errors",
     "Pose": "camera",
     "calibrate": "methods",
+    "detect_points": "detection.detect",
     "evaluate_camera": "evaluation",
+    "read_board": "io.board_yaml",
     "read_calibration": "io.calibration_yaml",
+    "read_image": "io.images",
     "read_points": "io.points_csv",
     "write_calibration": "io.calibration_yaml",
     "write_points": "io.points_csv",
 }
 
 __all__ = [
+    "Board",
     "Calibration",
     "Correspondences",
     "Intrinsics",
     "NeurocalError",
     "Pose",
     "calibrate",
+    "detect_points",
     "evaluate_camera",
+    "read_board",
     "read_calibration",
+    "read_image",
     "read_points",
     "write_calibration",
     "write_points",

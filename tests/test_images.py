@@ -85,7 +85,7 @@ def test_the_exif_orientation_is_applied_as_opencv_does_and_said(
     np.testing.assert_array_equal(image.grey, expected)
     assert image.size == ((30, 40) if orientation >= 5 else (40, 30))
     assert len(image.notes) == (orientation != 1)
-    assert all(note.startswith("a.jpg: ") and "EXIF" in note for note in image.notes)
+    assert all("EXIF" in note for note in image.notes)
 
 
 def test_a_turned_image_is_upright() -> None:

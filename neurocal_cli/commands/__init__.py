@@ -25,6 +25,7 @@ __all__ = ["neurocal"]
 # stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
     "calibrate": "Calibrate a camera from known points and the pixels where they were seen.",
+    "detect": "Find chessboards in images and measure the mid-points of their squares' edges.",
     "evaluate": "Measure how good a result is.",
     "man": None,
 }
@@ -129,4 +130,5 @@ def neurocal() -> None:
       neurocal calibrate points.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
       cat points.csv | neurocal calibrate - | neurocal evaluate camera -
+      neurocal detect left*.png --cols 9 --rows 6 --square 25 -o points.csv
     """  # noqa: D301 - click's mark of a paragraph not to be wrapped

@@ -1,0 +1,190 @@
+"""Pictures of what was found, to judge at a glance: points, labels, residuals over the dimmed image."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from neurocal_cli.detection.detect import Detection, label
+from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
+from neurocal_cli.detection.identity import Located
+from neurocal_cli.detection.residuals import residuals
+from neurocal_cli.geometry import Array
+
+__all__ = ["draw_detection", "draw_failure"]
+
+Picture = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+_WIDTH = 1500  # px of a picture, as near as whole factors allow
+_LINE = 26  # px, height of a line of text
+_CHARACTER = 10  # px, width of a character, nearly
+_SHIFT = 4  # binary digits of drawn coordinates behind the point
+_ARROW = 0.25  # of a square, for a typical residual
+_SCALES = tuple(m * 10**e for e in range(6) for m in (1, 2, 5))
+
+_KINDS: dict[int, tuple[str, Colour]] = {
+    EDGE_H: ("h", (255, 170, 0)),
+    EDGE_V: ("v", (0, 220, 255)),
+    VERTEX: ("vertex", (120, 255, 120)),
+}
+_RESIDUAL: Colour = (255, 70, 70)
+_WHITE: Colour = (255, 255, 255)
+_X_AXIS: Colour = (255, 60, 200)
+_Y_AXIS: Colour = (150, 255, 0)
+_GRIDS: tuple[Colour, ...] = ((255, 170, 0), (0, 220, 255), (120, 255, 120), (255, 60, 200), (255, 255, 90))
+
+
+def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
+    """Draw the points of a detection.
+
+    Crosses are the measured points, coloured by kind. The red lines are residuals from a smooth map
+    of the plane (a homography and a cubic for the lens), enlarged as the title says. The circle is
+    vertex (0, 0) with the axes of the plane; ids stand at the corners.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+    detection : Detection
+
+    Returns
+    -------
+    picture : (height, width, 3) uint8 array
+        Red, green, blue.
+    """
+    misses = [residuals(measured) for measured in detection.measured]
+    lengths = np.concatenate([np.hypot(*miss.T) for miss in misses])
+    square = min(_square(one.grid) for one in detection.located)
+    scale = _enlargement(lengths, square)
+    lines = [
+        f"{len(detection.ids)} points, {detection.rejected} rejected; residuals x {scale}: rms "
+        f"{np.sqrt((lengths**2).mean()):.3g} px, largest {lengths.max():.3g} px",
+        _legend(detection),
+    ]
+    canvas = _Canvas(grey, lines)
+    for located, measured, miss in zip(detection.located, detection.measured, misses, strict=True):
+        _draw_points(canvas, measured, label(located, measured).kind, miss * scale)
+        _draw_frame(canvas, located, measured)
+    return canvas.picture
+
+
+def draw_failure(grey: NDArray[np.generic], grids: Sequence[Grid], problem: str) -> Picture:
+    """Draw the grids that were found where they were not the board, and say why.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+    grids : sequence of Grid
+    problem : str
+    """
+    sizes = ", ".join("{} x {}".format(*grid.shape) for grid in grids) or "none"
+    canvas = _Canvas(grey, [problem, f"grids found: {sizes}"])
+    for k, grid in enumerate(grids):
+        for pixel in grid.pixels[grid.seen]:
+            canvas.cross(pixel, _GRIDS[k % len(_GRIDS)])
+    return canvas.picture
+
+
+def _draw_points(canvas: _Canvas, measured: Measured, kinds: NDArray[np.int64], arrows: Array) -> None:
+    for pixel, arrow in zip(measured.pixels, arrows, strict=True):
+        canvas.line(pixel, pixel + arrow, _RESIDUAL)
+    for kind, pixel in zip(kinds.tolist(), measured.pixels, strict=True):
+        canvas.cross(pixel, _KINDS[kind][1])
+
+
+def _draw_frame(canvas: _Canvas, located: Located, measured: Measured) -> None:
+    """Origin, axes and the ids of the corners, at the vertices that were seen."""
+    pixels = np.where(np.isfinite(measured.vertices), measured.vertices, located.grid.pixels)
+    rows, columns = np.nonzero(np.isfinite(pixels[..., 0]))
+    places = np.rint(located.placement.apply(np.stack([columns, rows], axis=-1))).astype(int)
+    at = {(x, y): pixels[r, c] for (x, y), r, c in zip(places.tolist(), rows, columns, strict=True)}
+    for axis, (colour, name) in enumerate(((_X_AXIS, "x"), (_Y_AXIS, "y"))):
+        tip = (2, 0) if axis == 0 else (0, 2)
+        if (0, 0) in at and tip in at:
+            canvas.arrow(at[0, 0], at[tip], colour)
+            canvas.text(at[tip], name, colour)
+    if (0, 0) in at:
+        canvas.circle(at[0, 0], _WHITE)
+    for key in sorted({min(at, key=lambda p: p[0] * a + p[1] * b) for a in (-1, 1) for b in (-1, 1)}):
+        canvas.text(at[key], f"{located.plane.prefix}{key[0]}:{key[1]}", _WHITE)
+
+
+def _legend(detection: Detection) -> str:
+    pairs = zip(detection.located, detection.measured, strict=True)
+    every = np.concatenate([label(located, measured).kind for located, measured in pairs])
+    counts = {kind: int((every == kind).sum()) for kind in _KINDS}
+    colours = {EDGE_H: "orange", EDGE_V: "cyan", VERTEX: "green"}
+    kinds = [f"{_KINDS[kind][0]} {colours[kind]} ({n})" for kind, n in counts.items() if n]
+    offsets = ", ".join(f"{measured.polarity:+.3f}" for measured in detection.measured)
+    return f"{', '.join(kinds)}; edges displaced by {offsets} px before correction"
+
+
+def _enlargement(lengths: Array, square: float) -> int:
+    typical = max(float(np.median(lengths)), 1e-9)
+    return max((scale for scale in _SCALES if scale * typical <= _ARROW * square), default=1)
+
+
+def _square(grid: Grid) -> float:
+    steps = [np.hypot(*np.moveaxis(np.diff(grid.pixels, axis=k), -1, 0)) for k in (0, 1)]
+    return float(min(np.nanmedian(step) for step in steps))
+
+
+class _Canvas:
+    """A dimmed image under lines of text, drawn on in the image's own coordinates."""
+
+    def __init__(self, grey: NDArray[np.generic], lines: Sequence[str]) -> None:
+        height, width = grey.shape
+        self.scale = max(1, _WIDTH // width) if width <= _WIDTH else _WIDTH / width
+        size = (max(1, round(width * self.scale)), max(1, round(height * self.scale)))
+        method = cv2.INTER_AREA if self.scale < 1 else cv2.INTER_NEAREST
+        small = cv2.resize(_dimmed(grey), size, interpolation=method)
+        room = max(10, (size[0] - 12) // _CHARACTER)
+        texts = [line[k : k + room] for line in lines for k in range(0, len(line), room)]
+        self.top = _LINE * len(texts) + 8
+        self.picture = np.zeros((size[1] + self.top, size[0], 3), dtype=np.uint8)
+        self.picture[self.top :] = small[..., None]
+        for k, text in enumerate(texts):
+            _put(self.picture, text, (6, _LINE * (k + 1) - 6), _WHITE, 0.55)
+
+    def line(self, start: ArrayLike, stop: ArrayLike, colour: Colour) -> None:
+        cv2.line(self.picture, self._at(start), self._at(stop), colour, 1, cv2.LINE_AA, _SHIFT)
+
+    def cross(self, pixel: ArrayLike, colour: Colour) -> None:
+        u, v = self._at(pixel)
+        arm = 3 << _SHIFT
+        cv2.line(self.picture, (u - arm, v), (u + arm, v), colour, 1, cv2.LINE_AA, _SHIFT)
+        cv2.line(self.picture, (u, v - arm), (u, v + arm), colour, 1, cv2.LINE_AA, _SHIFT)
+
+    def circle(self, pixel: ArrayLike, colour: Colour) -> None:
+        cv2.circle(self.picture, self._at(pixel), 8 << _SHIFT, colour, 2, cv2.LINE_AA, _SHIFT)
+
+    def arrow(self, start: ArrayLike, stop: ArrayLike, colour: Colour) -> None:
+        cv2.arrowedLine(self.picture, self._at(start), self._at(stop), colour, 2, cv2.LINE_AA, _SHIFT, 0.12)
+
+    def text(self, pixel: ArrayLike, text: str, colour: Colour) -> None:
+        u, v = self._at(pixel)
+        _put(self.picture, text, ((u >> _SHIFT) + 7, (v >> _SHIFT) - 7), colour, 0.5)
+
+    def _at(self, pixel: ArrayLike) -> tuple[int, int]:
+        """Place in the picture, in units of 1/16 px; the middle of a pixel stays the middle."""
+        u, v = (np.asarray(pixel) + 0.5) * self.scale - 0.5
+        limit = 1 << 24  # a wild residual must not overflow
+        u, v = np.clip([u, v + self.top], -limit >> _SHIFT, limit >> _SHIFT)
+        return round(float(u) * (1 << _SHIFT)), round(float(v) * (1 << _SHIFT))
+
+
+def _dimmed(grey: NDArray[np.generic]) -> Picture:
+    """Grey values between 20 and 130, in steps of 5: less to store, and nothing to outshine the crosses."""
+    step = max(1, max(grey.shape) // 500)
+    low, high = np.percentile(grey[::step, ::step].astype(float), [1, 99])
+    share = np.clip((grey.astype(np.float32) - low) / max(float(high - low), 1.0), 0, 1)
+    return (20 + 5 * np.rint(22 * share)).astype(np.uint8)
+
+
+def _put(picture: Picture, text: str, place: tuple[int, int], colour: Colour, size: float) -> None:
+    plain = text.encode("ascii", "replace").decode()  # the font knows no other characters
+    cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, (0, 0, 0), 3, cv2.LINE_AA)
+    cv2.putText(picture, plain, place, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)

@@ -1,0 +1,247 @@
+"""``neurocal detect``: what is written, what is said, and how it ends."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from click.testing import Result
+from command_line import run
+
+from neurocal_cli import read_points
+
+SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
+BOARD = ("--cols", 9, "--rows", 6, "--square", 25)
+
+
+def detect(*words: object) -> Result:
+    return run("detect", *words)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Three sample images in a folder of their own."""
+    images = tmp_path / "images"
+    images.mkdir()
+    for k in (1, 2, 3):
+        shutil.copy(SAMPLES / f"board{k:02d}.png", images)
+    return images
+
+
+def png(width: int, height: int) -> bytes:
+    """Header of a PNG that claims a size."""
+
+    def chunk(kind: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", zlib.compress(b"")) + chunk(b"IEND", b"")
+
+
+def write(path: Path, picture: np.ndarray) -> None:
+    path.write_bytes(cv2.imencode(path.suffix, picture)[1].tobytes())
+
+
+def test_points_of_all_images_go_to_a_file(folder: Path, tmp_path: Path) -> None:
+    result = detect(folder, *BOARD, "-o", tmp_path / "p.csv")
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert result.stderr == "found the board in 3 of 3 images: 279 points, 0 rejected\n"
+    text = (tmp_path / "p.csv").read_text()
+    head = "# image_size: 400 300\n# unit: mm\nview,point,X,Y,Z,u,v,suu,suv,svv\nboard01,h:0:0,12.5,0.0,0.0,"
+    assert text.startswith(head)
+    points = read_points(tmp_path / "p.csv")
+    assert points.view_names == ("board01", "board02", "board03")
+    assert points.covariance is not None
+
+
+def test_points_go_to_stdout_and_the_rest_to_stderr(folder: Path) -> None:
+    result = detect(f"{folder}/board0*.png", *BOARD, "--unit", "inch")
+    assert result.exit_code == 0
+    assert result.stdout.startswith("# image_size: 400 300\n# unit: inch\n")
+    assert len(result.stdout.splitlines()) == 3 + 279
+
+
+def test_any_number_of_jobs_writes_the_same_bytes(folder: Path, tmp_path: Path) -> None:
+    (folder / "bad.png").write_bytes(b"x")
+    one = detect(folder, *BOARD, "--jobs", 1, "--overlay", tmp_path / "one")
+    two = detect(folder, *BOARD, "--jobs", 2, "--overlay", tmp_path / "two")
+    assert one.exit_code == two.exit_code == 0
+    assert (one.stdout, one.stderr) == (two.stdout, two.stderr)
+    for name in ("board01.png", "board02.png", "board03.png"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+
+
+def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> None:
+    whole = (folder / "board01.png").read_bytes()
+    (folder / "c_cut.png").write_bytes(whole[: len(whole) // 2])
+    (folder / "d_empty.png").write_bytes(b"")
+    (folder / "e_text.png").write_bytes(b"no image at all")
+    (folder / "f_bomb.png").write_bytes(png(60000, 60000))
+    write(folder / "g_tiny.png", np.full((8, 8), 200, np.uint8))
+    write(folder / "h_black.pgm", np.zeros((300, 400), np.uint8))
+    write(folder / "i_white.bmp", np.full((300, 400), 255, np.uint8))
+    result = detect(folder, folder / "absent.png", *BOARD)
+    assert result.exit_code == 0
+    *lines, summary = result.stderr.splitlines()
+    expected = {
+        "c_cut.png": "cut off",
+        "d_empty.png": "is empty",
+        "e_text.png": "is no image",
+        "f_bomb.png": "60000 x 60000 px",
+        "g_tiny.png": "no board found",
+        "h_black.pgm": "no board found",
+        "i_white.bmp": "no board found",
+        "absent.png": "no such file",
+    }
+    assert len(lines) == len(expected)
+    for line, (name, words) in zip(lines, expected.items(), strict=True):
+        assert line.startswith(f"{folder / name}: ")
+        assert words in line
+    assert summary == "found the board in 3 of 11 images: 279 points, 0 rejected"
+    assert {row.split(",")[0] for row in result.stdout.splitlines()[3:]} == {"board01", "board02", "board03"}
+
+
+def test_the_decoders_are_not_heard(folder: Path) -> None:
+    """What C libraries print goes past Python, so the process is looked at from outside."""
+    damaged = bytearray(
+        cv2.imencode(".jpg", np.random.default_rng(0).integers(0, 255, (90, 90), np.uint8))[1]
+    )
+    damaged[len(damaged) // 2 : len(damaged) // 2 + 30] = b"\xff\xd0\x5a" * 10
+    (folder / "a.jpg").write_bytes(bytes(damaged))
+    words = [sys.executable, "-m", "neurocal_cli", "detect", str(folder), *map(str, BOARD)]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    first, last = done.stderr.splitlines()
+    assert first.startswith(f"{folder / 'a.jpg'}: is damaged")
+    assert last.startswith("found the board in 3 of 4 images")
+
+
+def test_no_board_in_any_image_is_exit_1_without_a_file(folder: Path, tmp_path: Path) -> None:
+    result = detect(
+        folder,
+        "--cols",
+        6,
+        "--rows",
+        4,
+        "--square",
+        25,
+        "-o",
+        tmp_path / "p.csv",
+        "--overlay",
+        tmp_path / "o",
+    )
+    assert (result.exit_code, result.stdout) == (1, "")
+    *lines, last = result.stderr.splitlines()
+    assert len(lines) == 3
+    assert all("found 9 x 6 inner vertices, the board has 6 x 4" in line for line in lines)
+    assert last == "Error: none of the 3 images shows the board; the reason stands above"
+    assert not (tmp_path / "p.csv").exists()
+    assert not (tmp_path / "o").exists()
+
+
+def test_overlays_are_drawn_for_all_images_that_can_be_read(folder: Path, tmp_path: Path) -> None:
+    write(folder / "none.png", np.zeros((300, 400), np.uint8))
+    seen = tmp_path / "new" / "seen"
+    result = detect(folder, *BOARD, "--overlay", seen)
+    assert result.exit_code == 0
+    assert sorted(path.name for path in seen.iterdir()) == [
+        "board01.png",
+        "board02.png",
+        "board03.png",
+        "none.png",
+    ]
+    picture = cv2.imdecode(np.fromfile(seen / "board01.png", np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[1] == 1200
+
+
+def test_overlays_never_replace_the_images(folder: Path, tmp_path: Path) -> None:
+    before = (folder / "board01.png").read_bytes()
+    result = detect(folder, *BOARD, "--overlay", folder)
+    assert result.exit_code == 2
+    assert "holds the images themselves" in result.stderr
+    assert (folder / "board01.png").read_bytes() == before
+    (tmp_path / "file").write_text("x")
+    assert detect(folder, *BOARD, "--overlay", tmp_path / "file").exit_code == 2
+
+
+def test_a_board_file_tells_the_size_and_the_unit(folder: Path, tmp_path: Path) -> None:
+    board = tmp_path / "board.yaml"
+    board.write_text("unit: cm\nplanes:\n  - {name: a, cols: 9, rows: 6, square: 2.5}\n")
+    result = detect(folder, "--board", board)
+    assert result.exit_code == 0
+    assert "# unit: cm\n" in result.stdout
+    assert "\nboard01,a/h:0:0,1.25,0.0,0.0," in result.stdout
+    assert detect(folder, "--board", tmp_path / "none.yaml").exit_code == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), "the board is not described"),
+        (("--cols", 9, "--rows", 6), "the board is not described"),
+        (("--board", "b.yaml", "--cols", 9), "leave out --cols"),
+        (("--cols", 9, "--rows", 1, "--square", 25), "--rows"),
+        (("--cols", 9, "--rows", 6, "--square", -1), "--square"),
+        ((*BOARD, "--jobs", 0), "--jobs"),
+        ((*BOARD, "--points", "corners"), "--points"),
+    ],
+)
+def test_wrong_usage_is_exit_2(folder: Path, options: tuple[object, ...], words: str) -> None:
+    result = detect(folder, *options)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert words in result.stderr
+
+
+def test_two_images_of_one_name_are_refused(folder: Path, tmp_path: Path) -> None:
+    other = tmp_path / "board01.jpg"
+    shutil.copy(folder / "board01.png", other)
+    result = detect(folder, other, *BOARD)
+    assert result.exit_code == 1
+    assert f"{folder / 'board01.png'} and {other} would both be the view 'board01'" in result.stderr
+
+
+def test_images_of_two_sizes_are_refused(folder: Path, tmp_path: Path) -> None:
+    image = cv2.imdecode(np.fromfile(folder / "board01.png", np.uint8), cv2.IMREAD_GRAYSCALE)
+    write(folder / "large.png", cv2.copyMakeBorder(image, 0, 10, 0, 20, cv2.BORDER_REPLICATE))
+    result = detect(folder, *BOARD, "-o", tmp_path / "p.csv")
+    assert result.exit_code == 1
+    assert "the image large has 420 x 310 px but board01 has 400 x 300 px" in result.stderr
+    assert not (tmp_path / "p.csv").exists()
+
+
+def test_an_image_comes_from_stdin(folder: Path) -> None:
+    result = run("detect", "-", *BOARD, stdin=(folder / "board02.png").read_bytes())
+    assert result.exit_code == 0
+    assert "\nstdin,h:0:0," in result.stdout
+
+
+def test_a_turned_image_is_used_and_said_once(folder: Path) -> None:
+    exif = b"II*\0" + struct.pack("<IHHHIHHI", 8, 1, 274, 3, 1, 3, 0, 0)
+    body = struct.pack(">I", len(exif)) + b"eXIf" + exif + struct.pack(">I", zlib.crc32(b"eXIf" + exif))
+    for path in folder.iterdir():
+        data = path.read_bytes()
+        path.write_bytes(data[:33] + body + data[33:])
+    result = detect(folder, *BOARD)
+    assert result.exit_code == 0
+    first, _ = result.stderr.splitlines()
+    assert first.startswith("note: board01 and 2 more: turned by 180 degrees, as its EXIF orientation says")
+
+
+def test_detected_points_calibrate_the_camera(tmp_path: Path) -> None:
+    points = tmp_path / "points.csv"
+    assert detect(f"{SAMPLES}/board*.png", *BOARD, "-o", points).exit_code == 0
+    result = run("calibrate", points, "-o", tmp_path / "camera.yaml")
+    assert result.exit_code == 0
+    from neurocal_cli import read_calibration
+
+    camera = read_calibration(tmp_path / "camera.yaml")
+    truth = {"alpha_u": 510.0, "alpha_v": 508.0, "u0": 202.5, "v0": 147.0}
+    for name, value in truth.items():
+        assert getattr(camera.intrinsics, name) == pytest.approx(value, abs=0.1)
+    assert camera.rmse_px < 0.01
