@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fit_edges import OFFSET, EdgeData, edge_data, fit_edges, moments, with_weight
-from neurocal_cli.detection.fit_gate import believable
+from neurocal_cli.detection.fit_gate import believable, smooth
 from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
 from neurocal_cli.detection.fit_noise import Noise, level_prior, profile_shape
@@ -16,7 +16,7 @@ from neurocal_cli.detection.fit_profile import RESPONSE_TERMS, box_kurtosis
 from neurocal_cli.detection.fit_robust import MapFit, Rows, choose_map, fit_map
 from neurocal_cli.detection.fit_shading import Levels, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines
-from neurocal_cli.detection.fit_vertices import fit_vertices, vertex_data, vertex_lines
+from neurocal_cli.detection.fit_vertices import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
@@ -174,11 +174,12 @@ def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noi
     offset = mapped.residual[: len(mean)] + mapped.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((len(mean), 1)), known], axis=1)
     fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, 2)
-    shape = profile_shape(data, fit, shape, np.ones(len(mean), dtype=np.bool_))
+    shape = profile_shape(data, fit, shape, smooth(fit))
     fit = fit_edges(data, fit.values, prior, 0.5 * lines.length, shape, 2)
-    rows = board.rows(lines, fit.values[:, OFFSET], fit.covariance[:, OFFSET, OFFSET])
-    chosen = choose_map(mapped.map, rows, mapped.shift)
-    good = chosen.weight[: len(mean)] > 0
+    good = smooth(fit)
+    variance = np.where(good, fit.covariance[:, OFFSET, OFFSET], _ANCHOR**2)
+    chosen = choose_map(mapped.map, board.rows(lines, fit.values[:, OFFSET], variance), mapped.shift)
+    good &= chosen.weight[: len(mean)] > 0
     return Fitted(lines, fit, data, chosen, shading, shape, Noise(noise, noise, noise), good)
 
 
@@ -203,10 +204,12 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     scale = float(np.median(fit.chi2[good] / fit.count[good]))
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = fit.covariance[:, OFFSET, OFFSET]
-    mapped = fit_map(first.map.map, board.rows(lines, fit.values[:, OFFSET], variance), first.map.shift)
+    trusted = np.where(smooth(fit), variance, _ANCHOR**2)
+    mapped = fit_map(first.map.map, board.rows(lines, fit.values[:, OFFSET], trusted), first.map.shift)
     strip = 2 * np.minimum(reach, 0.5 * lines.width) * (lines.length - 2 * _NEAREST * sigma)
     expected = variance + mapped.map.variance(board.edges.centre, lines.normal)
-    good = believable(fit, mapped.residual[:n], expected * max(mapped.excess, 1.0), strip)
+    departure = mapped.residual[:n] / np.sqrt(expected * max(mapped.excess, 1.0))
+    good = believable(fit, departure, strip)
     return Fitted(lines, fit, data, mapped, shading, shape, noise, good)
 
 
@@ -239,7 +242,14 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     weight = fitted.noise.weighted(fit.linear.x, data.weight)
     fit = fit_vertices(replace(data, weight=weight), fit.values, prior, half, shape, 2)
     fit = fit.scaled(float(np.median(fit.chi2 / np.maximum(fit.count, 1))))
-    return fit, lines, np.ones(len(grid), dtype=np.bool_)
+    departure = np.zeros(len(grid))
+    for line, place in zip(lines, (FIRST, SECOND), strict=True):
+        variance = fit.covariance[:, place, place] + fitted.map.map.variance(grid, line.normal)
+        variance *= max(fitted.map.excess, 1.0)
+        departure = np.maximum(departure, np.abs(fit.values[:, place]) / np.sqrt(variance))
+    widths = [2 * np.minimum(_REACH * sigma, 0.5 * line.width) for line in lines]
+    cross = widths[0] * lines[0].length + widths[1] * lines[1].length - widths[0] * widths[1]
+    return fit, lines, believable(fit, departure, cross)
 
 
 def _shading(first: Fitted) -> Shading:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, Fit
 from neurocal_cli.geometry import Array
 
-__all__ = ["believable"]
+__all__ = ["believable", "smooth"]
 
 _LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # of what is expected
 _MOST_BLUR = 2.0  # times what is expected, or its inverse
@@ -19,16 +19,23 @@ _ROUGH = 0.5  # relative excess of chi2 that is never held against a fit
 _MOST_STEP = 1.0  # standard deviations that the last step may have
 
 
-def believable(fit: Fit, residual: Array, variance: Array, expected: Array) -> NDArray[np.bool_]:
+def smooth(fit: Fit) -> NDArray[np.bool_]:
+    """(E,) whether fits look like those of most of the board: enough to learn from them."""
+    contrast = fit.values[:, CONTRAST] / np.median(fit.values[:, CONTRAST])
+    rough = fit.chi2 / np.maximum(fit.count, 1)
+    usual = float(np.median(rough))
+    scatter = 1.4826 * float(np.median(np.abs(rough - usual))) + 0.2 * usual
+    return (contrast > _LEAST_CONTRAST**2) & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
+
+
+def believable(fit: Fit, departure: Array, expected: Array) -> NDArray[np.bool_]:
     """(E,) whether fits agree with their pixels, the rest of the board, and the map.
 
     Parameters
     ----------
     fit : Fit
-    residual : (E,) array [px]
-        Of the offset, from the map and the polarity.
-    variance : (E,) array [px^2]
-        Expected of it.
+    departure : (E,) array
+        Of the place from the map, in standard deviations.
     expected : (E,) array
         Pixels of the whole strip.
     """
@@ -38,7 +45,7 @@ def believable(fit: Fit, residual: Array, variance: Array, expected: Array) -> N
     good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
     good &= (fit.count >= _LEAST_PIXELS * expected) & (fit.count >= _LEAST_COUNT)
     good &= fit.step < _MOST_STEP
-    good &= np.abs(residual) < _LIMIT * np.sqrt(variance)
+    good &= np.abs(departure) < _LIMIT
     rough = fit.chi2 / np.maximum(fit.count, 1)
     middle = float(np.median(rough[good])) if good.any() else 1.0
     scatter = 1.4826 * float(np.median(np.abs(rough[good] - middle))) if good.any() else 0.0

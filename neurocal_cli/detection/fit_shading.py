@@ -14,7 +14,9 @@ from neurocal_cli.geometry import Array
 __all__ = ["Levels", "Shading", "fit_shading", "square_levels"]
 
 _LATTICE = np.linspace(0.25, 0.75, 8)  # of a square; its interior, away from the blurred edges
-_STEPS = 4
+_STEPS = 2  # after the last degree
+_TUKEY = 5.0  # standard deviations beyond which a level counts as an outlier
+_TINY = 1e-9  # DN^2
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 
 
@@ -104,22 +106,26 @@ def fit_shading(frame: Frame, dark: Levels, light: Levels) -> Shading:
 
 def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     n = len(levels.level)
-    used = max([m for m in _TERMS if 3 * m <= n], default=1)
-    coefficients = np.zeros(6)
+    coefficients = np.zeros(_TERMS[-1])
     if n == 0:
         return coefficients, np.inf
-    terms = _terms(frame, levels.place)[:, :used]
-    spread, weight = 0.0, np.ones(n)
-    for _ in range(_STEPS):
-        root = np.sqrt(weight / (levels.variance + spread))
-        coefficients[:used] = np.linalg.lstsq(terms * root[:, None], levels.level * root, rcond=None)[0]
-        residual = levels.level - terms @ coefficients[:used]
+    terms = _terms(frame, levels.place)
+    residual, spread = levels.level - np.median(levels.level), 0.0
+    most = max([m for m in _TERMS if 3 * m <= n], default=1)
+    # From the median on to higher degrees: hidden squares must be known before they can bend anything.
+    for used in (*_TERMS, *(most,) * _STEPS):
+        used = min(used, most)
         # The median does not see the outliers that the weights have to find.
         scatter = float(np.median(residual**2)) / 0.455 * n / max(n - used, 1)
+        weight = np.clip(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6, None) ** 2
+        root = np.sqrt(weight / (levels.variance + spread))
+        coefficients[:used] = np.linalg.lstsq(
+            terms[:, :used] * root[:, None], levels.level * root, rcond=None
+        )[0]
+        residual = levels.level - terms[:, :used] @ coefficients[:used]
         # What the levels' own errors may do by chance is not taken for spread of the squares.
         chance = 1 + 4 / np.sqrt(n)
         spread = max(scatter - chance * float(np.median(levels.variance)), 0.0)
-        weight = np.clip(1 - residual**2 / (36 * (levels.variance + spread) + 1e-9), 1e-6, None) ** 2
     return coefficients, spread
 
 
