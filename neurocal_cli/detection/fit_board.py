@@ -30,6 +30,7 @@ _MOMENT_SIGMA = 0.05  # px, of offsets from moments
 _REACH = 4.0  # sigma on both sides of an edge
 _SLACK = 0.5  # px, for starts that are off
 _NEAREST = 0.5  # sigma from the crossing lines
+_STEPS = 6  # of Gauss and Newton, at most
 _WIDEST = 12.0  # px, of the strips for moments
 _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations before anything is known
 
@@ -173,9 +174,9 @@ def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noi
     shape = Shape(tails, np.zeros(RESPONSE_TERMS))
     offset = mapped.residual[: len(mean)] + mapped.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((len(mean), 1)), known], axis=1)
-    fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, 2)
+    fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, _STEPS)
     shape = profile_shape(data, fit, shape, smooth(fit))
-    fit = fit_edges(data, fit.values, prior, 0.5 * lines.length, shape, 2)
+    fit = fit_edges(data, fit.values, prior, 0.5 * lines.length, shape, _STEPS)
     good = smooth(fit)
     variance = np.where(good, fit.covariance[:, OFFSET, OFFSET], _ANCHOR**2)
     chosen = choose_map(mapped.map, board.rows(lines, fit.values[:, OFFSET], variance), mapped.shift)
@@ -196,11 +197,11 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     offset = first.map.residual[:n] + first.map.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     half_length = 0.5 * lines.length
-    fit = fit_edges(data, start, prior, half_length, first.shape, 2)
+    fit = fit_edges(data, start, prior, half_length, first.shape, _STEPS)
     shape = profile_shape(data, fit, first.shape, good)
     noise = Noise.of(fit, data.weight, board.floor)
     data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
-    fit = fit_edges(data, fit.values, prior, half_length, shape, 2)
+    fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
     scale = float(np.median(fit.chi2[good] / fit.count[good]))
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = fit.covariance[:, OFFSET, OFFSET]
@@ -238,9 +239,9 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     half = (0.5 * lines[0].length, 0.5 * lines[1].length)
     unit = replace(data, weight=data.weight / np.float32(fitted.noise.edge))
-    fit = fit_vertices(unit, start, prior, half, shape, 1)
+    fit = fit_vertices(unit, start, prior, half, shape, _STEPS)
     weight = fitted.noise.weighted(fit.linear.x, data.weight)
-    fit = fit_vertices(replace(data, weight=weight), fit.values, prior, half, shape, 2)
+    fit = fit_vertices(replace(data, weight=weight), fit.values, prior, half, shape, _STEPS)
     fit = fit.scaled(float(np.median(fit.chi2 / np.maximum(fit.count, 1))))
     departure = np.zeros(len(grid))
     for line, place in zip(lines, (FIRST, SECOND), strict=True):

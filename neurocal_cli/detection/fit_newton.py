@@ -17,6 +17,7 @@ Single = NDArray[np.float32]
 # The last three values of every fit: mean level and half contrast [DN], sigma_t [px].
 MEAN, CONTRAST, BLUR = -3, -2, -1
 _LEAST_BLUR = 0.3  # px; the pixel's box alone has 0.289
+_MOST, _SETTLED = 0.9, 0.1  # share of the fits whose last step was less, in standard deviations
 _NOTHING = 1e-9  # information that keeps fits without pixels from dividing by 0
 
 
@@ -124,6 +125,7 @@ def gauss_newton(
     weight : (E, N) array [1/DN^2]
         Of the pixels.
     steps : int
+        At most.
     """
     values = start.copy()
     size = np.zeros(len(values))
@@ -139,6 +141,9 @@ def gauss_newton(
         size = np.sqrt(np.maximum((step * gradient).sum(axis=1), 0))
         values = _moved(values, step)
         linear = model(values)
+        # What most fits still lack is little; those that cannot settle must not hold up the others.
+        if np.quantile(size, _MOST) < _SETTLED:
+            break
     information, _ = _normal(linear, weight)
     chi2 = np.einsum("en,en,en->e", linear.residual, linear.residual, weight).astype(float)
     count = (weight > 0).sum(axis=1).astype(np.int64)

@@ -15,9 +15,10 @@ __all__ = ["FORMS", "MapFit", "Rows", "choose_map", "fit_map"]
 # Forms of the map from the simplest on: (radial parameters, degree of the polynomial rest).
 FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
 
-_STEPS = 6
+_STEPS = 15
 _SHIFT_PRIOR = 1e-2  # 1/px^2
-_SETTLED = 0.02  # standard deviations
+_SETTLED = 0.1  # of chi2
+_DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
 _TUKEY = 6.0  # standard deviations beyond which a row counts as an outlier
 # A richer form must lower the chi2 by so much for each of its parameters; chance alone gives 1.
 _PRICE = 3.0
@@ -93,7 +94,7 @@ class MapFit:
 
 
 def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> MapFit:
-    """Gauss-Newton steps with Tukey's weights from a start that is nearly right.
+    """Levenberg-Marquardt steps with Tukey's weights, from a start that is nearly right.
 
     Parameters
     ----------
@@ -105,26 +106,32 @@ def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> 
     steps : int
         At most.
     """
-    free = start.free
-    k = rows.shift.shape[1]
-    values, shift = start.parameters.copy(), shift.copy()
-    prior = np.concatenate([start.prior[free], np.full(k, _SHIFT_PRIOR)])
-    for turn in range(steps):
-        now = replace(start, parameters=values)
-        residual, jacobian = _residual(now, rows, shift, free)
-        z = residual / np.sqrt(rows.variance)
-        # Before the first step everything may be off, the shifts above all.
-        weight = _tukey(z / _scale(z)) if turn else np.ones(len(z))
-        weight /= rows.variance
+    free, m = start.free, len(start.free)
+    prior = np.concatenate([start.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
+    values = np.concatenate([start.parameters[free], shift])
+    residual, jacobian = _residual(start, rows, shift, free)
+    # Before the first step everything may be off, the shifts above all.
+    weight, damping = 1 / rows.variance, _DAMPING
+    for _ in range(steps):
         normal = (jacobian.T * weight) @ jacobian
-        gradient = jacobian.T @ (weight * residual) - prior * np.concatenate([values[free], shift])
+        gradient = jacobian.T @ (weight * residual) - prior * values
         normal[np.diag_indices_from(normal)] += prior
-        step = _solved(normal, gradient)
-        values[free] += step[: len(free)]
-        shift += step[len(free) :]
-        if turn and float(step @ gradient) < _SETTLED**2 * len(free):
+        step = _solved(normal, gradient, damping)
+        tried, moved = replace(start, parameters=start.parameters.copy()), values + step
+        tried.parameters[free] = moved[:m]
+        ahead, slopes = _residual(tried, rows, moved[m:], free)
+        before = weight @ residual**2 + prior @ values**2
+        after = weight @ ahead**2 + prior @ moved**2
+        if not after <= before:
+            damping *= 10
+            continue
+        start, values, residual, jacobian = tried, moved, ahead, slopes
+        damping *= 0.1
+        z = residual / np.sqrt(rows.variance)
+        weight = _tukey(z / _scale(z)) / rows.variance
+        if before - after < _SETTLED:
             break
-    return _finished(replace(start, parameters=values), rows, shift)
+    return _finished(start, rows, values[m:])
 
 
 def choose_map(start: SmoothMap, rows: Rows, shift: Array) -> MapFit:
@@ -180,10 +187,12 @@ def _residual(now: SmoothMap, rows: Rows, shift: Array, free: NDArray[np.intp]) 
     return residual, np.concatenate([along, rows.shift], axis=1)
 
 
-def _solved(normal: Array, gradient: Array) -> Array:
-    """Solution of normal equations whose parameters have very different sizes."""
+def _solved(normal: Array, gradient: Array, damping: float) -> Array:
+    """Solution of damped normal equations whose parameters have very different sizes."""
     size = 1 / np.sqrt(np.diag(normal))
-    return np.asarray(size * np.linalg.solve(normal * size[:, None] * size, gradient * size))
+    scaled = normal * size[:, None] * size
+    scaled[np.diag_indices_from(scaled)] += damping
+    return np.asarray(size * np.linalg.solve(scaled, gradient * size))
 
 
 def _finished(now: SmoothMap, rows: Rows, shift: Array) -> MapFit:
