@@ -132,7 +132,16 @@ def _detected(path: str, image: Image, task: Task) -> Outcome:
         return Outcome(path, None, f"{image.source}: {error}", image.notes, overlay)
     if task.overlay:
         overlay = encode_png(draw_detection(image.grey, found))
-    return Outcome(path, found, "", image.notes, overlay)
+    return Outcome(path, found, "", (*image.notes, *_missing(found, task.board)), overlay)
+
+
+def _missing(found: Detection, board: Board) -> tuple[str, ...]:
+    """What to note of planes that are not among those found."""
+    seen = {one.plane.name for one in found.located}
+    names = [plane.name for plane in board.planes if plane.name not in seen]
+    return (
+        (f"without {' and '.join(names)}: not found, or not to be told from something else",) if names else ()
+    )
 
 
 def _begin() -> None:

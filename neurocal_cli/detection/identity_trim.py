@@ -1,6 +1,7 @@
 """Lines of vertices that a grid only seems to have.
 
-Where the paper of a board ends near its outer squares, a corner of the paper can look like a vertex.
+Where the paper of a board ends near its outer squares, a corner of the paper can look like a vertex,
+and where two planes meet, a square's corner at the fold can.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from neurocal_cli.geometry import Array
 __all__ = ["trimmed"]
 
 _FEW = 0.34  # share of a line's vertices up to which it may be none
+_FEW_AT_FOLDS = 0.6  # of one of several planes, whose places are proved by one camera seeing them all
 
 
 def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
@@ -32,12 +34,13 @@ def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
         The one given if it fits, or would not fit without such lines either.
     """
     left = grid
+    few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
     while not _fits(left, planes):
         seen = left.seen
         lines = {0: seen[:, 0], 1: seen[:, -1], 2: seen[0], 3: seen[-1]}
         shares = {side: float(line.mean()) for side, line in lines.items()}
         side = min(shares, key=lambda k: shares[k])
-        if shares[side] > _FEW or min(seen.shape) <= 3:
+        if shares[side] > few or min(seen.shape) <= 3:
             return grid
         left = _cropped(left.pixels, left.dark, side)
     return left

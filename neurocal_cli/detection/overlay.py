@@ -42,7 +42,7 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     """Draw the points of a detection.
 
     Crosses are the measured points, coloured by kind. The red lines are residuals from a smooth map
-    of the plane (a homography and a cubic for the lens), enlarged as the title says. The circle is
+    of the plane (a homography, and a polynomial for the lens), enlarged as the title says. The circle is
     vertex (0, 0) with the axes of the plane; ids stand at the corners.
 
     Parameters

@@ -10,13 +10,13 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["residuals"]
 
-_POINTS_A_TERM = 3  # that a coefficient of the lens's part must have to be fitted
+_POINTS_A_TERM = 6  # that a coefficient of the lens's part must have to be fitted
 
 
 def residuals(measured: Measured) -> Array:
     """Measured pixels minus those of a homography and a polynomial fitted to them.
 
-    The polynomial, of the third degree or what the number of points allows, takes up the lens.
+    The polynomial, of the fifth degree or what the number of points allows, takes up the lens.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def residuals(measured: Measured) -> Array:
         return np.zeros_like(measured.pixels)
     seen = np.column_stack([grid, np.ones(len(grid))]) @ H.T
     left = measured.pixels - seen[:, :2] / seen[:, 2:]
-    degree = max((d for d in (1, 2, 3) if _POINTS_A_TERM * (d + 1) * (d + 2) <= 2 * len(grid)), default=0)
+    degree = max((d for d in range(1, 6) if _POINTS_A_TERM * (d + 1) * (d + 2) <= 2 * len(grid)), default=0)
     x, y = ((grid - grid.mean(axis=0)) / max(float(np.ptp(grid)), 1.0)).T
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
     return np.asarray(left - terms @ np.linalg.lstsq(terms, left, rcond=None)[0])
