@@ -13,7 +13,7 @@ from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
 from neurocal_cli.detection.fit_noise import Noise, level_prior, profile_shape
 from neurocal_cli.detection.fit_profile import RESPONSE_TERMS, box_kurtosis
-from neurocal_cli.detection.fit_robust import MapFit, Rows, choose_map, fit_map
+from neurocal_cli.detection.fit_robust import MapFit, Rows, choose_map, fit_map, median
 from neurocal_cli.detection.fit_shading import Levels, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines
 from neurocal_cli.detection.fit_vertices import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
@@ -26,12 +26,14 @@ Image = NDArray[np.generic]
 
 _START_SIGMA = 0.3  # px, of the found vertices' coordinates
 _ANCHOR = 2.0  # px; later they only hold what the edges leave open
+_ENOUGH = 60  # edges that need no anchors
 _MOMENT_SIGMA = 0.05  # px, of offsets from moments
 _REACH = 4.0  # sigma on both sides of an edge
 _SLACK = 0.5  # px, for starts that are off
 _NEAREST = 0.5  # sigma from the crossing lines
 _STEPS = 6  # of Gauss and Newton, at most
 _WIDEST = 12.0  # px, of the strips for moments
+_BLUR_OFF = 0.1  # relative error of the blur that makes the first fit be done again
 _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations before anything is known
 
 
@@ -103,6 +105,8 @@ class Board:
         """Edges as what a map is fitted to; moved by an unknown common shift to the light side."""
         value = (lines.middle * lines.normal).sum(axis=1) + offset
         edges = Rows(self.edges.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
+        if len(offset) > _ENOUGH:
+            return edges
         anchors = replace(self.anchors, variance=np.full_like(self.anchors.variance, _ANCHOR**2))
         return edges.and_(anchors)
 
@@ -143,7 +147,7 @@ def fit_board(board: Board) -> Fitted:
     found = choose_map(start, board.anchors, np.zeros(1))
     dark, light = square_levels(board.image, board.grid, found.map)
     shading = fit_shading(frame, dark, light)
-    noise = max(float(np.median(np.concatenate([dark.noise, light.noise]))), board.floor)
+    noise = max(median(np.concatenate([dark.noise, light.noise])), board.floor)
     mapped, sigma = _by_moments(board, found, shading)
     first = _first_fit(board, mapped, sigma, shading, noise)
     return _last_fit(board, first)
@@ -152,17 +156,38 @@ def fit_board(board: Board) -> Fitted:
 def _by_moments(board: Board, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
     """Map through the edges' moments, and their blur [px]."""
     lines = board.lines(found.map)
-    half = np.clip(0.35 * np.minimum(lines.width, lines.length), 2.0, _WIDEST)
+    # Where lines cross at an angle they come into wide strips from the side.
+    slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
+    half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
+    half = np.clip(half, 2.0, _WIDEST)
     strips = gather(board.image, lines, half, 0.2 * lines.length, 2)
     offset, _, blur = moments(strips, half, *shading.at(lines.middle))
-    sigma = float(np.clip(np.median(blur), 0.33, 0.25 * np.median(lines.width)))
+    sigma = float(np.clip(median(blur), 0.33, 0.25 * median(lines.width)))
     rows = board.rows(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
     return fit_map(found.map, rows, found.shift), sigma
 
 
 def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noise: float) -> Fitted:
-    """Edges fitted with free levels and a Gaussian profile, and the map through them."""
+    """Edges fitted with free levels, and the map through them."""
     lines = board.lines(mapped.map)
+    offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
+    for _ in range(2):
+        data, fit, shape = _free_fit(board, lines, offset, sigma, shading, noise)
+        good = smooth(fit)
+        found = median(fit.values[good, BLUR]) if good.any() else sigma
+        # The blur decides what the lines that cross do to the pixels.
+        wrong, sigma = abs(found - sigma) > _BLUR_OFF * sigma, found
+        if not wrong:
+            break
+    variance = np.where(good, fit.covariance[:, OFFSET, OFFSET], _ANCHOR**2)
+    chosen = choose_map(mapped.map, board.rows(lines, fit.values[:, OFFSET], variance), mapped.shift)
+    good &= chosen.weight[: len(good)] > 0
+    return Fitted(lines, fit, data, chosen, shading, shape, Noise(noise, noise, noise), good)
+
+
+def _free_fit(
+    board: Board, lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
+) -> tuple[EdgeData, Fit, Shape]:
     mean, contrast = shading.at(lines.middle)
     blur = np.full(len(mean), sigma)
     data = _pixels(board, lines, blur, shading, _REACH * blur + _SLACK, 2)
@@ -172,23 +197,17 @@ def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noi
     prior = Prior(known, (1 / spread**2)[:, :, None] * np.eye(3))
     tails = box_kurtosis(lines.normal, blur)[:, None] * [1.0, 0.0]
     shape = Shape(tails, np.zeros(RESPONSE_TERMS))
-    offset = mapped.residual[: len(mean)] + mapped.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((len(mean), 1)), known], axis=1)
     fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, _STEPS)
     shape = profile_shape(data, fit, shape, smooth(fit))
-    fit = fit_edges(data, fit.values, prior, 0.5 * lines.length, shape, _STEPS)
-    good = smooth(fit)
-    variance = np.where(good, fit.covariance[:, OFFSET, OFFSET], _ANCHOR**2)
-    chosen = choose_map(mapped.map, board.rows(lines, fit.values[:, OFFSET], variance), mapped.shift)
-    good &= chosen.weight[: len(mean)] > 0
-    return Fitted(lines, fit, data, chosen, shading, shape, Noise(noise, noise, noise), good)
+    return data, fit_edges(data, fit.values, prior, 0.5 * lines.length, shape, _STEPS), shape
 
 
 def _last_fit(board: Board, first: Fitted) -> Fitted:
     """Edges fitted with what all of them share, and the map through them."""
     fit, good, n = first.fit, first.good, len(first.good)
     shading = _shading(first)
-    sigma = np.full(n, float(np.median(fit.values[good, BLUR])))
+    sigma = np.full(n, median(fit.values[good, BLUR]))
     lines = board.lines(first.map.map)
     reach = _REACH * sigma
     data = _pixels(board, lines, sigma, shading, reach, 1)
@@ -202,15 +221,14 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     noise = Noise.of(fit, data.weight, board.floor)
     data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
     fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
-    scale = float(np.median(fit.chi2[good] / fit.count[good]))
+    scale = median(fit.chi2[good] / fit.count[good])
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = fit.covariance[:, OFFSET, OFFSET]
     trusted = np.where(smooth(fit), variance, _ANCHOR**2)
     mapped = fit_map(first.map.map, board.rows(lines, fit.values[:, OFFSET], trusted), first.map.shift)
-    strip = 2 * np.minimum(reach, 0.5 * lines.width) * (lines.length - 2 * _NEAREST * sigma)
     expected = variance + mapped.map.variance(board.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * max(mapped.excess, 1.0))
-    good = believable(fit, departure, strip)
+    good = believable(fit, departure, data.beyond)
     return Fitted(lines, fit, data, mapped, shading, shape, noise, good)
 
 
@@ -228,29 +246,27 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     grid = board.anchors.grid[: len(board.anchors.grid) // 2]
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + board.grid.dark) % 2 == 1, 1.0, -1.0)
-    middle = lines[0].middle
-    sigma = np.full(len(grid), float(np.median(fitted.fit.values[:, BLUR])))
-    contrast = fitted.shading.at(middle)[1]
-    slopes = fitted.shading.slopes(middle)
+    place = lines[0].middle
+    sigma = np.full(len(grid), median(fitted.fit.values[:, BLUR]))
+    contrast = fitted.shading.at(place)[1]
+    slopes = fitted.shading.slopes(place)
     data = vertex_data(board.image, lines, light, sigma, _REACH, slopes, contrast)
-    tails = np.tile(np.median(fitted.shape.tails, axis=0), (len(grid), 1))
+    tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
     shape = Shape(tails, fitted.shape.bend)
-    prior = level_prior(fitted.shading, middle, sigma, fitted.noise.edge)
+    prior = level_prior(fitted.shading, place, sigma, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     half = (0.5 * lines[0].length, 0.5 * lines[1].length)
     unit = replace(data, weight=data.weight / np.float32(fitted.noise.edge))
     fit = fit_vertices(unit, start, prior, half, shape, _STEPS)
     weight = fitted.noise.weighted(fit.linear.x, data.weight)
     fit = fit_vertices(replace(data, weight=weight), fit.values, prior, half, shape, _STEPS)
-    fit = fit.scaled(float(np.median(fit.chi2 / np.maximum(fit.count, 1))))
+    fit = fit.scaled(median(fit.chi2 / np.maximum(fit.count, 1)))
     departure = np.zeros(len(grid))
     for line, place in zip(lines, (FIRST, SECOND), strict=True):
         variance = fit.covariance[:, place, place] + fitted.map.map.variance(grid, line.normal)
         variance *= max(fitted.map.excess, 1.0)
         departure = np.maximum(departure, np.abs(fit.values[:, place]) / np.sqrt(variance))
-    widths = [2 * np.minimum(_REACH * sigma, 0.5 * line.width) for line in lines]
-    cross = widths[0] * lines[0].length + widths[1] * lines[1].length - widths[0] * widths[1]
-    return fit, lines, believable(fit, departure, cross)
+    return fit, lines, believable(fit, departure, data.beyond)
 
 
 def _shading(first: Fitted) -> Shading:

@@ -45,6 +45,8 @@ class EdgeData:
     Q, R : arrays
     weight : array [1/DN^2]
         Inverse variance of the noise; 0 for pixels that are not used.
+    beyond : (E,) array
+        Share of the strip's pixels that lie outside the image.
     """
 
     s: Single
@@ -54,6 +56,7 @@ class EdgeData:
     Q: Single
     R: Single
     weight: Single
+    beyond: Array
 
 
 def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:
@@ -130,7 +133,7 @@ def edge_data(
         if close.any():
             t = (width[close, None].astype(np.float32) + side * strips.d[close]) * per_sigma[close]
             Q[close] *= erf_and_density(t)[0]
-    return EdgeData(strips.s, strips.d, value, gain, Q, R, used.astype(np.float32))
+    return EdgeData(strips.s, strips.d, value, gain, Q, R, used.astype(np.float32), strips.beyond)
 
 
 def fit_edges(

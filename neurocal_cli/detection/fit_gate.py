@@ -6,13 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, Fit
+from neurocal_cli.detection.fit_robust import median
 from neurocal_cli.geometry import Array
 
 __all__ = ["believable", "smooth"]
 
 _LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # of what is expected
 _MOST_BLUR = 2.0  # times what is expected, or its inverse
-_LEAST_PIXELS = 0.7  # of the strip
+_MOST_BEYOND = 0.3
 _LEAST_COUNT = 8
 _LIMIT = 6.0  # standard deviations
 _ROUGH = 0.5  # relative excess of chi2 that is never held against a fit
@@ -21,14 +22,14 @@ _MOST_STEP = 1.0  # standard deviations that the last step may have
 
 def smooth(fit: Fit) -> NDArray[np.bool_]:
     """(E,) whether fits look like those of most of the board: enough to learn from them."""
-    contrast = fit.values[:, CONTRAST] / np.median(fit.values[:, CONTRAST])
+    contrast = fit.values[:, CONTRAST] / median(fit.values[:, CONTRAST])
     rough = fit.chi2 / np.maximum(fit.count, 1)
-    usual = float(np.median(rough))
-    scatter = 1.4826 * float(np.median(np.abs(rough - usual))) + 0.2 * usual
+    usual = median(rough)
+    scatter = 1.4826 * median(np.abs(rough - usual)) + 0.2 * usual
     return (contrast > _LEAST_CONTRAST**2) & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
 
 
-def believable(fit: Fit, departure: Array, expected: Array) -> NDArray[np.bool_]:
+def believable(fit: Fit, departure: Array, beyond: Array) -> NDArray[np.bool_]:
     """(E,) whether fits agree with their pixels, the rest of the board, and the map.
 
     Parameters
@@ -36,18 +37,18 @@ def believable(fit: Fit, departure: Array, expected: Array) -> NDArray[np.bool_]
     fit : Fit
     departure : (E,) array
         Of the place from the map, in standard deviations.
-    expected : (E,) array
-        Pixels of the whole strip.
+    beyond : (E,) array
+        Share of the pixels that lie outside the image.
     """
     contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, CONTRAST]
     blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]
     good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
     good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
-    good &= (fit.count >= _LEAST_PIXELS * expected) & (fit.count >= _LEAST_COUNT)
+    good &= (beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
     good &= fit.step < _MOST_STEP
     good &= np.abs(departure) < _LIMIT
     rough = fit.chi2 / np.maximum(fit.count, 1)
-    middle = float(np.median(rough[good])) if good.any() else 1.0
-    scatter = 1.4826 * float(np.median(np.abs(rough[good] - middle))) if good.any() else 0.0
-    chance = middle * np.sqrt(2 / np.maximum(fit.count, 1))
-    return good & (rough - middle < _LIMIT * np.maximum(scatter, chance) + _ROUGH * middle)
+    usual = median(rough[good]) if good.any() else 1.0
+    scatter = 1.4826 * median(np.abs(rough[good] - usual)) if good.any() else 0.0
+    chance = usual * np.sqrt(2 / np.maximum(fit.count, 1))
+    return good & (rough - usual < _LIMIT * np.maximum(scatter, chance) + _ROUGH * usual)

@@ -17,7 +17,7 @@ Single = NDArray[np.float32]
 # The last three values of every fit: mean level and half contrast [DN], sigma_t [px].
 MEAN, CONTRAST, BLUR = -3, -2, -1
 _LEAST_BLUR = 0.3  # px; the pixel's box alone has 0.289
-_MOST, _SETTLED = 0.9, 0.1  # share of the fits whose last step was less, in standard deviations
+_MOST, _SETTLED = 0.9, 0.5  # share of the fits whose last step was less, in standard deviations
 _NOTHING = 1e-9  # information that keeps fits without pixels from dividing by 0
 
 

@@ -16,6 +16,7 @@ from neurocal_cli.detection.fit_profile import (
     response_terms,
     tail_terms,
 )
+from neurocal_cli.detection.fit_robust import median
 from neurocal_cli.detection.fit_shading import Shading
 from neurocal_cli.geometry import Array
 
@@ -27,6 +28,7 @@ _FLAT = 0.95  # light, of -1 to 1, beyond which the levels are reached but for l
 # Noise that seems smaller than this share of the largest, as that of clipped pixels does, is not believed.
 _LEAST_SHARE = 0.3
 _BLUR_SPREAD = 0.05  # of single edges' blur around the board's
+_ENOUGH = 10000  # pixels to learn the profile's shape from
 _RIDGE = 1e-5
 _LEAST_SPREAD = 0.002  # of levels, in variances of the noise
 
@@ -60,7 +62,7 @@ class Noise:
             some = count >= min(8, int(count.max(initial=0)))
             sums = np.einsum("en,en->e", square, mine.astype(np.float32))
             # The median over the edges does not see those that are hidden.
-            variances.append(float(np.median(sums[some] / np.maximum(count[some], 1))) if some.any() else 0.0)
+            variances.append(median(sums[some] / np.maximum(count[some], 1)) if some.any() else 0.0)
         return cls(*(max(v, floor, _LEAST_SHARE * max(variances)) for v in variances))
 
     def times(self, factor: float) -> Noise:
@@ -88,21 +90,24 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     good : (E,) bool array
         Edges to use.
     """
-    z, x, Q = fit.linear.z[good], fit.linear.x[good], data.Q[good]
+    # A share of the pixels is enough for a dozen numbers.
+    step = max(1, int((data.weight[good] > 0).sum()) // _ENOUGH)
+    some = np.ix_(np.flatnonzero(good), np.arange(0, data.s.shape[1], step))
+    z, x, Q = fit.linear.z[some], fit.linear.x[some], data.Q[some]
     _, density = erf_and_density(z)
-    scale = fit.values[good, CONTRAST].astype(np.float32)[:, None] * data.gain[good]
+    scale = fit.values[good, CONTRAST].astype(np.float32)[:, None] * data.gain[some]
     steep = response(x, shape.bend)[1] * Q
     bends = response_terms(x)
     tails = tail_terms(z, density) * steep
     others = np.stack([density * steep, density * z * steep, x])
     columns = np.concatenate([tails * scale, bends * scale, others * scale, np.ones_like(z)[None]])
     columns = columns.reshape(len(columns), -1)
-    weighted = columns * data.weight[good].reshape(-1)
+    weighted = columns * data.weight[some].reshape(-1)
     normal = (weighted @ columns.T).astype(float)
-    right = (weighted @ fit.linear.residual[good].reshape(-1)).astype(float)
+    right = (weighted @ fit.linear.residual[some].reshape(-1)).astype(float)
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
-    step = np.linalg.solve(normal, right)
-    return Shape(shape.tails + step[:2], shape.bend + step[2 : 2 + RESPONSE_TERMS])
+    change = np.linalg.solve(normal, right)
+    return Shape(shape.tails + change[:2], shape.bend + change[2 : 2 + RESPONSE_TERMS])
 
 
 def level_prior(shading: Shading, place: Array, sigma: Array, noise: float) -> Prior:

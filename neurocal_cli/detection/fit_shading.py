@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fit_map import Frame, SmoothMap
+from neurocal_cli.detection.fit_robust import median
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
@@ -87,8 +88,9 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
     height, width = image.shape
     u, v = np.rint(places[..., 0]).astype(np.intp), np.rint(places[..., 1]).astype(np.intp)
     values = image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(float)
-    level = np.median(values, axis=1)
-    noise = (1.4826 * np.median(np.abs(values - level[:, None]), axis=1)) ** 2 + 1 / 12
+    half = values.shape[1] // 2
+    level = np.sort(values, axis=1)[:, half]
+    noise = (1.4826 * np.sort(np.abs(values - level[:, None]), axis=1)[:, half]) ** 2 + 1 / 12
     is_dark = (c + r + grid.dark) % 2 == 0
     middle = corners.mean(axis=1)
     dark, light = (
@@ -110,13 +112,13 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     if n == 0:
         return coefficients, np.inf
     terms = _terms(frame, levels.place)
-    residual, spread = levels.level - np.median(levels.level), 0.0
+    residual, spread = levels.level - median(levels.level), 0.0
     most = max([m for m in _TERMS if 3 * m <= n], default=1)
     # From the median on to higher degrees: hidden squares must be known before they can bend anything.
     for used in (*_TERMS, *(most,) * _STEPS):
         used = min(used, most)
         # The median does not see the outliers that the weights have to find.
-        scatter = float(np.median(residual**2)) / 0.455 * n / max(n - used, 1)
+        scatter = median(residual**2) / 0.455 * n / max(n - used, 1)
         weight = np.clip(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6, None) ** 2
         root = np.sqrt(weight / (levels.variance + spread))
         coefficients[:used] = np.linalg.lstsq(
@@ -125,7 +127,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
         residual = levels.level - terms[:, :used] @ coefficients[:used]
         # What the levels' own errors may do by chance is not taken for spread of the squares.
         chance = 1 + 4 / np.sqrt(n)
-        spread = max(scatter - chance * float(np.median(levels.variance)), 0.0)
+        spread = max(scatter - chance * median(levels.variance), 0.0)
     return coefficients, spread
 
 

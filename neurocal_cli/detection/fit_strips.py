@@ -102,6 +102,8 @@ class Strips:
         False for the padding and for pixels outside the strip or the image.
     u, v : (E, N) arrays [px]
         Relative to the line's middle.
+    beyond : (E,) array
+        Share of the strip's pixels that lie outside the image.
     """
 
     s: Single
@@ -110,6 +112,7 @@ class Strips:
     inside: NDArray[np.bool_]
     u: Single
     v: Single
+    beyond: Array
 
 
 def gather(
@@ -159,8 +162,10 @@ def _seen(
     image: NDArray[np.generic], lines: Lines, half_width: Array, low: Array, high: Array, u: Array, v: Array
 ) -> Strips:
     height, width = image.shape
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    place = np.where(inside, v * width + u, 0).astype(np.intp)
+    framed = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    place = (v * width + u).astype(np.intp)
+    if not framed.all():
+        place[~framed] = 0
     value = image.reshape(-1)[place].astype(np.float32)
     du = (u - lines.middle[:, :1]).astype(np.float32)
     dv = (v - lines.middle[:, 1:]).astype(np.float32)
@@ -168,5 +173,10 @@ def _seen(
     s = du * t[:, :1] + dv * t[:, 1:]
     d = du * n[:, :1] + dv * n[:, 1:]
     d -= (0.5 * lines.curvature[:, None]).astype(np.float32) * s * s
-    inside &= (np.abs(d) <= half_width[:, None]) & (s >= low[:, None]) & (s <= high[:, None])
-    return Strips(s, d, value, inside, du, dv)
+    single = np.float32
+    inside = np.abs(d) <= half_width[:, None].astype(single)
+    inside &= (s >= low[:, None].astype(single)) & (s <= high[:, None].astype(single))
+    total = inside.sum(axis=1)
+    inside &= framed
+    beyond = 1 - inside.sum(axis=1) / np.maximum(total, 1)
+    return Strips(s, d, value, inside, du, dv, beyond)

@@ -48,6 +48,8 @@ class VertexData:
         With the sign of the square.
     rho : (V, 1) array
     weight : array [1/DN^2]
+    beyond : (V,) array
+        Share of the strips' pixels that lie outside the image.
     """
 
     s1: Single
@@ -59,6 +61,7 @@ class VertexData:
     Q: Single
     rho: Single
     weight: Single
+    beyond: Array
 
 
 def vertex_lines(at: SmoothMap, grid: Array) -> tuple[Lines, Lines]:
@@ -119,7 +122,9 @@ def vertex_data(
     relative = slope_b / contrast.astype(np.float32)[:, None]
     gain = 1 + u * relative[:, :1] + v * relative[:, 1:]
     rho = (lines[0].normal * lines[1].normal).sum(axis=1).astype(np.float32)[:, None]
-    return VertexData(s1, d1, s2, d2, value, gain, Q, rho, (inside & mine).astype(np.float32))
+    used = (inside & mine).astype(np.float32)
+    beyond = np.maximum(parts[0].beyond, parts[1].beyond)
+    return VertexData(s1, d1, s2, d2, value, gain, Q, rho, used, beyond)
 
 
 def _coordinates(lines: Lines, u: Single, v: Single) -> tuple[Single, Single]:

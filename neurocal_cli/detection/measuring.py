@@ -17,6 +17,7 @@ from neurocal_cli.detection.fit_board import Board, Fitted, fit_all_vertices, fi
 from neurocal_cli.detection.fit_edges import OFFSET, TILT
 from neurocal_cli.detection.fit_newton import BLUR
 from neurocal_cli.detection.fit_profile import profile, response
+from neurocal_cli.detection.fit_robust import median
 from neurocal_cli.detection.fit_vertices import FIRST, SECOND
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.geometry import Array
@@ -24,7 +25,7 @@ from neurocal_cli.geometry import Array
 __all__ = ["measure"]
 
 _ROUNDING = 1 / 12  # DN^2
-_FAR, _HALVINGS = 3.0, 40  # sigma, for the search of the middle level
+_FAR, _PLACES = 3.0, 601  # sigma, and places where the middle level is looked for
 
 
 def measure(
@@ -97,13 +98,13 @@ def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
 
 def _polarity(fitted: Fitted) -> float:
     """How far towards the dark side [px] the middle between the levels lies from the undisturbed edge."""
-    low, high = -_FAR, _FAR
-    for _ in range(_HALVINGS):
-        z = 0.5 * (low + high)
-        light, _, _ = profile(np.array([[z]]), fitted.shape.tails[:1])
-        low, high = (low, z) if response(light, fitted.shape.bend)[0] > 0 else (z, high)
-    sigma = float(np.median(fitted.fit.values[:, BLUR]))
-    return -float(fitted.map.shift[0]) - 0.5 * (low + high) * sigma
+    z = np.linspace(-_FAR, _FAR, _PLACES)[None]
+    light = response(profile(z, fitted.shape.tails[:1])[0], fitted.shape.bend)[0][0]
+    after = max(int(np.argmax(light > 0)), 1)
+    share = light[after] / (light[after] - light[after - 1])
+    zero = z[0, after] - share * (z[0, 1] - z[0, 0])
+    sigma = median(fitted.fit.values[:, BLUR])
+    return -float(fitted.map.shift[0]) - float(zero) * sigma
 
 
 def _vertices(board: Board, fitted: Fitted, vertices: Array) -> Measured:
