@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import struct
 import subprocess
@@ -23,6 +24,13 @@ BOARD = ("--cols", 9, "--rows", 6, "--square", 25)
 
 def detect(*words: object) -> Result:
     return run("detect", *words)
+
+
+@pytest.fixture(autouse=True)
+def own_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command chooses the threads of its process, which is the tests' own here."""
+    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
+        monkeypatch.setenv(name, "1")
 
 
 @pytest.fixture
@@ -70,12 +78,30 @@ def test_points_go_to_stdout_and_the_rest_to_stderr(folder: Path) -> None:
 
 def test_any_number_of_jobs_writes_the_same_bytes(folder: Path, tmp_path: Path) -> None:
     (folder / "bad.png").write_bytes(b"x")
-    one = detect(folder, *BOARD, "--jobs", 1, "--overlay", tmp_path / "one")
-    two = detect(folder, *BOARD, "--jobs", 2, "--overlay", tmp_path / "two")
-    assert one.exit_code == two.exit_code == 0
-    assert (one.stdout, one.stderr) == (two.stdout, two.stderr)
+    done = []
+    for jobs in ("1", "2"):
+        words = ["detect", str(folder), *map(str, BOARD), "--jobs", jobs, "--overlay", str(tmp_path / jobs)]
+        # As users run it: these tests' own process began with other threads than it starts.
+        call = [sys.executable, "-m", "neurocal_cli", *words]
+        done.append(subprocess.run(call, capture_output=True, text=True, check=True))
+    assert (done[0].stdout, done[0].stderr) == (done[1].stdout, done[1].stderr)
     for name in ("board01.png", "board02.png", "board03.png"):
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
+
+
+def test_the_number_of_cores_does_not_show(folder: Path) -> None:
+    """Linear algebra on one thread, whatever the environment of the shell leaves open."""
+    code = (
+        "import os, sys; from neurocal_cli.commands import neurocal; "
+        "neurocal(sys.argv[1:], standalone_mode=False); print(os.environ['OPENBLAS_NUM_THREADS'])"
+    )
+    words = [sys.executable, "-c", code, "detect", str(folder), *map(str, BOARD)]
+    for given, expected in ((None, "1"), ("2", "2")):
+        environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
+        if given is not None:
+            environment["OPENBLAS_NUM_THREADS"] = given
+        done = subprocess.run(words, capture_output=True, text=True, check=True, env=environment)
+        assert done.stdout.splitlines()[-1] == expected
 
 
 def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
@@ -11,7 +12,7 @@ from rendered import condition, picture
 from seen_grids import seen_grid
 
 from neurocal_cli.board import Board, Plane
-from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured
+from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect
 from neurocal_cli.detection.detect import Detection, detect_points, gather, label
 from neurocal_cli.detection.identity import Located
 from neurocal_cli.detection.identity_placement import Placement
@@ -92,6 +93,39 @@ def test_an_image_without_a_board_says_so() -> None:
 def test_a_board_of_another_size_is_not_taken() -> None:
     with pytest.raises(NoBoardError, match="found 9 x 6 inner vertices, the board has 6 x 4"):
         detect_points(picture("base", 0).image, Board.single(6, 4, 28.0))
+
+
+def measuring(monkeypatch: pytest.MonkeyPatch, change: Callable[[Measured], Measured]) -> None:
+    measure = detect.measure
+    monkeypatch.setattr(detect, "measure", lambda *words: change(measure(*words)))
+
+
+def test_points_that_are_no_numbers_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    def spoilt(measured: Measured) -> Measured:
+        covariance, pixels = measured.covariance.copy(), measured.pixels.copy()
+        covariance[0, 1] = 1e3
+        covariance[1, 0] = np.nan
+        covariance[2, 2] = 0.0
+        pixels[3, 0] = np.inf
+        return replace(measured, covariance=covariance, pixels=pixels)
+
+    whole, seen = detected("base", 0)
+    measuring(monkeypatch, spoilt)
+    found = detect_points(seen.image, BOARD)
+    assert len(found.ids) == len(whole.ids) - 4
+    assert found.rejected == whole.rejected + 4
+    gather({"a": found})
+
+
+def test_a_handful_of_points_is_not_a_view(monkeypatch: pytest.MonkeyPatch) -> None:
+    def few(measured: Measured) -> Measured:
+        names = ("kind", "index", "pixels", "covariance")
+        return replace(measured, **{name: getattr(measured, name)[:7] for name in names}, rejected=86)
+
+    seen = detected("base", 0)[1]
+    measuring(monkeypatch, few)
+    with pytest.raises(NoBoardError, match="only 7 of 93 points of the board can be measured"):
+        detect_points(seen.image, BOARD)
 
 
 def test_views_are_gathered_with_their_covariance() -> None:

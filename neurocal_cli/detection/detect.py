@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -23,6 +23,7 @@ __all__ = ["Detection", "Labels", "Points", "detect_points", "gather", "label"]
 
 Points = Literal["midpoints", "vertices"]
 
+_FEWEST = 8  # points; fewer tell hardly more than where the board is
 _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # from a point's index to the other end of its edge, by kind
 _PREFIXES = ("h:", "v:", "")  # of its id, by kind
 
@@ -128,11 +129,15 @@ def detect_points(
     found = find_grids(image) if grids is None else grids
     identified = identify(board, found, image)
     located = identified.located
-    measured = tuple(measure(image, one.grid, points, gamma) for one in located)
+    measured = tuple(_sound(measure(image, one.grid, points, gamma)) for one in located)
     labels = [label(one, points_of) for one, points_of in zip(located, measured, strict=True)]
     orders = [one.order for one in labels]
-    if not any(map(len, orders)):
-        raise NoBoardError("the board is too blurred or too small to measure; show it sharper or nearer")
+    total = sum(map(len, orders))
+    if total < _FEWEST:
+        tried = total + sum(one.rejected for one in measured)
+        raise NoBoardError(
+            f"only {total} of {tried} points of the board can be measured; show it sharper or nearer"
+        )
 
     def joined(parts: Iterable[Array]) -> Array:
         return np.concatenate([part[order] for part, order in zip(parts, orders, strict=True)])
@@ -148,6 +153,18 @@ def detect_points(
         measured,
         identified.warnings,
     )
+
+
+def _sound(measured: Measured) -> Measured:
+    """Without points whose place or covariance is no number to calibrate with."""
+    suu, suv, svv = measured.covariance.T
+    with np.errstate(invalid="ignore", over="ignore"):
+        good = (suu > 0) & (svv > 0) & (suu * svv > suv**2) & np.isfinite(suu * svv)
+    good &= np.isfinite(measured.pixels).all(axis=1)
+    if good.all():
+        return measured
+    parts = {name: getattr(measured, name)[good] for name in ("kind", "index", "pixels", "covariance")}
+    return replace(measured, **parts, rejected=measured.rejected + int((~good).sum()))
 
 
 def label(located: Located, measured: Measured) -> Labels:
