@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.detection.find_grow import Lattice, cropped, framed, frontier
 from neurocal_cli.detection.find_predict import expected
@@ -14,7 +13,9 @@ from neurocal_cli.geometry import Array
 __all__ = ["disputed", "distinct"]
 
 _SAME = 0.25  # of a square's width; between vertices that are the same
-_MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on
+_MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on ...
+_MEETS_PARTLY = 0.22  # ... if few of its row are seen
+_MOSTLY = 0.6  # share of a row
 _COPY = 0.5  # share of vertices in another lattice
 
 
@@ -24,7 +25,7 @@ def distinct(lattices: list[Lattice]) -> list[Lattice]:
     for lattice in sorted(lattices, key=lambda x: -int(x.seen.sum())):
         points = lattice.pixels[lattice.seen]
         reach = _SAME * lattice.width
-        if not any(_near(points, x.pixels[x.seen], reach).mean() > _COPY for x in kept):
+        if not any((_distance(points, x.pixels[x.seen]) < reach).mean() > _COPY for x in kept):
             kept.append(lattice)
     return kept
 
@@ -57,26 +58,33 @@ def _claim(lattice: Lattice) -> tuple[Array, float]:
 
 def _trimmed(lattice: Lattice, claim: tuple[Array, float]) -> Lattice:
     points, width = claim
-    reach = _MEETS * min(width, lattice.width)
-    claimed = np.zeros(lattice.seen.shape, dtype=bool)
-    claimed[lattice.seen] = _near(lattice.pixels[lattice.seen], points, reach)
-    if not claimed.any():
-        return lattice
-    drop = np.zeros_like(claimed)
-    for line in (np.s_[0, :], np.s_[-1, :], np.s_[:, 0], np.s_[:, -1]):
-        known = int(lattice.seen[line].sum())
-        if claimed[line].sum() >= max(2, 0.6 * known):
-            drop[line] = lattice.seen[line]
+    seen = lattice.seen
+    away = np.full(seen.shape, np.inf)
+    away[seen] = _distance(lattice.pixels[seen], points) / min(width, lattice.width)
+    drop = np.zeros_like(seen)
+    for line, inner in _OUTERMOST:
+        known = int(seen[line].sum())
+        # A row that is not whole is likelier to be where a plane ends.
+        meets = _MEETS if known > 0.75 * seen[inner].sum() else _MEETS_PARTLY
+        if known and (away[line][seen[line]] < meets).mean() >= _MOSTLY:
+            drop[line] = seen[line]
     if not drop.any():
         return lattice
     pixels = np.where(drop[..., None], np.nan, lattice.pixels)
-    contrast = np.where(drop, np.nan, lattice.contrast)
-    return cropped(replace(lattice, pixels=pixels, contrast=contrast))
+    return cropped(replace(lattice, pixels=pixels, contrast=np.where(drop, np.nan, lattice.contrast)))
 
 
-def _near(points: Array, others: Array, reach: float) -> NDArray[np.bool_]:
-    """(N,) which points have one of the others within reach."""
+_OUTERMOST = (
+    (np.s_[0, :], np.s_[1, :]),
+    (np.s_[-1, :], np.s_[-2, :]),
+    (np.s_[:, 0], np.s_[:, 1]),
+    (np.s_[:, -1], np.s_[:, -2]),
+)
+
+
+def _distance(points: Array, others: Array) -> Array:
+    """(N,) from each point to the nearest of the others [px]."""
     if not len(points) or not len(others):
-        return np.zeros(len(points), dtype=bool)
+        return np.full(len(points), np.inf)
     away = points[:, None] - others[None]
-    return np.asarray((away**2).sum(axis=-1).min(axis=1) < reach**2)
+    return np.asarray(np.sqrt((away**2).sum(axis=-1).min(axis=1)))

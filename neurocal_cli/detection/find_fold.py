@@ -105,9 +105,9 @@ def _fold(second: Array, width: float) -> tuple[float, float]:
         return 0.0, 0.0
     before, after, far = (np.full_like(second, np.nan) for _ in range(3))
     before[1:], after[:-1], far[:-2] = second[:-1], second[1:], second[2:]
-    at = _size(_against(second, before, after))
+    at = _size(_against_one_or_both(second, before, after))
     # Between row i and i + 1.
-    between = _BETWEEN * _size(_against(0.5 * (second + after), before, far))
+    between = _BETWEEN * _size(0.5 * (second + after - before - far))
     size = np.stack([at, between], axis=-1).ravel()
     best = int(size.argmax())
     others = np.abs(np.arange(2 * rows) - best) > 3
@@ -119,7 +119,7 @@ def _fold(second: Array, width: float) -> tuple[float, float]:
     return 0.5 * best, float(size[best])
 
 
-def _against(values: Array, first: Array, second: Array) -> Array:
+def _against_one_or_both(values: Array, first: Array, second: Array) -> Array:
     """Differences from the mean of two arrays, reduced where one of them is unknown."""
     both = values - 0.5 * (first + second)
     one = _ONE_SIDED * (values - np.where(np.isnan(first), second, first))
@@ -127,7 +127,9 @@ def _against(values: Array, first: Array, second: Array) -> Array:
 
 
 def _size(values: Array) -> Array:
-    """Root mean square of each row's vectors; 0 where fewer than two are known."""
-    square = (values**2).sum(axis=-1)
-    count = np.isfinite(square).sum(axis=1)
-    return np.where(count >= 2, np.sqrt(np.nansum(square, axis=1) / np.maximum(count, 1)), 0.0)
+    """Median length of each row's vectors; 0 where fewer than two are known."""
+    length = np.sqrt((values**2).sum(axis=-1))
+    count = np.isfinite(length).sum(axis=1)
+    size = np.zeros(len(length))
+    size[count >= 2] = np.nanmedian(length[count >= 2], axis=1)
+    return size

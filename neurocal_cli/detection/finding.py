@@ -62,7 +62,10 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
 def _separated(level: Level, lattices: list[Lattice]) -> list[Lattice]:
     """Grids of one plane each."""
     result = []
-    for lattice in disputed(distinct(lattices)):
+    several = distinct(lattices)
+    if len(several) > 1:
+        several = [part for x in disputed(several) for part in _boards(cleaned(level, x))]
+    for lattice in several:
         planes = [part for part in unfolded(lattice) if has_block(part)]
         if len(planes) > 1 or (planes and planes[0].seen.sum() < lattice.seen.sum()):
             # What was taken out at a fold for lying between two planes may belong to one.
