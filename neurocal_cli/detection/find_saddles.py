@@ -24,6 +24,8 @@ _RADII = (5.0, 3.0)  # px; of the rings, the better one first
 _RAYS = 32
 _MOST_BENT = np.radians(22)  # of a line on its way through the vertex
 _MOST_DIFFERENT = np.radians(14)  # between two rings
+_SHARPEST = 3.0  # standard deviations of the noise
+_ROUNDEST = 0.02  # ratio of the principal curvatures: along a bright stripe it is 0
 _NARROWEST = np.radians(14)
 _PER_MEGAPIXEL = 4000  # saddles that are looked at ...
 _MOST = 1400  # ... and kept
@@ -73,23 +75,42 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     noise = level.noise
     rings = [_ring(sampled(level.smooth, points[:, None] + r * _DIRECTIONS), noise) for r in _RADII]
     (ports, contrast, good), (ports_small, contrast_small, good_small) = rings
-    # Where squares are small, the large ring reaches into the next ones: then both rings differ.
-    differ = np.abs(_wrapped(ports - ports_small)).max(axis=1) > _MOST_DIFFERENT
-    good &= ~(good_small & differ)
+    curved, sharp = _curved(level, points)
+    # Where squares are small, rings reach into the next ones: trust a ring that agrees with a
+    # smaller one, and curvature where none does.
+    good &= ~(good_small & (_differ(ports, ports_small) > _MOST_DIFFERENT))
+    astray = _differ(ports_small, curved) > 2 * _MOST_DIFFERENT
+    ports_small = np.where(astray[:, None], curved, ports_small)
     ports = np.where(good[:, None], ports, ports_small)
     contrast = np.where(good, contrast, contrast_small)
-    kept = np.flatnonzero(good | good_small)
+    kept = np.flatnonzero((good | good_small) & sharp)
     kept = kept[np.argsort(-contrast[kept], kind="stable")[:_MOST]]
     return Saddles(points[kept], ports[kept], contrast[kept])
 
 
+def _curved(level: Level, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Ports from the second derivatives, and whether both principal curvatures stand out from noise."""
+    u, v = np.rint(points.T).astype(np.intp)
+    uu, uv, vv = (x[v, u].astype(float) for x in level.curvature)
+    middle, radius = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
+    rising, falling = np.maximum(middle + radius, 1e-9), np.maximum(radius - middle, 1e-9)
+    weaker, stronger = np.minimum(rising, falling), np.maximum(rising, falling)
+    sharp = (weaker > _SHARPEST * level.noise) & (weaker > _ROUNDEST * stronger)
+    # Dark sectors lie to both sides of the direction in which brightness falls off.
+    dark = 0.5 * np.arctan2(2 * uv, uu - vv) + np.pi / 2
+    half = np.arctan(np.sqrt(falling / rising))
+    ports = np.stack([dark - half, dark + half, dark - half + np.pi, dark + half + np.pi], axis=-1)
+    return ports, sharp
+
+
+def _differ(first: Array, second: Array) -> Array:
+    """Largest angle between two sets of ports, whichever of the opposite ones come first."""
+    away = first[:, :2] - second[:, :2]
+    return np.abs((away + np.pi / 2) % np.pi - np.pi / 2).max(axis=1)
+
+
 _ANGLES = 2 * np.pi / _RAYS * np.arange(_RAYS)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
-
-
-def _wrapped(angle: Array) -> Array:
-    """Angles from -pi to pi."""
-    return np.asarray((angle + np.pi) % (2 * np.pi) - np.pi)
 
 
 def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:

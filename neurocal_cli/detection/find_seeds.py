@@ -20,7 +20,8 @@ __all__ = ["Links", "find_links", "find_seeds"]
 Index = NDArray[np.intp]
 
 _WIDEST = 0.26  # rad; between a port and the way to the neighbour
-_SHARE = 0.4  # the same as a share of the vertex's narrower angle
+_SHARE = 0.45  # the same as a share of the vertex's narrower angle
+_ASIDE = 2.0  # px; the neighbour may be off the port's direction by so much anyway
 _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
 _IRREGULAR = 0.12  # squares; how much a seed's second differences may vary ...
 _BENT = 0.4  # ... as a share of what they may be
@@ -49,9 +50,7 @@ def find_links(level: Level, saddles: Saddles) -> Links:
     du, dv = (place[None, :, k] - place[:, None, k] for k in (0, 1))
     distance = du * du + dv * dv
     np.fill_diagonal(distance, np.inf)
-    opening = saddles.ports[:, 1] - saddles.ports[:, 0]
-    tolerance = np.minimum(_WIDEST, _SHARE * np.minimum(opening, np.pi - opening))
-    port = _port_towards(du, dv, distance, saddles.ports, tolerance)
+    port = _port_towards(du, dv, saddles.ports)
     contrast = saddles.contrast.astype(np.float32)
     fit = (port >= 0) & (port.T >= 0) & ((port ^ port.T) & 1 == 1)
     fit &= contrast[:, None] > _SIMILAR * contrast[None, :]
@@ -72,20 +71,18 @@ def find_links(level: Level, saddles: Saddles) -> Links:
     return Links(to, entry)
 
 
-def _port_towards(
-    du: NDArray[np.float32],
-    dv: NDArray[np.float32],
-    square: NDArray[np.float32],
-    ports: Array,
-    tolerance: Array,
-) -> NDArray[np.int8]:
+def _port_towards(du: NDArray[np.float32], dv: NDArray[np.float32], ports: Array) -> NDArray[np.int8]:
     """(N, N) the port of each saddle that leads to each other one, or -1."""
     port = np.full(du.shape, -1, dtype=np.int8)
-    limit = (np.cos(tolerance) ** 2).astype(np.float32)[:, None]
+    opening = ports[:, 1] - ports[:, 0]
+    widest = _SHARE * np.minimum(opening, np.pi - opening)
+    usual, most = (np.tan(x).astype(np.float32)[:, None] for x in (np.minimum(_WIDEST, widest), widest))
     for line in range(2):
         c, s = (f(ports[:, line]).astype(np.float32)[:, None] for f in (np.cos, np.sin))
-        along = c * du + s * dv
-        close = along * along > limit * square
+        along, across = c * du + s * dv, np.abs(c * dv - s * du)
+        reach = np.abs(along)
+        # Directions are only known to a pixel or two at the end of a short edge.
+        close = across < np.maximum(usual * reach, np.minimum(most * reach, _ASIDE))
         port[close & (along > 0)] = line
         port[close & (along < 0)] = line + 2
     return port
