@@ -259,6 +259,16 @@ def test_a_turned_image_is_used_and_said_once(folder: Path) -> None:
     assert first.startswith("note: board01 and 2 more: turned by 180 degrees, as its EXIF orientation says")
 
 
+@pytest.mark.parametrize("words", [["detect", "--help"], ["calibrate", str(SAMPLES / "flat.csv")]])
+def test_opencv_is_loaded_for_images_only(words: list[str]) -> None:
+    code = (
+        "import sys; from neurocal_cli.commands import neurocal; "
+        "neurocal(sys.argv[1:], standalone_mode=False); print(*sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, check=True)
+    assert not {name for name in done.stderr.split() if name == "cv2"}
+
+
 def test_detected_points_calibrate_the_camera(tmp_path: Path) -> None:
     points = tmp_path / "points.csv"
     assert detect(f"{SAMPLES}/board*.png", *BOARD, "-o", points).exit_code == 0

@@ -8,17 +8,17 @@ from functools import cache
 
 import numpy as np
 import pytest
-from rendered import condition, picture
-from seen_grids import seen_grid
+from rendered import Recipe, board_pose, condition, picture, single
+from seen_grids import labelled_vertices, seen_grid
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect
 from neurocal_cli.detection.detect import Detection, detect_points, gather, label
-from neurocal_cli.detection.identity import Located
+from neurocal_cli.detection.identity import Identified, Located
 from neurocal_cli.detection.identity_placement import Placement
 from neurocal_cli.detection.identity_words import NoBoardError
 from neurocal_cli.errors import InputError
-from neurocal_cli.rendering import Rendered
+from neurocal_cli.rendering import Rendered, render
 
 BOARD = Board.single(9, 6, 28.0)
 
@@ -56,6 +56,32 @@ def test_points_are_where_the_ids_say(name: str) -> None:
         if not turned:
             np.testing.assert_allclose(found.world, expected[:, :3], atol=1e-9)
         assert found.image_size == (640, 480)
+
+
+def test_ids_stay_on_their_places_while_the_board_turns_in_its_plane() -> None:
+    scene = single(Recipe(zoom=0.5, square=28, margin=0.3), np.random.default_rng(5))
+    firsts = set()
+    for k in range(24):
+        pose = board_pose(scene, np.array([160.0, 120.0]), 13.0, 25.0, 0.5, np.pi / 12 * k)
+        seen = render(replace(scene, pose=pose), np.random.default_rng(k))
+        (one,) = detect_points(seen.image, scene.board, "vertices").located
+        names = labelled_vertices(Identified((one,)))
+        assert len(names) == 54
+        corners = seen.truth.planes[0].vertices[[0, -1], [0, -1]]
+        near = np.hypot(*(names["0:0"] - corners).T) < 1
+        assert near.sum() == 1
+        firsts.add(bool(near[0]))
+    assert len(firsts) == 1
+
+
+def test_vertices_are_measured_when_asked_for() -> None:
+    seen = detected("base", 0)[1]
+    found = detect_points(seen.image, BOARD, "vertices")
+    assert found.ids[0] == "0:0"
+    assert len(found.ids) >= 50
+    truth = seen.truth.planes[0].vertices.reshape(-1, 2)
+    distances = np.hypot(*np.moveaxis(found.pixels[:, None] - truth, -1, 0)).min(axis=1)
+    assert distances.max() < 0.1
 
 
 def test_points_come_in_the_order_of_the_board() -> None:

@@ -68,7 +68,7 @@ def test_the_first_vertex_is_where_opencv_begins() -> None:
 @pytest.mark.parametrize("name", ["board cut", "occluded"])
 def test_a_part_of_the_board_is_placed_by_the_ends_that_are_seen_or_refused(name: str) -> None:
     placed = 0
-    for seed in range(8):
+    for seed in range(5):
         scene, seen = condition(name, seed), picture(name, seed)
         try:
             found = labelled_vertices(identify(scene.board, seen_grids(scene, seen), seen.image))
@@ -78,7 +78,7 @@ def test_a_part_of_the_board_is_placed_by_the_ends_that_are_seen_or_refused(name
         placed += 1
         found = found if scene.targets[0].first_black else turned_by(found, 9, 6)
         assert same(found, true_vertices(seen))
-    assert placed >= 6
+    assert placed >= 4
 
 
 def test_a_part_that_could_be_anywhere_is_refused() -> None:
@@ -166,7 +166,7 @@ def test_no_grid_is_no_board() -> None:
         identify(Board.single(9, 6, 25), [], EMPTY)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize(
     "name",
     ["two planes", "two planes distorted", "two planes across", "three planes", "three planes across"],
