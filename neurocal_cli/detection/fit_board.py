@@ -11,7 +11,7 @@ from neurocal_cli.detection.fit_edges import OFFSET, EdgeData, edge_data, fit_ed
 from neurocal_cli.detection.fit_gate import believable, smooth
 from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
-from neurocal_cli.detection.fit_noise import Noise, level_prior, profile_shape
+from neurocal_cli.detection.fit_noise import Noise, blur_of, level_prior, profile_shape
 from neurocal_cli.detection.fit_profile import RESPONSE_TERMS, box_kurtosis
 from neurocal_cli.detection.fit_robust import MapFit, Rows, choose_map, fit_map, median
 from neurocal_cli.detection.fit_shading import Levels, Shading, fit_shading, square_levels
@@ -137,6 +137,17 @@ class Fitted:
     noise: Noise
     good: NDArray[np.bool_]
 
+    @property
+    def unevenness(self) -> float:
+        """Variance [px^2] of the edges around the smooth map that their fits cannot explain.
+
+        A print or a board that is not even, and pixels that the model does not describe: for a camera,
+        noise of the points like any other.
+        """
+        if not self.good.any():
+            return 0.0
+        return max(self.map.excess - 1, 0.0) * median(self.fit.covariance[self.good, OFFSET, OFFSET])
+
 
 def fit_board(board: Board) -> Fitted:
     """All stages: map of the found vertices, moments, a first fit, what edges share, the last fit."""
@@ -207,12 +218,13 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     """Edges fitted with what all of them share, and the map through them."""
     fit, good, n = first.fit, first.good, len(first.good)
     shading = _shading(first)
-    sigma = np.full(n, median(fit.values[good, BLUR]))
+    usual, spread = blur_of(fit, good)
+    sigma = np.full(n, usual)
     lines = board.lines(first.map.map)
     reach = _REACH * sigma
     data = _pixels(board, lines, sigma, shading, reach, 1)
     data = with_weight(data, np.full_like(data.weight, 1 / first.noise.edge))
-    prior = level_prior(shading, lines.middle, sigma, first.noise.edge)
+    prior = level_prior(shading, lines.middle, sigma, spread, first.noise.edge)
     offset = first.map.residual[:n] + first.map.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     half_length = 0.5 * lines.length
@@ -227,7 +239,7 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     trusted = np.where(smooth(fit), variance, _ANCHOR**2)
     mapped = fit_map(first.map.map, board.rows(lines, fit.values[:, OFFSET], trusted), first.map.shift)
     expected = variance + mapped.map.variance(board.edges.centre, lines.normal)
-    departure = mapped.residual[:n] / np.sqrt(expected * max(mapped.excess, 1.0))
+    departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
     good = believable(fit, departure, data.beyond)
     return Fitted(lines, fit, data, mapped, shading, shape, noise, good)
 
@@ -247,13 +259,14 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + board.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
-    sigma = np.full(len(grid), median(fitted.fit.values[:, BLUR]))
+    usual, spread = blur_of(fitted.fit, fitted.good)
+    sigma = np.full(len(grid), usual)
     contrast = fitted.shading.at(place)[1]
     slopes = fitted.shading.slopes(place)
     data = vertex_data(board.image, lines, light, sigma, _REACH, slopes, contrast)
     tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
     shape = Shape(tails, fitted.shape.bend)
-    prior = level_prior(fitted.shading, place, sigma, fitted.noise.edge)
+    prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     half = (0.5 * lines[0].length, 0.5 * lines[1].length)
     unit = replace(data, weight=data.weight / np.float32(fitted.noise.edge))
@@ -262,10 +275,10 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     fit = fit_vertices(replace(data, weight=weight), fit.values, prior, half, shape, _STEPS)
     fit = fit.scaled(median(fit.chi2 / np.maximum(fit.count, 1)))
     departure = np.zeros(len(grid))
-    for line, place in zip(lines, (FIRST, SECOND), strict=True):
-        variance = fit.covariance[:, place, place] + fitted.map.map.variance(grid, line.normal)
-        variance *= max(fitted.map.excess, 1.0)
-        departure = np.maximum(departure, np.abs(fit.values[:, place]) / np.sqrt(variance))
+    for line, which in zip(lines, (FIRST, SECOND), strict=True):
+        variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
+        variance *= fitted.map.excess
+        departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
     return fit, lines, believable(fit, departure, data.beyond)
 
 

@@ -161,7 +161,7 @@ def fit_edges(
 
 def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Linear:
     """The model and its derivatives; ``lever`` is s over the half length."""
-    offset, tilt, mean, contrast, sigma = (x.astype(np.float32)[:, None] for x in values.T)
+    offset, tilt, mean, contrast, sigma = (x.astype(data.value.dtype)[:, None] for x in values.T)
     z = data.d - offset
     z -= tilt * lever
     z /= sigma
@@ -177,7 +177,7 @@ def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Li
         F = x
     slope *= data.gain
     slope *= -contrast / sigma
-    jacobian = np.empty((len(z), 5, z.shape[1]), dtype=np.float32)
+    jacobian = np.empty((len(z), 5, z.shape[1]), dtype=x.dtype)
     jacobian[:, OFFSET] = slope
     np.multiply(slope, lever, out=jacobian[:, TILT])
     jacobian[:, MEAN] = 1

@@ -17,6 +17,7 @@ _MOST_BEYOND = 0.3
 _LEAST_COUNT = 8
 _LIMIT = 6.0  # standard deviations
 _ROUGH = 0.5  # relative excess of chi2 that is never held against a fit
+_LEAST_SHARE = 0.2  # of good fits; fewer are so by chance, and what they share is not the board's
 _MOST_STEP = 1.0  # standard deviations that the last step may have
 
 
@@ -51,4 +52,5 @@ def believable(fit: Fit, departure: Array, beyond: Array) -> NDArray[np.bool_]:
     usual = median(rough[good]) if good.any() else 1.0
     scatter = 1.4826 * median(np.abs(rough[good] - usual)) if good.any() else 0.0
     chance = usual * np.sqrt(2 / np.maximum(fit.count, 1))
-    return good & (rough - usual < _LIMIT * np.maximum(scatter, chance) + _ROUGH * usual)
+    good &= rough - usual < _LIMIT * np.maximum(scatter, chance) + _ROUGH * usual
+    return good & (good.mean() > _LEAST_SHARE) if len(good) else good

@@ -20,17 +20,17 @@ from neurocal_cli.detection.fit_robust import median
 from neurocal_cli.detection.fit_shading import Shading
 from neurocal_cli.geometry import Array
 
-__all__ = ["Noise", "level_prior", "profile_shape"]
+__all__ = ["Noise", "blur_of", "level_prior", "profile_shape"]
 
 Single = NDArray[np.float32]
 
 _FLAT = 0.95  # light, of -1 to 1, beyond which the levels are reached but for little
 # Noise that seems smaller than this share of the largest, as that of clipped pixels does, is not believed.
 _LEAST_SHARE = 0.3
-_BLUR_SPREAD = 0.05  # of single edges' blur around the board's
+_BLUR_SPREAD = 0.03  # relative, of single edges' blur around the board's at least
 _ENOUGH = 10000  # pixels to learn the profile's shape from
 _RIDGE = 1e-5
-_LEAST_SPREAD = 0.002  # of levels, in variances of the noise
+_LEAST_SPREAD = 0.0002  # of levels, in variances of the noise
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,15 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     return Shape(shape.tails + change[:2], shape.bend + change[2 : 2 + RESPONSE_TERMS])
 
 
-def level_prior(shading: Shading, place: Array, sigma: Array, noise: float) -> Prior:
+def blur_of(fit: Fit, good: NDArray[np.bool_]) -> tuple[float, float]:
+    """Blur [px] of a board and the variance [px^2] of its edges' blur, beyond that of the fits."""
+    sigma = fit.values[good, BLUR]
+    usual = median(sigma)
+    scatter = median((sigma - usual) ** 2) / 0.455
+    return usual, max(scatter - 2 * median(fit.covariance[good, BLUR, BLUR]), 0.0)
+
+
+def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: float, noise: float) -> Prior:
     """What the whole board tells about the levels and the blur of single edges.
 
     Parameters
@@ -118,6 +126,9 @@ def level_prior(shading: Shading, place: Array, sigma: Array, noise: float) -> P
     shading : Shading
     place : (E, 2) array [px]
     sigma : (E,) array [px]
+        Blur.
+    blur_spread : float [px^2]
+        Variance of single edges' blur around that.
     noise : float [DN^2]
         Variance of a pixel.
     """
@@ -127,5 +138,5 @@ def level_prior(shading: Shading, place: Array, sigma: Array, noise: float) -> P
     # Of A = (light + dark) / 2 and B = (light - dark) / 2, from those of dark and light.
     precision[:, MEAN, MEAN] = precision[:, CONTRAST, CONTRAST] = high + low
     precision[:, MEAN, CONTRAST] = precision[:, CONTRAST, MEAN] = high - low
-    precision[:, BLUR, BLUR] = 1 / (_BLUR_SPREAD * sigma) ** 2
+    precision[:, BLUR, BLUR] = 1 / (blur_spread + (_BLUR_SPREAD * sigma) ** 2)
     return Prior(np.stack([mean, contrast, sigma], axis=-1), precision)

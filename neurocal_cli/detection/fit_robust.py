@@ -17,6 +17,8 @@ FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3
 
 _STEPS = 15
 _SHIFT_PRIOR = 1e-2  # 1/px^2
+_TINY = 1e-300
+_BELIEF = 20  # rows' worth of belief that variances are what they claim to be
 _SETTLED = 0.1  # of chi2
 _DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
 _TUKEY = 6.0  # standard deviations beyond which a row counts as an outlier
@@ -81,7 +83,8 @@ class MapFit:
     chi2 : float
         Tukey's loss, about the number of good rows less that of parameters.
     excess : float
-        Variance of the good rows that tell something about the map, as a multiple of what they claim.
+        Variance of the good rows that tell something about the map, as a multiple of what they claim;
+        1 as long as it may be that by chance, less where it is less.
     """
 
     map: SmoothMap
@@ -195,7 +198,7 @@ def _residual(now: SmoothMap, rows: Rows, shift: Array, free: NDArray[np.intp]) 
 
 def _solved(normal: Array, gradient: Array, damping: float) -> Array:
     """Solution of damped normal equations whose parameters have very different sizes."""
-    size = 1 / np.sqrt(np.diag(normal))
+    size = 1 / np.sqrt(np.maximum(np.diag(normal), _TINY))
     scaled = normal * size[:, None] * size
     scaled[np.diag_indices_from(scaled)] += damping
     return np.asarray(size * np.linalg.solve(scaled, gradient * size))
@@ -210,10 +213,12 @@ def _finished(now: SmoothMap, rows: Rows, shift: Array, residual: Array, jacobia
     normal[np.diag_indices_from(normal)] += np.concatenate(
         [now.prior[free], np.full(len(shift), _SHIFT_PRIOR)]
     )
-    size = 1 / np.sqrt(np.diag(normal))
+    size = 1 / np.sqrt(np.maximum(np.diag(normal), _TINY))
     inverse = np.linalg.inv(normal * size[:, None] * size) * size[:, None] * size
     telling = good & (rows.variance < 100 * median(rows.variance))
     left = int(telling.sum()) - len(free) - len(shift)
+    excess = float((z[telling] ** 2).sum()) / max(left, 0.2 * len(z))
+    shrunk = min(1.0, (excess * left + _BELIEF) / (left + _BELIEF)) if left > 0 else 1.0
     covariance = np.zeros((len(now.parameters),) * 2)
     covariance[np.ix_(free, free)] = inverse[: len(free), : len(free)]
     return MapFit(
@@ -223,5 +228,5 @@ def _finished(now: SmoothMap, rows: Rows, shift: Array, residual: Array, jacobia
         residual=residual,
         weight=weight,
         chi2=float((z[good] ** 2).sum()),
-        excess=float((z[telling] ** 2).sum()) / max(left, 0.2 * len(z)),
+        excess=excess if excess > 1 + 3 * np.sqrt(2 / max(left, 1)) else shrunk,
     )

@@ -18,6 +18,7 @@ _LATTICE = np.linspace(0.25, 0.75, 8)  # of a square; its interior, away from th
 _STEPS = 2  # after the last degree
 _TUKEY = 5.0  # standard deviations beyond which a level counts as an outlier
 _TINY = 1e-9  # DN^2
+_LEAST_CONTRAST = 1e-3  # DN; where there is none, the fits fail by themselves but must not divide by it
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 
 
@@ -50,7 +51,7 @@ class Shading:
     dark, light : (6,) arrays [DN]
         Coefficients of 1, x, y, x^2, x y, y^2.
     spread : (2,) array [DN^2]
-        Variance of single squares' levels around the dark and the light polynomial.
+        Variance of single squares' levels around the dark and the light polynomial, and of these.
     """
 
     frame: Frame
@@ -62,7 +63,7 @@ class Shading:
         """Mean level and half contrast at places (N, 2)."""
         terms = _terms(self.frame, place)
         dark, light = terms @ self.dark, terms @ self.light
-        return 0.5 * (light + dark), 0.5 * (light - dark)
+        return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
 
     def slopes(self, place: Array) -> tuple[Array, Array]:
         """Gradients [DN/px] of mean level and half contrast at places (N, 2); (N, 2) arrays."""
@@ -128,7 +129,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
         # What the levels' own errors may do by chance is not taken for spread of the squares.
         chance = 1 + 4 / np.sqrt(n)
         spread = max(scatter - chance * median(levels.variance), 0.0)
-    return coefficients, spread
+    return coefficients, spread + most / n * median(levels.variance)
 
 
 def _terms(frame: Frame, place: Array) -> Array:

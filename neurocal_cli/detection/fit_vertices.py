@@ -164,7 +164,9 @@ def fit_vertices(
 
 def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, shape: Shape) -> Linear:
     """The model and its derivatives; ``levers`` are s over the half lengths."""
-    offset1, tilt1, offset2, tilt2, mean, contrast, sigma = (x.astype(np.float32)[:, None] for x in values.T)
+    offset1, tilt1, offset2, tilt2, mean, contrast, sigma = (
+        x.astype(data.value.dtype)[:, None] for x in values.T
+    )
     z1 = (data.d1 - offset1 - tilt1 * levers[0]) / sigma
     z2 = (data.d2 - offset2 - tilt2 * levers[1]) / sigma
     E1, slope1, density1 = profile(z1, shape.tails)
@@ -180,7 +182,7 @@ def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, s
     factor = -contrast / sigma * steep * data.gain
     by_z1 *= factor
     by_z2 *= factor
-    jacobian = np.empty((len(x), 7, x.shape[1]), dtype=np.float32)
+    jacobian = np.empty((len(x), 7, x.shape[1]), dtype=x.dtype)
     jacobian[:, FIRST], jacobian[:, FIRST + 1] = by_z1, by_z1 * levers[0]
     jacobian[:, SECOND], jacobian[:, SECOND + 1] = by_z2, by_z2 * levers[1]
     jacobian[:, 4] = 1

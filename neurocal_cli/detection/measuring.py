@@ -55,6 +55,8 @@ def measure(
     light = image if gamma is None else _linear(image, gamma)
     floor = _ROUNDING if np.issubdtype(light.dtype, np.integer) else 0.0
     board = Board.of(light, grid, floor)
+    if len(board.edges.index) == 0:
+        return _nothing(grid)
     fitted = fit_board(board)
     vertices = np.full(grid.pixels.shape, np.nan)
     seen = grid.seen
@@ -74,6 +76,13 @@ def measure(
     )
 
 
+def _nothing(grid: Grid) -> Measured:
+    none = np.zeros(0)
+    index = np.zeros((0, 2), dtype=np.int64)
+    vertices = np.full(grid.pixels.shape, np.nan)
+    return Measured(index[:, 0], index, none.reshape(0, 2), none.reshape(0, 3), vertices, 0, 0.0)
+
+
 def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
     """Pixels (E, 2) and covariances (E, 3): along the edges from the map, across from the edges."""
     lines, fit, mapped = fitted.lines, fitted.fit, fitted.map
@@ -82,8 +91,9 @@ def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
     d = fit.values[:, OFFSET] + fit.values[:, TILT] * s / (0.5 * lines.length)
     d += 0.5 * lines.curvature * s * s - mapped.shift[0]
     pixels = lines.middle + s[:, None] * lines.tangent + d[:, None] * lines.normal
-    along = mapped.map.variance(centre, lines.tangent) * max(mapped.excess, 1.0)
-    across = fit.covariance[:, OFFSET, OFFSET] + mapped.shift_variance[0]
+    along = mapped.map.variance(centre, lines.tangent) * mapped.excess
+    across = fit.covariance[:, OFFSET, OFFSET] * min(mapped.excess, 1.0) + mapped.shift_variance[0]
+    across += fitted.unevenness
     (tu, tv), (nu, nv) = lines.tangent.T, lines.normal.T
     covariance = np.stack(
         [
@@ -115,7 +125,8 @@ def _vertices(board: Board, fitted: Fitted, vertices: Array) -> Measured:
     pixels = first.middle + (inverse @ offsets[:, :, None])[:, :, 0]
     spread = fit.covariance[:, [[FIRST], [SECOND]], [FIRST, SECOND]]
     spread = inverse @ spread @ inverse.swapaxes(1, 2)
-    covariance = np.stack([spread[:, 0, 0], spread[:, 0, 1], spread[:, 1, 1]], axis=-1)
+    uneven = fitted.unevenness
+    covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
     index = np.argwhere(board.grid.seen)[:, ::-1]
     vertices[tuple(index[:, ::-1].T)] = np.where(good[:, None], pixels, np.nan)
     return Measured(

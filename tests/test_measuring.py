@@ -1,0 +1,226 @@
+"""Measured mid-points and vertices are as good as physics allows, and know how good they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from measured import errors, found, places, take
+
+from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Grid
+from neurocal_cli.detection.measuring import measure
+from neurocal_cli.rendering import edge_bound
+
+PHOTOS = Path(__file__).resolve().parents[2] / "shared" / "data" / "opencv_stereo"
+
+# Conditions in which the bound is to be met within a fifth, and those where a factor of two is allowed:
+# blur as wide as the squares, unknown responses, clipped light, hardly any pixels.
+BEST = (
+    "base",
+    "noise 0.5",
+    "noise 5",
+    "noise 12",
+    "psf 0.5",
+    "poisson",
+    "tilt 0",
+    "tilt 50",
+    "tilt 65",
+    "k1 -0.3",
+    "k1 -0.4 wide",
+    "skew",
+    "illumination",
+    "vignetting",
+    "clutter",
+    "narrow margin",
+    "two planes",
+    "two planes distorted",
+    "two planes across",
+    "2 Mpx",
+    "5 Mpx",
+)
+GOOD = (
+    "psf 2",
+    "psf 3",
+    "tilt 75",
+    "16 bit",
+    "gamma 2.2",
+    "srgb",
+    "saturated",
+    "squares 16",
+    "squares 10",
+    "squares 6",
+    "low contrast",
+    "mix",
+    "three planes",
+    "three planes across",
+    "stress 1",
+    "stress 2",
+)
+
+
+@pytest.mark.parametrize("name", ["base", "tilt 65", "k1 -0.3"])
+def test_midpoints_reach_the_bound(name: str) -> None:
+    found_errors = errors(name, range(2))
+    assert found_errors.ratio < 1.2
+    assert 0.7 < found_errors.normalised < 1.4  # two pictures: wider than for eight
+    assert found_errors.kept == 1
+    assert found_errors.rms < 0.0036
+
+
+def test_vertices_reach_the_bound() -> None:
+    found_errors = errors("base", range(2, 4), "vertices")
+    assert found_errors.ratio < 1.2
+    assert 0.7 < found_errors.normalised < 1.4
+    assert found_errors.kept == 1
+
+
+def test_gamma_is_found_from_the_edges_and_taken_off() -> None:
+    found_errors = errors("gamma 2.2", range(1))
+    assert found_errors.ratio < 1.5
+    assert 0.25 < found_errors.polarity[0] < 0.4
+    known = errors("gamma 2.2", range(1), gamma=2.2)
+    assert known.ratio < 1.5
+    assert abs(known.polarity[0]) < 0.02
+
+
+def test_hidden_edges_are_left_out() -> None:
+    found_errors = errors("occluded", range(3), hidden=True)
+    assert found_errors.kept >= 0.99
+    assert found_errors.rms < 0.004
+    assert found_errors.hidden_kept <= 3  # the occluder only just touches the strip around them
+
+
+def test_result_is_complete_and_repeatable() -> None:
+    _, picture = take("base", 5)
+    plane = picture.truth.planes[0]
+    grid, mirrored = found(plane, 5)
+    first, again = (measure(picture.image, grid) for _ in range(2))
+    np.testing.assert_array_equal(first.pixels, again.pixels)
+    assert first.rejected == 0
+    assert sorted(places(first, plane, mirrored)) == list(range(len(plane.midpoints)))
+    assert set(first.kind) == {EDGE_H, EDGE_V}
+    assert np.isfinite(first.vertices).all()
+    assert np.abs(first.vertices - (plane.vertices[:, ::-1] if mirrored else plane.vertices)).max() < 0.02
+    vertices = measure(picture.image, grid, "vertices")
+    assert set(vertices.kind) == {VERTEX}
+    np.testing.assert_array_equal(vertices.pixels, vertices.vertices[tuple(vertices.index[:, ::-1].T)])
+
+
+def test_start_does_not_matter() -> None:
+    _, picture = take("k1 -0.3", 6)
+    plane = picture.truth.planes[0]
+    bound = edge_bound(2.02, 196, np.sqrt(0.8**2 + 1 / 12), 36)
+    results = []
+    for start, blur in ((1, 0.0), (2, 0.5), (3, 0.5)):
+        grid, _ = found(plane, start, blur)
+        results.append(measure(picture.image, grid).pixels)
+    assert np.abs(results[1] - results[0]).max() < 2 * bound
+    assert np.sqrt(((results[2] - results[0]) ** 2).mean()) < 0.3 * bound
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
+def test_kinds_of_images_agree(dtype: type) -> None:
+    _, picture = take("base", 7)
+    grid, _ = found(picture.truth.planes[0], 7)
+    factor = 257 if dtype is np.uint16 else 1
+    image = (picture.image.astype(float) * factor).astype(dtype)
+    expected = measure(picture.image, grid)
+    got = measure(image, grid)
+    assert np.abs(got.pixels - expected.pixels).max() < 5e-4
+    np.testing.assert_allclose(got.covariance, expected.covariance, rtol=0.1, atol=1e-7)
+
+
+def test_images_may_be_views_and_grids_may_be_small() -> None:
+    _, picture = take("base", 8)
+    plane = picture.truth.planes[0]
+    grid, _ = found(plane, 8)
+    wide = np.repeat(picture.image, 2, axis=1)[:, ::2]
+    small = Grid(grid.pixels[1:4, 2:5], (grid.dark + 3) % 2)
+    measured = measure(wide, small)
+    assert len(measured.kind) == 12
+    shifted = measured.index + np.array([2, 1])
+    whole = measure(picture.image, grid)
+    rows = [
+        int(np.flatnonzero((whole.kind == k) & (whole.index == i).all(axis=1))[0])
+        for k, i in zip(measured.kind, shifted, strict=True)
+    ]
+    assert np.abs(measured.pixels - whole.pixels[rows]).max() < 0.05
+
+
+def test_parts_of_a_board_are_measured() -> None:
+    _, picture = take("base", 9)
+    plane = picture.truth.planes[0]
+    grid, _ = found(plane, 9)
+    pixels = grid.pixels.copy()
+    pixels[0, :4] = np.nan
+    pixels[3, 4] = np.nan
+    measured = measure(picture.image, Grid(pixels, grid.dark))
+    seen = np.isfinite(pixels[..., 0])
+    assert len(measured.kind) == (seen[:, 1:] & seen[:, :-1]).sum() + (seen[1:] & seen[:-1]).sum()
+    assert np.isnan(measured.vertices[~seen]).all()
+    assert np.isfinite(measured.vertices[seen]).all()
+
+
+def test_nothing_is_measured_where_there_is_nothing() -> None:
+    rng = np.random.default_rng(0)
+    c, r = np.meshgrid(np.arange(6.0), np.arange(5.0))
+    grid = Grid(np.stack([40 + 30 * c, 40 + 30 * r], axis=-1), 0)
+    for image in (
+        rng.integers(0, 256, (240, 320)).astype(np.uint8),
+        np.full((240, 320), 100, dtype=np.uint8),
+    ):
+        measured = measure(image, grid)
+        assert measured.rejected >= 0.9 * (measured.rejected + len(measured.kind))
+        assert np.isfinite(measured.pixels).all()
+
+
+def test_no_edges_give_no_points() -> None:
+    grid = Grid(np.full((1, 1, 2), 50.0), 0)
+    measured = measure(np.zeros((100, 100), dtype=np.uint8), grid)
+    assert len(measured.kind) == 0
+    assert measured.rejected == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BEST + GOOD)
+def test_midpoints_in_every_condition(name: str) -> None:
+    found_errors = errors(name, range(8) if "Mpx" not in name else range(3))
+    assert found_errors.ratio < (1.2 if name in BEST else 2.0)
+    assert 0.7 < found_errors.normalised < 1.4
+    assert found_errors.kept >= 0.99
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BEST + GOOD)
+def test_vertices_in_every_condition(name: str) -> None:
+    found_errors = errors(name, range(8) if "Mpx" not in name else range(3), "vertices")
+    assert found_errors.ratio < (1.2 if name in BEST else 2.0)
+    assert 0.7 < found_errors.normalised < 1.4
+    assert found_errors.kept >= 0.99
+
+
+@pytest.mark.slow
+def test_occluders_in_many_pictures() -> None:
+    found_errors = errors("occluded", range(12), hidden=True)
+    assert found_errors.kept >= 0.99
+    assert found_errors.rms < 0.0035
+    assert found_errors.hidden_kept <= 8
+
+
+@pytest.mark.skipif(not PHOTOS.is_dir(), reason="needs the photographs")
+@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+def test_photographs_calibrate_better_than_with_opencv_corners(points: str) -> None:
+    cv2 = pytest.importorskip("cv2")
+    finding = pytest.importorskip("neurocal_cli.detection.finding")
+    places_3d, pixels = [], []
+    for path in sorted(PHOTOS.glob("left*.jpg")):
+        image = cv2.imread(str(path), 0)
+        grid = finding.find_grids(image)[0]
+        measured = measure(image, grid, points)  # type: ignore[arg-type]
+        half = np.array([[0.5, 0], [0, 0.5], [0, 0]])[measured.kind]
+        place = np.column_stack([measured.index + half, np.zeros(len(measured.kind))])
+        places_3d.append(place.astype(np.float32))
+        pixels.append(measured.pixels.astype(np.float32))
+    rms = cv2.calibrateCamera(places_3d, pixels, image.shape[::-1], None, None)[0]
+    assert rms < 0.17  # 0.195 with cornerSubPix
