@@ -70,8 +70,11 @@ def smoothing(width: float) -> float:
     return float(np.clip(np.round(0.15 * width / 0.25) * 0.25, 0.75, 2.0))
 
 
-def grown(level: Level, lattice: Lattice, outwards: bool = True) -> Lattice:
-    """Add vertices between and, unless told otherwise, around the known ones until none fits any more."""
+def grown(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) -> Lattice:
+    """Add vertices between and, unless told otherwise, around the known ones until none fits any more.
+
+    With a reach of 2, one vertex in a row may be hidden and the next still be found.
+    """
     sigma = smoothing(lattice.width)
     tried: set[tuple[int, int, int]] = set()
     origin = np.zeros(2, dtype=np.intp)
@@ -79,7 +82,7 @@ def grown(level: Level, lattice: Lattice, outwards: bool = True) -> Lattice:
         if outwards:
             lattice, shift = framed(lattice)
             origin = origin + shift
-        row, col = frontier(lattice)
+        row, col = frontier(lattice, reach)
         # A place is looked at again only when it has more neighbours than before.
         support = _around(lattice.seen)[row, col]
         keys = list(
@@ -90,7 +93,7 @@ def grown(level: Level, lattice: Lattice, outwards: bool = True) -> Lattice:
         row, col = row[fresh], col[fresh]
         if not len(row):
             break
-        lattice, added = _layer(level, lattice, row, col, sigma)
+        lattice, added = _layer(level, lattice, row, col, sigma, reach)
         if not added and not fresh.any():
             break
     return cropped(lattice)
@@ -130,9 +133,12 @@ def _around(values: NDArray[np.generic]) -> Array:
     return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])
 
 
-def frontier(lattice: Lattice) -> tuple[Index, Index]:
+def frontier(lattice: Lattice, reach: int = 1) -> tuple[Index, Index]:
     """Unknown places with a known neighbour along an edge and another one near."""
     seen = lattice.seen
+    if reach > 1:
+        row, col = np.nonzero(~seen & (_around(_around(seen)) > 0))
+        return row, col
     beside = np.zeros_like(seen)
     beside[1:] |= seen[:-1]
     beside[:-1] |= seen[1:]
@@ -142,10 +148,12 @@ def frontier(lattice: Lattice) -> tuple[Index, Index]:
     return row, col
 
 
-def _layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: float) -> tuple[Lattice, int]:
+def _layer(
+    level: Level, lattice: Lattice, row: Index, col: Index, sigma: float, reach: int
+) -> tuple[Lattice, int]:
     """Look for vertices at places of a lattice."""
     at = expected(lattice.pixels, row, col)
-    worth = (at.spread < _MOST_SPREAD) & (at.area > 4) & _inside(level, at.points)
+    worth = (at.spread < _MOST_SPREAD * reach) & (at.area > 4) & _inside(level, at.points)
     row, col, at = row[worth], col[worth], at[worth]
     if not len(row):
         return lattice, 0

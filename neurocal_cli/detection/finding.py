@@ -17,6 +17,7 @@ from neurocal_cli.detection.find_claims import disputed, distinct
 from neurocal_cli.detection.find_fold import joined, unfolded
 from neurocal_cli.detection.find_grow import Lattice, cleaned, grown, smoothing
 from neurocal_cli.detection.find_levels import Level, levels_of
+from neurocal_cli.detection.find_merge import merged
 from neurocal_cli.detection.find_refine import settle
 from neurocal_cli.detection.find_saddles import Saddles, find_saddles
 from neurocal_cli.detection.find_seeds import find_links, find_seeds
@@ -71,7 +72,14 @@ def _separated(level: Level, lattices: list[Lattice]) -> list[Lattice]:
             # What was taken out at a fold for lying between two planes may belong to one.
             planes = [cleaned(level, grown(level, x, outwards=False)) for x in planes]
         result += [x for x in planes if has_block(x) and is_smooth(level, x)]
-    return distinct(result)
+    return [x for x in (_mended(level, x) for x in merged(distinct(result))) if has_block(x)]
+
+
+def _mended(level: Level, lattice: Lattice) -> Lattice:
+    """Look for vertices behind hidden ones, in a lattice that has such."""
+    if lattice.seen.all():
+        return lattice
+    return cleaned(level, grown(level, lattice, outwards=False, reach=2))
 
 
 def _area(pixels: Array) -> float:

@@ -1,0 +1,283 @@
+"""Finding chessboards: complete, rightly indexed, and nothing where there is none."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rendered import condition, picture
+
+from neurocal_cli.detection import Grid
+from neurocal_cli.detection.finding import find_grids
+from neurocal_cli.geometry import Array
+from neurocal_cli.rendering import PlaneTruth, Rectangle, render, scene_bound
+
+cv2 = pytest.importorskip("cv2")
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+FIRST = 500  # seeds that nothing was developed on
+
+WHOLE = (
+    "base",
+    "noise 5",
+    "noise 12",
+    "psf 0.5",
+    "psf 3",
+    "poisson",
+    "tilt 0",
+    "tilt 65",
+    "k1 -0.3",
+    "k1 -0.4 wide",
+    "skew",
+    "gamma 2.2",
+    "saturated",
+    "16 bit",
+    "squares 10",
+    "squares 6",
+    "illumination",
+    "vignetting",
+    "low contrast",
+    "narrow margin",
+    "clutter",
+    "mix",
+)
+FOLDED = ("two planes", "two planes distorted", "two planes across", "three planes", "three planes across")
+
+
+def turned(shape: tuple[int, int]) -> Iterable[tuple[Array, Array]]:
+    """Row and column in a grid of each vertex of a board, for the four ways of turning it."""
+    rows, cols = np.indices(shape)
+    yield rows, cols
+    yield cols, shape[0] - 1 - rows
+    yield shape[0] - 1 - rows, shape[1] - 1 - cols
+    yield shape[1] - 1 - cols, rows
+
+
+def matched(grid: Grid, truth: PlaneTruth, within: float = 1.0) -> tuple[np.ndarray, int]:
+    """(rows, cols) which true vertices a grid has under the right index, and how many others it has."""
+    vertices = truth.vertices
+    mirrored = _mirrored(vertices)
+    if mirrored:
+        vertices = vertices[:, ::-1]
+    best, wrong = np.zeros(vertices.shape[:2], dtype=bool), int(grid.seen.sum())
+    for rows, cols in turned(vertices.shape[:2]):
+        hit = _hits(grid, vertices, rows, cols, within)
+        if hit.sum() > best.sum():
+            best, wrong = hit, int(grid.seen.sum() - hit.sum())
+    return (best[:, ::-1] if mirrored else best), wrong
+
+
+def _mirrored(vertices: Array) -> bool:
+    c = np.nanmean(vertices[:, 1:] - vertices[:, :-1], axis=(0, 1))
+    r = np.nanmean(vertices[1:] - vertices[:-1], axis=(0, 1))
+    return bool(c[0] * r[1] < c[1] * r[0])
+
+
+def _hits(grid: Grid, vertices: Array, rows: Array, cols: Array, within: float) -> np.ndarray:
+    """Which vertices are at their places of a grid, shifted as most of them are."""
+    found = np.argwhere(grid.seen)
+    away = np.hypot(*np.moveaxis(grid.pixels[grid.seen][:, None, None] - vertices, -1, 0))
+    away = np.where(np.isfinite(away), away, np.inf)
+    nearest = away.reshape(len(found), -1).argmin(axis=1)
+    close = away.reshape(len(found), -1)[np.arange(len(found)), nearest] < within
+    shift = found - np.stack([rows.ravel()[nearest], cols.ravel()[nearest]], axis=-1)
+    hit = np.zeros(vertices.shape[:2], dtype=bool)
+    if close.any():
+        kinds, count = np.unique(shift[close], axis=0, return_counts=True)
+        right = close & (shift == kinds[count.argmax()]).all(axis=1)
+        hit.ravel()[nearest[right]] = True
+    return hit
+
+
+def best_match(grids: list[Grid], truth: PlaneTruth, within: float = 1.0) -> tuple[np.ndarray, int]:
+    none = np.zeros(truth.vertices.shape[:2], dtype=bool), 0
+    return max((matched(g, truth, within) for g in grids), key=lambda m: m[0].sum(), default=none)
+
+
+def missed(name: str, seeds: Iterable[int], within: float = 1.0) -> list[tuple[int, int, int]]:
+    """Seeds whose pictures are not found exactly, with vertices missed and wrong ones."""
+    result = []
+    for seed in seeds:
+        shot = picture(name, seed)
+        grids = find_grids(shot.image)
+        for truth in shot.truth.planes:
+            hit, wrong = best_match(grids, truth, within)
+            if wrong or not hit.all():
+                result.append((seed, int((~hit).sum()), wrong))
+        if len(grids) != len(shot.truth.planes):
+            result.append((seed, 0, len(grids)))
+    return result
+
+
+def open_around(truth: PlaneTruth, size: tuple[int, int]) -> np.ndarray:
+    """(rows, cols) which vertices have half a square around them in plain sight."""
+    seen = truth.vertices_visible.copy()
+    hidden = np.zeros(seen.size, dtype=bool)
+    hidden[truth.ends[~truth.midpoints_visible].ravel()] = True
+    seen &= ~hidden.reshape(seen.shape)
+    c, r = np.gradient(truth.vertices, axis=1), np.gradient(truth.vertices, axis=0)
+    for i in (-0.5, 0.5):
+        for j in (-0.5, 0.5):
+            corner = truth.vertices + i * c + j * r
+            with np.errstate(invalid="ignore"):
+                seen &= ((corner >= 0) & (corner <= np.array(size) - 1)).all(axis=-1)
+    return seen
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_a_whole_board_is_found_completely(name: str) -> None:
+    assert missed(name, [FIRST]) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WHOLE)
+def test_whole_boards_are_found_completely(name: str) -> None:
+    assert missed(name, range(FIRST, FIRST + 8)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["2 Mpx", "5 Mpx", "5 Mpx clutter"])
+def test_boards_in_large_pictures_are_found(name: str) -> None:
+    assert missed(name, range(FIRST, FIRST + 2)) == []
+
+
+@pytest.mark.parametrize("name", FOLDED)
+def test_planes_at_a_fold_are_separate_grids(name: str) -> None:
+    assert missed(name, range(FIRST, FIRST + 2)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FOLDED)
+def test_planes_at_a_fold_are_separate_grids_in_many_poses(name: str) -> None:
+    assert len(missed(name, range(FIRST, FIRST + 25))) <= 1
+
+
+@pytest.mark.parametrize("name", ["base", "k1 -0.3", "psf 3"])
+def test_vertices_are_good_to_a_few_tenths_of_a_pixel(name: str) -> None:
+    assert missed(name, range(FIRST, FIRST + 2), within=0.3) == []
+
+
+def test_grids_are_oriented_as_promised() -> None:
+    shot = picture("base", FIRST + 3)
+    (grid,) = find_grids(shot.image)
+    p = grid.pixels
+    c, r = p[:-1, 1:] - p[:-1, :-1], p[1:, :-1] - p[:-1, :-1]
+    assert (c[..., 0] * r[..., 1] - c[..., 1] * r[..., 0] > 0).all()
+    u, v = np.rint(0.25 * (p[1:, 1:] + p[1:, :-1] + p[:-1, 1:] + p[:-1, :-1])).astype(int).transpose(2, 0, 1)
+    rows, cols = np.indices(u.shape)
+    dark = shot.image[v, u] < 128
+    assert (dark == ((rows + cols + grid.dark) % 2 == 0)).all()
+
+
+@pytest.mark.parametrize("name", ["occluded", "board cut", "two boards"])
+@pytest.mark.parametrize("count", [2, pytest.param(16, marks=pytest.mark.slow)])
+def test_visible_vertices_of_partly_hidden_boards_are_found(name: str, count: int) -> None:
+    found = total = wrong = 0
+    for seed in range(FIRST, FIRST + count):
+        shot = picture(name, seed)
+        grids = find_grids(shot.image)
+        for truth in shot.truth.planes:
+            hit, others = best_match(grids, truth)
+            visible = open_around(truth, shot.image.shape[::-1])
+            found, total, wrong = found + (hit & visible).sum(), total + visible.sum(), wrong + others
+    assert wrong == 0
+    assert found >= 0.985 * total
+
+
+@pytest.mark.parametrize("count", [3, pytest.param(30, marks=pytest.mark.slow)])
+def test_there_is_no_grid_in_clutter(count: int) -> None:
+    found = [bool(find_grids(picture("clutter only", FIRST + k).image)) for k in range(count)]
+    assert sum(found) <= 0.05 * count
+
+
+@pytest.mark.slow
+def test_hard_mixtures_are_found_as_far_as_physics_allows() -> None:
+    found: dict[bool, list[bool]] = {False: [], True: []}
+    for name in ("stress 1", "stress 2"):
+        for seed in range(FIRST, FIRST + 30):
+            bound = float(np.median(scene_bound(condition(name, seed))[0].vertex))
+            if bound < 0.1:
+                found[bound > 0.03].append(not [m for m in missed(name, [seed]) if m[1] or m[2] > 2])
+    assert np.mean(found[False]) >= 0.97
+    assert np.mean(found[True]) >= 0.8
+
+
+def test_sixteen_bits_and_real_numbers_give_what_eight_bits_give() -> None:
+    image = picture("clutter", FIRST).image
+    (grid,) = find_grids(image)
+    for other in (image.astype(np.uint16) * 257, image / 255.0, image.astype(np.float32)):
+        (same,) = find_grids(other)
+        assert same.dark == grid.dark
+        assert np.abs(same.pixels - grid.pixels).max() < 0.01
+
+
+@pytest.mark.parametrize("size", [(8, 8), (1, 500), (3, 3), (0, 0), (480, 640), (2000, 3000)])
+@pytest.mark.parametrize("level", [0, 255])
+def test_blank_images_of_any_size_have_no_grid(size: tuple[int, int], level: int) -> None:
+    assert find_grids(np.full(size, level, dtype=np.uint8)) == []
+
+
+def test_noise_and_numbers_that_are_none_have_no_grid() -> None:
+    rng = np.random.default_rng(1)
+    assert find_grids(rng.integers(0, 256, (480, 640), dtype=np.uint8)) == []
+    assert find_grids(np.full((100, 100), np.nan)) == []
+    assert find_grids(np.full((100, 100), np.inf)) == []
+
+
+def test_finding_is_deterministic() -> None:
+    image = picture("three planes", FIRST).image
+    first, second = find_grids(image), find_grids(image.copy())
+    assert all(np.array_equal(a.pixels, b.pixels, equal_nan=True) for a, b in zip(first, second, strict=True))
+
+
+def real(pattern: str) -> list[Path]:
+    return sorted(DATA.glob(pattern))
+
+
+def shapes(path: Path) -> list[tuple[int, ...]]:
+    """Shapes of the whole grids in a picture, the smaller number first."""
+    grids = find_grids(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
+    return [tuple(sorted(grid.shape)) for grid in grids if grid.seen.all()]
+
+
+@pytest.mark.skipif(not real("opencv_stereo/*.jpg"), reason="pictures not there")
+def test_all_boards_of_a_stereo_rig_are_found() -> None:
+    assert [path.name for path in real("opencv_stereo/*.jpg") if shapes(path)[:1] != [(6, 9)]] == []
+
+
+@pytest.mark.skipif(not real("sony_chess/*.jpg"), reason="pictures not there")
+def test_all_boards_on_a_table_are_found() -> None:
+    assert [path.name for path in real("sony_chess/*.jpg") if shapes(path) != [(4, 6)]] == []
+
+
+@pytest.mark.skipif(not real("line_pattern/chessboard.jpg"), reason="picture not there")
+def test_a_board_of_900_vertices_is_found() -> None:
+    assert shapes(DATA / "line_pattern" / "chessboard.jpg") == [(25, 36)]
+
+
+@pytest.mark.skipif(not real("ortho3/*_calib.jpg"), reason="pictures not there")
+def test_three_walls_are_found_at_once() -> None:
+    for path in real("ortho3/*.jpg"):
+        assert sorted(shapes(path)) == [(6, 7), (6, 8), (6, 8)]
+
+
+@pytest.mark.skipif(not real("zhang_planar/*.png"), reason="pictures not there")
+def test_separate_squares_are_no_board() -> None:
+    assert [path.name for path in real("zhang_planar/*.png") if shapes(path)] == []
+
+
+@pytest.mark.parametrize("seed", [FIRST, FIRST + 1])
+def test_a_board_in_two_halves_is_one_grid(seed: int) -> None:
+    scene = condition("base", seed)
+    truth = render(scene, np.random.default_rng(0)).truth.planes[0].vertices
+    middle = 0.5 * (truth[2, 4] + truth[3, 4])
+    along = truth[3, 4] - truth[2, 4]
+    angle = float(np.arctan2(along[1], along[0]))
+    bar = Rectangle((float(middle[0]), float(middle[1])), (500.0, 30.0), angle, 0.4)
+    shot = render(type(scene)(**{**scene.__dict__, "occluders": (bar,)}), np.random.default_rng(1))
+    grids = find_grids(shot.image)
+    hit, wrong = best_match(grids, shot.truth.planes[0])
+    visible = open_around(shot.truth.planes[0], shot.image.shape[::-1])
+    assert wrong == 0
+    assert (hit | ~visible).all()
+    assert len(grids) == 1
