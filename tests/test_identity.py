@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -159,6 +160,24 @@ def test_a_bigger_board_behind_does_not_hide_one_that_is_seen_to_its_ends() -> N
     scene, seen = condition("base", 0), picture("base", 0)
     grids = [flat_grid(12, 12), *seen_grids(scene, seen)]
     assert len(identify(scene.board, grids, seen.image).located) == 1
+
+
+def test_small_pieces_of_large_boards_are_refused_at_once() -> None:
+    sheets = tuple(Plane(name, 40, 30, 5.0, (0.0, 0.0, z)) for name, z in (("a", 0.0), ("b", 40.0)))
+    pieces = [flat_grid(3, 3), Grid(flat_grid(4, 3).pixels + 200.0, 0)]
+    for board in (Board.single(40, 30, 5.0), Board(sheets)):
+        start = time.monotonic()
+        with pytest.raises(NoBoardError, match="nothing tells which"):
+            identify(board, pieces, EMPTY)
+        assert time.monotonic() - start < 5
+
+
+def test_a_piece_beside_a_bigger_board_is_not_taken_but_a_board_before_it_is() -> None:
+    board, bigger = Board.single(9, 6, 25), flat_grid(12, 8)
+    with pytest.raises(NoBoardError, match="found 12 x 8 inner vertices, the board has 9 x 6"):
+        identify(board, [bigger, flat_grid(9, 6)], EMPTY)
+    far = Grid(bigger.pixels * 0.5, 0)
+    assert identify(board, [far, flat_grid(9, 6)], EMPTY).located[0].grid.shape == (9, 6)
 
 
 def test_no_grid_is_no_board() -> None:

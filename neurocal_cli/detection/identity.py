@@ -37,6 +37,7 @@ _NOISE = 0.05  # px; errors below this do not rule anything out
 _MISFIT = 0.25  # squares by which planes may miss where the board says they are: distortion, a bent board
 _SAMPLES = 25  # vertices of a grid that are enough to tell how it lies
 _NEARER = 1.5  # how many times larger the squares of the board before the others of its size must look
+_MOST_WAYS = 5000  # arrangements that are tried; small pieces of large planes have more
 _KEPT = 200  # arrangements that are followed up when a further grid joins
 
 
@@ -127,12 +128,20 @@ def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) 
     every = [_candidate(board, trimmed(grid, board.planes), grey) for grid in grids]
     usable = sorted((c for c in every if c.ways), key=lambda c: (-c.whole, -int(c.grid.seen.sum())))
     largest = max(every, key=lambda c: int(c.grid.seen.sum()))
-    if len(board.planes) == 1 and not largest.ways:
-        # What is smaller than a board of another size may be a piece of it, unless its ends are seen.
-        usable = [c for c in usable if c.whole and set(c.ends.values()) == {End.BOARD}]
+    if len(board.planes) == 1:
+        others = [c for c in every if not c.ways]
+        usable = [c for c in usable if not any(_may_be_a_piece(c, other) for other in others)]
     if not usable:
         raise NoBoardError(another_size(board, largest.grid, list(largest.ends.values())))
     return (_foremost(board, usable) + [c for c in usable if not c.whole])[: len(board.planes)]
+
+
+def _may_be_a_piece(candidate: _Candidate, other: _Candidate) -> bool:
+    """Whether a grid may be a piece of a board of another size that a larger grid shows."""
+    ends_seen = candidate.whole and set(candidate.ends.values()) == {End.BOARD}
+    smaller = candidate.grid.seen.sum() < other.grid.seen.sum()
+    behind = _square(candidate.grid) >= _NEARER * _square(other.grid)
+    return bool(smaller and not ends_seen and not behind)
 
 
 def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate]:
@@ -173,6 +182,8 @@ def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidat
 
 def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Way]:
     """Ways for all grids together that one camera can see, the best one first."""
+    if len(board.planes) == 1:
+        return [_Way((placement,)) for placement in chosen[0].ways]
     flat = is_flat(np.concatenate([_corners(plane) for plane in board.planes]))
     front = board.planes[0].normal if flat else None
     ways, before = [_Way(())], 0.0
@@ -183,6 +194,8 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Way]:
             for placement in candidate.ways
             if placement.plane not in {p.plane for p in way.placements}
         ]
+        if len(longer) > _MOST_WAYS:
+            raise NoBoardError(several_ways(board, [c.grid for c in chosen], 0.0))
         ways = [_scored(board, chosen[:count], placements, front) for placements in longer]
         ways = sorted((way for way in ways if np.isfinite(way.rms)), key=lambda way: way.rms)
         if not ways:
