@@ -17,6 +17,7 @@ _EDGES = 0.9  # share of the edges that are seen
 # Vertices may be off from where their neighbours put them, rms, by so many squares and px, and by
 # so many px per ratio of the noise (of second derivatives) to the contrast.
 _OFF, _OFF_PX, _OFF_NOISE = 0.021, 0.09, 20.0
+_MANY, _FEW_SMOOTH = 18, 0.6  # few vertices are in line by chance: less is tolerated of them
 
 
 def has_block(lattice: Lattice) -> bool:
@@ -30,7 +31,7 @@ def has_block(lattice: Lattice) -> bool:
 
 def is_smooth(level: Level, lattice: Lattice) -> bool:
     """Whether vertices are where their neighbours put them, as well as noise allows."""
-    return roughness(level, lattice) < 1
+    return roughness(level, lattice) < (1 if lattice.seen.sum() >= _MANY else _FEW_SMOOTH)
 
 
 def roughness(level: Level, lattice: Lattice) -> float:

@@ -22,7 +22,7 @@ _STEPS = 7
 _MOST_SPREAD = 5.0  # of an expectation that is worth looking at
 _OFF, _OFF_SPREAD, _OFF_PX = 0.06, 0.03, 0.45  # squares, squares per spread, px: see `_tolerance`
 _WEAKEST = 0.55  # least contrast over the neighbours'
-_EVEN_ALONE = 0.85  # of a vertex that closes no square
+_EVEN_ALONE, _OFF_ALONE = 0.88, 0.3  # of a vertex that closes no square; the latter over the tolerance
 _LAYERS = 200
 
 
@@ -62,7 +62,7 @@ class Lattice:
 
 def signs(row: Index, col: Index, dark: int) -> Array:
     """+1 where the square towards growing c and r is dark, else -1."""
-    return 1.0 - 2.0 * ((row + col + dark) % 2)
+    return np.where((row + col + dark) % 2 == 0, 1.0, -1.0)
 
 
 def smoothing(width: float) -> float:
@@ -214,7 +214,7 @@ def cleaned(level: Level, lattice: Lattice) -> Lattice:
         sight = look(level, points, at, signs(row, col, lattice.dark))
         # One that closes no square has little that speaks for it.
         closes = _squared(np.isfinite(pixels[..., 0]))[row, col]
-        plain = sight.like & (closes | ((sight.even > _EVEN_ALONE) & (off < 0.5)))
+        plain = sight.like & (closes | ((sight.even > _EVEN_ALONE) & (off < _OFF_ALONE)))
         off = np.where(plain, off, np.inf)
         contrast[row, col] = sight.contrast
         if not (off > 1).any():

@@ -47,7 +47,7 @@ class Level:
     def curvature(self) -> tuple[Image, Image, Image]:
         """Second derivatives uu, uv and vv of `smooth` [DN/px^2]."""
         uu, uv, vv = (
-            cv2.Sobel(self.smooth, cv2.CV_32F, *order, ksize=3, scale=0.25)
+            np.asarray(cv2.Sobel(self.smooth, cv2.CV_32F, *order, ksize=3, scale=0.25), dtype=np.float32)
             for order in ((2, 0), (1, 1), (0, 2))
         )
         return uu, uv, vv
@@ -76,7 +76,7 @@ def levels_of(image: NDArray[np.generic]) -> list[Level]:
     current, scale = _grey(image), 1
     while min(current.shape) >= (16 if scale == 1 else _SMALLEST):
         levels.append(Level(current, scale))
-        current, scale = cv2.pyrDown(current), 2 * scale
+        current, scale = np.asarray(cv2.pyrDown(current), dtype=np.float32), 2 * scale
     return levels
 
 

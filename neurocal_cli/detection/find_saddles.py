@@ -117,8 +117,11 @@ def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:
     """Whole pixels where the saddle is steepest; (N, 2)."""
     uu, uv, vv = level.curvature
     steepness = cv2.subtract(cv2.multiply(uv, uv), cv2.multiply(uu, vv))
-    peak = cv2.compare(steepness, cv2.dilate(steepness, np.ones((5, 5), np.uint8)), cv2.CMP_GE)
-    peak &= cv2.compare(steepness, (_THRESHOLD * level.noise) ** 2, cv2.CMP_GT)
+    steepness = np.asarray(steepness, dtype=np.float32)
+    # The largest within two pixels, and above the noise.
+    largest = np.asarray(cv2.dilate(steepness, np.ones((5, 5), np.uint8)))
+    least = np.maximum(largest, np.float32((_THRESHOLD * level.noise) ** 2))
+    peak = np.asarray(cv2.compare(steepness, least, cv2.CMP_GE), dtype=np.uint8)
     if covered is not None:
         peak[covered > 0] = 0
     b = _BORDER

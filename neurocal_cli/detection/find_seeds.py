@@ -15,7 +15,7 @@ from neurocal_cli.detection.find_levels import Level, sampled
 from neurocal_cli.detection.find_saddles import Saddles
 from neurocal_cli.geometry import Array
 
-__all__ = ["Links", "find_links", "find_seeds"]
+__all__ = ["Links", "find_links", "find_seeds", "find_slim_seeds"]
 
 Index = NDArray[np.intp]
 
@@ -137,6 +137,31 @@ def find_seeds(saddles: Saddles, links: Links) -> tuple[Index, Array]:
     order = np.argsort(irregularity, kind="stable")
     order = order[irregularity[order] < _IRREGULAR]
     return block[order], irregularity[order]
+
+
+def find_slim_seeds(saddles: Saddles, links: Links) -> tuple[Index, Index]:
+    """Find blocks of two closed squares side by side, where there are not four.
+
+    Returns
+    -------
+    members : (S, 2, 3) int array
+        Saddles of each block, the most regular first.
+    dark : (S,) int array
+        As in `Lattice`.
+    """
+    closed = _closed(links)
+    middle, p = np.nonzero(closed & np.roll(closed, -1, axis=1))
+    right, down, left = (links.to[middle, (p + k) % 4] for k in range(3))
+    # The corners beyond the first and the second square.
+    corner = links.to[right, (links.port[middle, p] - 1) % 4]
+    other = links.to[down, (links.port[middle, (p + 1) % 4] - 1) % 4]
+    block = np.stack([np.stack([left, middle, right], -1), np.stack([other, down, corner], -1)], axis=1)
+    grid = saddles.points[block]
+    c = 0.5 * (grid[:, 0, 2] - grid[:, 0, 0])
+    bent = np.abs(grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]).max(axis=(1, 2))
+    irregularity = bent / np.maximum(np.hypot(*c.T), 1e-6)
+    order = np.argsort(irregularity, kind="stable")
+    return block[order], (p[order] + 1) % 2
 
 
 def _closed(links: Links) -> NDArray[np.bool_]:

@@ -20,7 +20,7 @@ from neurocal_cli.detection.find_levels import Level, levels_of
 from neurocal_cli.detection.find_merge import merged
 from neurocal_cli.detection.find_refine import settle
 from neurocal_cli.detection.find_saddles import Saddles, find_saddles
-from neurocal_cli.detection.find_seeds import find_links, find_seeds
+from neurocal_cli.detection.find_seeds import find_links, find_seeds, find_slim_seeds
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
@@ -28,7 +28,7 @@ __all__ = ["find_grids"]
 
 _SEARCHED = 1.4e6  # px; the largest level that is searched when smaller ones gave something
 _REFINED = 1.4e6  # px; the largest level that grids grow on
-_TRIES = 12  # seeds per level that come to nothing
+_TRIES, _SLIM_TRIES = 12, 4  # seeds per level that come to nothing
 
 
 def find_grids(image: NDArray[np.generic]) -> list[Grid]:
@@ -93,28 +93,35 @@ def _new(level: Level, known: list[Lattice]) -> list[Lattice]:
     saddles = find_saddles(level, _covered(level, known) if known else None)
     if len(saddles) < 9:
         return []
-    seeds, _ = find_seeds(saddles, find_links(level, saddles))
+    links = find_links(level, saddles)
+    seeds, _ = find_seeds(saddles, links)
+    found = _sprouted(level, saddles, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES)
+    if not found and not known and level.scale == 1:
+        found = _sprouted(level, saddles, *find_slim_seeds(saddles, links), _SLIM_TRIES)
+    return found
+
+
+def _sprouted(
+    level: Level, saddles: Saddles, seeds: NDArray[np.intp], dark: NDArray[np.intp], tries: int
+) -> list[Lattice]:
+    """Grids that grow from seeds, until some of these have come to nothing."""
     found: list[Lattice] = []
     free = np.ones(len(saddles), dtype=bool)
-    tries = 0
-    for seed in seeds:
-        if tries >= _TRIES:
-            break
+    for seed, parity in zip(seeds, dark, strict=True):
         if not free[seed].all():
             continue
         free[seed] = False
-        grid = cleaned(level, grown(level, _planted(saddles, seed)))
+        planted = Lattice(saddles.points[seed], saddles.contrast[seed], int(parity))
+        grid = cleaned(level, grown(level, planted))
         boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_seen(level, x)]
         if boards:
             found += boards
             free &= _covered(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
         else:
-            tries += 1
+            tries -= 1
+        if tries <= 0:
+            break
     return found
-
-
-def _planted(saddles: Saddles, seed: NDArray[np.intp]) -> Lattice:
-    return Lattice(saddles.points[seed], saddles.contrast[seed], 0)
 
 
 def _finer(level: Level, lattice: Lattice) -> Lattice:
