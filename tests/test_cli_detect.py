@@ -8,7 +8,9 @@ import struct
 import subprocess
 import sys
 import zlib
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +18,9 @@ import pytest
 from click.testing import Result
 from command_line import run
 
-from neurocal_cli import read_points
+from neurocal_cli import Board, read_image, read_points
+from neurocal_cli.board import Plane
+from neurocal_cli.detection.detect import Detection
 
 SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
 BOARD = ("--cols", 9, "--rows", 6, "--square", 25)
@@ -204,6 +208,29 @@ def test_a_board_file_tells_the_size_and_the_unit(folder: Path, tmp_path: Path) 
     assert "# unit: cm\n" in result.stdout
     assert "\nboard01,a/h:0:0,1.25,0.0,0.0," in result.stdout
     assert detect(folder, "--board", tmp_path / "none.yaml").exit_code == 1
+
+
+def test_planes_that_are_missing_and_rejected_points_are_noted(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from neurocal_cli.detection import batch
+
+    def poor(*words: Any) -> Detection:
+        found = detect_points(*words)
+        return replace(found, measured=tuple(replace(one, rejected=100) for one in found.measured))
+
+    detect_points = batch.detect_points
+    monkeypatch.setattr(batch, "detect_points", poor)
+    result = detect(folder, *BOARD, "--jobs", 1)
+    assert result.stderr.splitlines()[0] == (
+        "note: board01 and 2 more: most points are rejected: blurred, shaken or reflecting; look at the overlay"
+    )
+    board = Board((Plane("a", 9, 6, 25.0), Plane("b", 4, 4, 25.0)))
+    found = detect_points(read_image(folder / "board01.png").grey, Board.single(9, 6, 25.0))
+    named = replace(found, located=(replace(found.located[0], plane=board.planes[0]),))
+    assert list(batch._remarks(named, board)) == [
+        "without b: not found, or not to be told from something else"
+    ]
 
 
 @pytest.mark.parametrize(

@@ -132,16 +132,17 @@ def _detected(path: str, image: Image, task: Task) -> Outcome:
         return Outcome(path, None, f"{image.source}: {error}", image.notes, overlay)
     if task.overlay:
         overlay = encode_png(draw_detection(image.grey, found))
-    return Outcome(path, found, "", (*image.notes, *_missing(found, task.board)), overlay)
+    return Outcome(path, found, "", (*image.notes, *_remarks(found, task.board)), overlay)
 
 
-def _missing(found: Detection, board: Board) -> tuple[str, ...]:
-    """What to note of planes that are not among those found."""
+def _remarks(found: Detection, board: Board) -> Iterator[str]:
+    """What to note of a detection that is less than it might be; the same words for all images."""
     seen = {one.plane.name for one in found.located}
     names = [plane.name for plane in board.planes if plane.name not in seen]
-    return (
-        (f"without {' and '.join(names)}: not found, or not to be told from something else",) if names else ()
-    )
+    if names:
+        yield f"without {' and '.join(names)}: not found, or not to be told from something else"
+    if found.rejected > len(found.ids):
+        yield "most points are rejected: blurred, shaken or reflecting; look at the overlay"
 
 
 def _begin() -> None:
