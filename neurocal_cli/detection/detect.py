@@ -131,24 +131,23 @@ def detect_points(
     located = identified.located
     measured = tuple(_sound(measure(image, one.grid, points, gamma)) for one in located)
     labels = [label(one, points_of) for one, points_of in zip(located, measured, strict=True)]
-    orders = [one.order for one in labels]
-    total = sum(map(len, orders))
+    total = sum(len(one.kind) for one in labels)
     if total < _FEWEST:
         tried = total + sum(one.rejected for one in measured)
         raise NoBoardError(
             f"only {total} of {tried} points of the board can be measured; show it sharper or nearer"
         )
+    orders = [one.order for one in labels]
 
     def joined(parts: Iterable[Array]) -> Array:
         return np.concatenate([part[order] for part, order in zip(parts, orders, strict=True)])
 
-    height, width = image.shape
     return Detection(
         tuple(joined(np.array(one.ids, dtype=object) for one in labels).tolist()),
         joined(one.world for one in labels),
         joined(one.pixels for one in measured),
         joined(one.covariance for one in measured),
-        (width, height),
+        (image.shape[1], image.shape[0]),
         located,
         measured,
         identified.warnings,
