@@ -131,12 +131,7 @@ def detect_points(
     located = identified.located
     measured = tuple(_sound(measure(image, one.grid, points, gamma)) for one in located)
     labels = [label(one, points_of) for one, points_of in zip(located, measured, strict=True)]
-    total = sum(len(one.kind) for one in labels)
-    if total < _FEWEST:
-        tried = total + sum(one.rejected for one in measured)
-        raise NoBoardError(
-            f"only {total} of {tried} points of the board can be measured; show it sharper or nearer"
-        )
+    _check_enough(measured)
     orders = [one.order for one in labels]
 
     def joined(parts: Iterable[Array]) -> Array:
@@ -152,6 +147,14 @@ def detect_points(
         measured,
         identified.warnings,
     )
+
+
+def _check_enough(measured: Iterable[Measured]) -> None:
+    total, rejected = np.sum([(len(one.kind), one.rejected) for one in measured], axis=0)
+    if total < _FEWEST:
+        raise NoBoardError(
+            f"only {total} of {total + rejected} points of the board can be measured; show it sharper or nearer"
+        )
 
 
 def _sound(measured: Measured) -> Measured:
