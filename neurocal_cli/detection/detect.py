@@ -150,11 +150,10 @@ def detect_points(
 
 
 def _check_enough(measured: Iterable[Measured]) -> None:
-    total, rejected = np.sum([(len(one.kind), one.rejected) for one in measured], axis=0)
-    if total < _FEWEST:
-        raise NoBoardError(
-            f"only {total} of {total + rejected} points of the board can be measured; show it sharper or nearer"
-        )
+    found, rejected = np.sum([(len(one.kind), one.rejected) for one in measured], axis=0)
+    if found < _FEWEST:
+        share = f"{found} of {found + rejected} points"
+        raise NoBoardError(f"only {share} of the board can be measured; show it sharper or nearer")
 
 
 def _sound(measured: Measured) -> Measured:
