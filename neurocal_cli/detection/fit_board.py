@@ -25,6 +25,7 @@ __all__ = ["Board", "Edges", "Fitted", "fit_all_vertices", "fit_board"]
 Image = NDArray[np.generic]
 
 _START_SIGMA = 0.3  # px, of the found vertices' coordinates
+_GOOD_START = 1.3  # chi2 per coordinate of the found vertices at which their map will do
 _ANCHOR = 2.0  # px; later they only hold what the edges leave open
 _ENOUGH = 60  # edges that need no anchors
 _MOMENT_SIGMA = 0.05  # px, of offsets from moments
@@ -32,6 +33,7 @@ _REACH = 4.0  # sigma on both sides of an edge
 _SLACK = 0.5  # px, for starts that are off
 _NEAREST = 0.5  # sigma from the crossing lines
 _STEPS = 6  # of Gauss and Newton, at most
+_LEAST_SCALE = 0.1  # of the noise by the final residuals; less cannot be, the rounding being known
 _WIDEST = 12.0  # px, of the strips for moments
 _BLUR_OFF = 0.1  # relative error of the blur that makes the first fit be done again
 _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations before anything is known
@@ -155,7 +157,7 @@ def fit_board(board: Board) -> Fitted:
     n = len(board.anchors.grid) // 2
     points = board.anchors.value.reshape(2, n).T
     start = homography_start(frame, board.anchors.grid[:n], points)
-    found = choose_map(start, board.anchors, np.zeros(1))
+    found = choose_map(start, board.anchors, np.zeros(1), _GOOD_START)
     dark, light = square_levels(board.image, board.grid, found.map)
     shading = fit_shading(frame, dark, light)
     noise = max(median(np.concatenate([dark.noise, light.noise])), board.floor)
@@ -233,7 +235,7 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     noise = Noise.of(fit, data.weight, board.floor)
     data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
     fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
-    scale = median(fit.chi2[good] / fit.count[good])
+    scale = max(median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = fit.covariance[:, OFFSET, OFFSET]
     trusted = np.where(smooth(fit), variance, _ANCHOR**2)
@@ -273,7 +275,7 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     fit = fit_vertices(unit, start, prior, half, shape, _STEPS)
     weight = fitted.noise.weighted(fit.linear.x, data.weight)
     fit = fit_vertices(replace(data, weight=weight), fit.values, prior, half, shape, _STEPS)
-    fit = fit.scaled(median(fit.chi2 / np.maximum(fit.count, 1)))
+    fit = fit.scaled(max(median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
         variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, Fit
+from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit
 from neurocal_cli.detection.fit_robust import median
 from neurocal_cli.geometry import Array
 
@@ -18,6 +18,7 @@ _LEAST_COUNT = 8
 _LIMIT = 6.0  # standard deviations
 _ROUGH = 0.5  # relative excess of chi2 that is never held against a fit
 _LEAST_SHARE = 0.2  # of good fits; fewer are so by chance, and what they share is not the board's
+_MOST_SPREAD = 0.5  # standard deviation of an offset, in sigma; more is a fit to noise
 _MOST_STEP = 1.0  # standard deviations that the last step may have
 
 
@@ -47,6 +48,10 @@ def believable(fit: Fit, departure: Array, beyond: Array) -> NDArray[np.bool_]:
     good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
     good &= (beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
     good &= fit.step < _MOST_STEP
+    # Offsets of the lines are every other value.
+    offsets = range(0, fit.values.shape[1] + MEAN, 2)
+    spread = fit.covariance[:, offsets, offsets].max(axis=1)
+    good &= spread < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
     good &= np.abs(departure) < _LIMIT
     rough = fit.chi2 / np.maximum(fit.count, 1)
     usual = median(rough[good]) if good.any() else 1.0

@@ -15,7 +15,7 @@ __all__ = ["FORMS", "MapFit", "Rows", "choose_map", "fit_map", "median"]
 # Forms of the map from the simplest on: (radial parameters, degree of the polynomial rest).
 FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
 
-_STEPS = 15
+_STEPS = 25
 _SHIFT_PRIOR = 1e-2  # 1/px^2
 _TINY = 1e-300
 _BELIEF = 20  # rows' worth of belief that variances are what they claim to be
@@ -132,12 +132,12 @@ def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> 
         damping *= 0.1
         z = residual / np.sqrt(rows.variance)
         weight = _tukey(z / _scale(z)) / rows.variance
-        if before - after < _SETTLED:
+        if before - after < _SETTLED and damping < _DAMPING:
             break
     return _finished(start, rows, values[m:], residual, jacobian)
 
 
-def choose_map(start: SmoothMap, rows: Rows, shift: Array) -> MapFit:
+def choose_map(start: SmoothMap, rows: Rows, shift: Array, enough: float = 0.0) -> MapFit:
     """The map of the simplest form that the rows do not contradict.
 
     Parameters
@@ -146,6 +146,8 @@ def choose_map(start: SmoothMap, rows: Rows, shift: Array) -> MapFit:
         Of any form.
     rows : Rows
     shift : (K,) array [px]
+    enough : float
+        Chi2 per row with which no richer form is tried.
     """
     best: MapFit | None = None
     barren, now, worth = 0, start, np.inf
@@ -160,7 +162,7 @@ def choose_map(start: SmoothMap, rows: Rows, shift: Array) -> MapFit:
             best, worth, barren = fit, cost, 0
         else:
             barren += 1
-        if barren >= _BARREN:
+        if barren >= _BARREN or cost < enough * len(rows.value):
             break
     assert best is not None
     return best

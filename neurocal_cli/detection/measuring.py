@@ -25,6 +25,7 @@ from neurocal_cli.geometry import Array
 __all__ = ["measure"]
 
 _ROUNDING = 1 / 12  # DN^2
+_EXACT, _TINY = 1e-5, 1e-30  # relative rounding of the fits' own numbers, for images without noise
 _FAR, _PLACES = 3.0, 601  # sigma, and places where the middle level is looked for
 
 
@@ -53,7 +54,8 @@ def measure(
         With points that failed the quality gate left out.
     """
     light = image if gamma is None else _linear(image, gamma)
-    floor = _ROUNDING if np.issubdtype(light.dtype, np.integer) else 0.0
+    whole = np.issubdtype(light.dtype, np.integer)
+    floor = _ROUNDING if whole else (_EXACT * float(np.abs(light).max())) ** 2 + _TINY
     board = Board.of(light, grid, floor)
     if len(board.edges.index) == 0:
         return _nothing(grid)

@@ -1,0 +1,196 @@
+"""The models of edges, vertices and maps, and their derivatives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neurocal_cli.detection import fit_edges, fit_vertices
+from neurocal_cli.detection.fit_edges import EdgeData
+from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fit_newton import Shape
+from neurocal_cli.detection.fit_profile import (
+    RESPONSE_TERMS,
+    box_kurtosis,
+    erf_and_density,
+    profile,
+    response,
+    response_terms,
+    tail_terms,
+)
+from neurocal_cli.detection.fit_vertices import VertexData
+from neurocal_cli.geometry import Array
+
+STEP = 1e-5
+
+
+def slope(function: Callable[[Array], Array], x: Array) -> Array:
+    return (function(x + STEP) - function(x - STEP)) / (2 * STEP)
+
+
+def test_error_function_is_exact_to_nine_digits() -> None:
+    z = np.linspace(-12, 12, 40001)
+    value, density = erf_and_density(z)
+    exact = np.array([math.erf(x / math.sqrt(2)) for x in z])
+    assert np.abs(value - exact).max() < 1e-9
+    np.testing.assert_allclose(density, np.exp(-0.5 * z**2) / math.sqrt(2 * math.pi), rtol=1e-12)
+    single, _ = erf_and_density(z.astype(np.float32))
+    assert single.dtype == np.float32
+    assert np.abs(single - exact).max() < 5e-7
+
+
+def test_profile_has_the_slope_it_says() -> None:
+    z = np.linspace(-5, 5, 100)[None]  # not 0, where the error function's own error jumps
+    tails = np.array([[0.03, -0.01]])
+    value, steep, density = profile(z, tails)
+    np.testing.assert_allclose(steep, slope(lambda x: profile(x, tails)[0], z), atol=2e-9)
+    plain = profile(z, np.zeros((1, 2)))[0]
+    np.testing.assert_allclose(value, plain + np.tensordot(tails[0], tail_terms(z, density), 1), atol=1e-14)
+
+
+def test_response_keeps_the_levels_and_has_the_slope_it_says() -> None:
+    bend = np.array([0.2, -0.1, 0.05, 0.02])
+    assert len(bend) == RESPONSE_TERMS
+    x = np.linspace(-1, 1, 51)
+    value, steep = response(x, bend)
+    assert value[0] == -1
+    assert value[-1] == 1
+    np.testing.assert_allclose(steep, slope(lambda t: response(t, bend)[0], x), atol=1e-8)
+    np.testing.assert_allclose(value, x + np.tensordot(bend, response_terms(x), 1), atol=1e-14)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.3, np.pi / 4])
+@pytest.mark.parametrize("psf", [0.5, 0.8])
+def test_pixel_box_is_in_the_profile(angle: float, psf: float) -> None:
+    normal = np.array([[np.cos(angle), np.sin(angle)]])
+    sigma = np.sqrt(psf**2 + 1 / 12)
+    d = np.linspace(-3, 3, 61)
+    fine = (np.arange(200) + 0.5) / 200 - 0.5
+    across = normal[0, 0] * fine[:, None] + normal[0, 1] * fine
+    blurred = np.array([erf_and_density((x + across) / psf)[0].mean() for x in d])
+    tails = np.array([[box_kurtosis(normal, np.array([sigma]))[0], 0.0]])
+    with_box = np.abs(profile(d[None] / sigma, tails)[0][0] - blurred).max()
+    without = np.abs(profile(d[None] / sigma, 0 * tails)[0][0] - blurred).max()
+    assert with_box < 1e-3
+    assert with_box < 0.3 * without
+
+
+def some_edges() -> tuple[EdgeData, Array, Shape, Array]:
+    rng = np.random.default_rng(1)
+    E, N = 3, 60
+    s, d = rng.uniform(-15, 15, (E, N)), rng.uniform(-3, 3, (E, N))
+    value, gain, Q, R = (
+        rng.uniform(low, high, (E, N)) for low, high in ((20, 230), (0.9, 1.1), (0.5, 1), (-0.5, 0.5))
+    )
+    data = EdgeData(s, d, value, gain, Q, R, np.ones((E, N)), np.zeros(E))  # type: ignore[arg-type]
+    values = np.column_stack(
+        [
+            rng.normal(0, 0.3, E),
+            rng.normal(0, 0.2, E),
+            np.full(E, 120.0),
+            np.full(E, 90.0),
+            rng.uniform(0.6, 1.2, E),
+        ]
+    )
+    shape = Shape(np.tile([0.02, -0.005], (E, 1)), np.array([0.1, -0.05, 0.02, 0.01]))
+    return data, values, shape, s / 15
+
+
+def test_edge_model_has_the_derivatives_it_says() -> None:
+    data, values, shape, lever = some_edges()
+    linear = fit_edges.linearised(data, lever, values, shape)  # type: ignore[arg-type]
+    for k in range(5):
+        h = np.zeros(5)
+        h[k] = STEP
+        ahead, behind = (
+            fit_edges.linearised(data, lever, values + sign * h, shape).residual  # type: ignore[arg-type]
+            for sign in (1, -1)
+        )
+        np.testing.assert_allclose(linear.jacobian[:, k], (behind - ahead) / (2 * STEP), atol=3e-6)
+
+
+def some_vertices() -> tuple[VertexData, Array, Shape, tuple[Array, Array]]:
+    rng = np.random.default_rng(2)
+    V, N = 3, 80
+    s1, d1, s2, d2 = rng.uniform(-3, 3, (4, V, N))
+    value, gain, Q = rng.uniform(20, 230, (V, N)), rng.uniform(0.9, 1.1, (V, N)), rng.choice([-1, 1], (V, N))
+    rho = np.array([[0.0], [0.3], [-0.5]])
+    arrays = (s1, d1, s2, d2, value, gain, Q, rho, np.ones((V, N)))
+    data = VertexData(*arrays, np.zeros(V))  # type: ignore[arg-type]
+    places = rng.normal(0, 0.2, (V, 4))
+    values = np.column_stack([places, np.full(V, 120.0), np.full(V, 90.0), rng.uniform(0.6, 1.2, V)])
+    shape = Shape(np.tile([0.02, -0.005], (V, 1)), np.array([0.1, -0.05, 0.02, 0.01]))
+    return data, values, shape, (s1 / 3, s2 / 3)
+
+
+def test_vertex_model_has_the_derivatives_it_says() -> None:
+    data, values, shape, levers = some_vertices()
+    linear = fit_vertices.linearised(data, levers, values, shape)  # type: ignore[arg-type]
+    for k in range(7):
+        h = np.zeros(7)
+        h[k] = STEP
+        ahead, behind = (
+            fit_vertices.linearised(data, levers, values + sign * h, shape).residual  # type: ignore[arg-type]
+            for sign in (1, -1)
+        )
+        np.testing.assert_allclose(linear.jacobian[:, k], (behind - ahead) / (2 * STEP), atol=3e-6)
+
+
+def test_blurred_oblique_cross_is_as_modelled() -> None:
+    """sign(a . x) sign(b . x) blurred by a round Gaussian, against a sum over many random points."""
+    rng = np.random.default_rng(3)
+    cloud = rng.normal(size=(400_000, 2))
+    a, b = np.array([0.0, 1.0]), np.array([np.cos(0.3), np.sin(0.3)])
+    places = rng.uniform(-1.5, 1.5, (12, 2))
+    exact = [(np.sign((cloud + p) @ a) * np.sign((cloud + p) @ b)).mean() for p in places]
+    d1, d2 = (places @ a)[None], (places @ b)[None]
+    one, zero = np.ones_like(d1), np.zeros_like(d1)
+    data = VertexData(zero, d1, zero, d2, zero, one, one, np.array([[a @ b]]), one, np.zeros(1))  # type: ignore[arg-type]
+    values = np.array([[0, 0, 0, 0, 0, 1, 1.0]])
+    shape = Shape(np.zeros((1, 2)), np.zeros(RESPONSE_TERMS))
+    linear = fit_vertices.linearised(data, (zero, zero), values, shape)  # type: ignore[arg-type]
+    np.testing.assert_allclose(linear.x[0], exact, atol=0.006)
+
+
+def some_map(degree: int = 4) -> SmoothMap:
+    rng = np.random.default_rng(4)
+    grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+    frame = Frame.of(grid, (640, 480))
+    homography = np.array([0.4, 0.05, 0.02, -0.04, 0.3, -0.01, 0.1, -0.05])
+    now = SmoothMap(frame, np.concatenate([homography, np.zeros(6)])).shaped(3, degree)
+    values = now.parameters.copy()
+    values[8:14] = [0.02, -0.03, -0.2, 0.05, 0.02, -0.01]
+    values[14:] = rng.normal(0, 0.0005, len(values) - 14)
+    return replace(now, parameters=values)
+
+
+def test_map_has_the_derivatives_it_says() -> None:
+    now = some_map()
+    grid = np.random.default_rng(5).uniform(0, 8, (20, 2))
+    pixels, jacobian = now.derivatives(grid)
+    np.testing.assert_allclose(pixels, now.at(grid), atol=1e-10)
+    for k in range(len(now.parameters)):
+        h = np.zeros(len(now.parameters))
+        h[k] = STEP
+        ahead, behind = (replace(now, parameters=now.parameters + sign * h).at(grid) for sign in (1, -1))
+        np.testing.assert_allclose(jacobian[:, :, k], (ahead - behind) / (2 * STEP), atol=1e-5)
+
+
+def test_map_keeps_what_another_form_shares_with_it() -> None:
+    now = some_map(4)
+    grid = np.random.default_rng(6).uniform(0, 8, (20, 2))
+    np.testing.assert_allclose(now.shaped(3, 6).at(grid), now.at(grid), atol=1e-10)
+    np.testing.assert_array_equal(now.shaped(3, 6).shaped(3, 4).parameters, now.parameters)
+    plain = now.shaped(0, 0)
+    assert not plain.parameters[8:].any()
+
+
+def test_homography_is_found_by_least_squares() -> None:
+    now = some_map().shaped(0, 0)
+    grid = np.random.default_rng(7).uniform(0, 8, (12, 2))
+    again = homography_start(now.frame, grid, now.at(grid))
+    np.testing.assert_allclose(again.parameters, now.parameters, atol=1e-10)

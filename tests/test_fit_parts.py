@@ -1,0 +1,139 @@
+"""Fitting maps, gathering pixels, levels: the parts that measuring is made of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_fit_models import some_map
+
+from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fit_robust import Rows, choose_map, fit_map, median
+from neurocal_cli.detection.fit_shading import Levels, fit_shading
+from neurocal_cli.detection.fit_strips import gather, grid_lines
+from neurocal_cli.geometry import Array
+
+GRID = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
+
+
+def test_map_is_fitted_through_outliers_with_a_true_covariance() -> None:
+    true = some_map(0).shaped(2, 0)
+    squares = []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        pixels = true.at(GRID) + rng.normal(0, 0.01, GRID.shape)
+        pixels[:4] += rng.normal(0, 5, (4, 2))
+        start = homography_start(true.frame, GRID, true.at(GRID)).shaped(2, 0)
+        fit = fit_map(start, Rows.of_points(GRID, pixels, 0.01), np.zeros(0))
+        assert set(np.flatnonzero(fit.weight == 0)) <= {*range(4), *range(54, 58)}
+        direction = np.tile([0.6, 0.8], (len(GRID), 1))
+        error = ((fit.map.at(GRID) - true.at(GRID)) * direction).sum(axis=1)
+        squares.append((error**2 / fit.map.variance(GRID, direction)).mean())
+    assert np.mean(squares) == pytest.approx(1, abs=0.3)
+
+
+def test_shift_of_alternating_edges_is_told_from_the_map() -> None:
+    true = some_map(0).shaped(0, 0)
+    rng = np.random.default_rng(1)
+    angle = rng.uniform(0, 2 * np.pi, 200)
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    grid = rng.uniform(0, [8, 5], (200, 2))
+    value = (true.at(grid) * direction).sum(axis=1) + 0.3 + rng.normal(0, 0.003, 200)
+    rows = Rows(grid, direction, value, np.full(200, 0.003**2), np.ones((200, 1)))
+    fit = fit_map(true, rows, np.zeros(1))
+    assert fit.shift[0] == pytest.approx(0.3, abs=5 * np.sqrt(fit.shift_variance[0]))
+    assert np.sqrt(fit.shift_variance[0]) < 0.0005
+
+
+@pytest.mark.parametrize(("radial", "degree"), [(0, 0), (1, 0), (3, 0), (3, 4)])
+def test_simplest_form_that_follows_is_chosen(radial: int, degree: int) -> None:
+    true = some_map(degree).shaped(radial, degree)
+    rng = np.random.default_rng(radial + degree)
+    pixels = true.at(GRID) + rng.normal(0, 0.003, GRID.shape)
+    chosen = choose_map(
+        homography_start(true.frame, GRID, pixels), Rows.of_points(GRID, pixels, 0.003), np.zeros(0)
+    )
+    assert chosen.map.radial == radial
+    assert degree <= chosen.map.degree <= degree + (degree > 0)
+    assert np.abs(chosen.map.at(GRID) - true.at(GRID)).max() < 0.01
+    assert chosen.excess == pytest.approx(1, abs=0.4)
+
+
+def straight(angle: float, size: float = 20.0) -> SmoothMap:
+    """A map without perspective, turned by an angle."""
+    grid = np.array([[0.0, 0], [1, 0], [0, 1], [1, 1]])
+    turn = size * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    return homography_start(Frame.of(grid, (100, 90)), grid, np.array([48.3, 41.8]) + grid @ turn)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.2, 0.8, 1.5, 3.0])
+def test_strips_hold_every_pixel_once(angle: float) -> None:
+    image = np.arange(90 * 100, dtype=np.uint16).reshape(90, 100)
+    lines = grid_lines(straight(angle), np.array([[0.5, 0.0]]), np.array([False]), np.ones(1))
+    strips = gather(image, lines, np.array([4.0]), np.array([1.5]))
+    v, u = np.mgrid[0:90, 0:100]
+    du, dv = u - lines.middle[0, 0], v - lines.middle[0, 1]
+    s = du * lines.tangent[0, 0] + dv * lines.tangent[0, 1]
+    d = du * lines.normal[0, 0] + dv * lines.normal[0, 1]
+    expected = image[(np.abs(d) <= 4) & (np.abs(s) <= 10 - 1.5)]
+    np.testing.assert_array_equal(np.sort(strips.value[strips.inside]), expected)
+    assert strips.beyond[0] == 0
+
+
+def test_strips_know_what_lies_outside_the_image() -> None:
+    image = np.zeros((90, 100), dtype=np.uint8)
+    lines = grid_lines(straight(0.0), np.array([[0.5, 2.3]]), np.array([False]), np.ones(1))
+    strips = gather(image, lines, np.array([6.0]), np.zeros(1))
+    assert 0 < strips.beyond[0] < 1
+    assert strips.inside.sum() > 0
+
+
+def test_lines_bend_as_the_map_does() -> None:
+    bent = some_map(0)
+    centre = np.array([[3.5, 2.0], [7.0, 4.5]])
+    vertical = np.array([False, True])
+    lines = grid_lines(bent, centre, vertical, np.array([1.0, -1.0]))
+    for k in (0, 1):
+        t = np.linspace(-0.5, 0.5, 11)[:, None]
+        step = np.array([0.0, 1.0]) if vertical[k] else np.array([1.0, 0.0])
+        offset = bent.at(centre[k] + t * step) - lines.middle[k]
+        s, d = offset @ lines.tangent[k], offset @ lines.normal[k]
+        assert np.abs(d - 0.5 * lines.curvature[k] * s**2).max() < 0.01
+        assert np.abs(d).max() > 5 * np.abs(d - 0.5 * lines.curvature[k] * s**2).max()
+        across = bent.at(centre[k] + 0.1 * step[::-1]) - lines.middle[k]
+        assert np.sign(across @ lines.normal[k]) == [1, -1][k]
+        assert (lines.crossing[k] @ lines.tangent[k] * [1, -1] > 0).all()
+
+
+def test_levels_are_fitted_through_hidden_squares() -> None:
+    rng = np.random.default_rng(8)
+    frame = Frame(np.zeros(2), np.ones(2), np.array([320.0, 240.0]), 400.0)
+    place = rng.uniform([100, 100], [540, 380], (40, 2))
+
+    def level(p: Array) -> Array:
+        return 200 + 0.1 * (p[:, 0] - 320) - 0.05 * (p[:, 1] - 240)
+
+    values = level(place) + rng.normal(0, 0.2, 40)
+    values[:8] = 90
+    dark = Levels(place, 0.2 * level(place), np.full(40, 0.04))
+    shading = fit_shading(frame, dark, Levels(place, values, np.full(40, 0.04)))
+    mean, contrast = shading.at(place)
+    assert np.abs(mean + contrast - level(place)).max() < 0.5
+    slopes = shading.slopes(place)
+    step = 1e-3
+    ahead, behind = (shading.at(place + np.array([sign * step, 0])) for sign in (1, -1))
+    for k in (0, 1):
+        np.testing.assert_allclose(slopes[k][:, 0], (ahead[k] - behind[k]) / (2 * step), atol=1e-8)
+    assert shading.spread.max() < 0.05
+
+
+def test_rows_may_be_put_together() -> None:
+    rows = Rows.of_points(GRID, GRID, 1.0, 1)
+    both = rows.and_(replace(rows, value=rows.value + 1))
+    assert len(both.value) == 4 * len(GRID)
+
+
+def test_median_of_an_even_number_is_the_upper_one() -> None:
+    assert median(np.array([4.0, 1.0, 3.0, 2.0])) == 3
+    assert median(np.array([3.0, 1.0, 2.0])) == 2
