@@ -31,7 +31,7 @@ __all__ = [
 
 Real = NDArray[np.floating]
 
-RESPONSE_TERMS = 4
+RESPONSE_TERMS = 6
 
 # erf(x) = 1 - exp(-x^2) sum_k C_k t^k, t = 1 / (1 + p x): the form of Hastings (Abramowitz and Stegun
 # 7.1.26) with seven terms, which Lawson's method has made minimax: at most 7.3e-10 off.
