@@ -158,7 +158,7 @@ def _layer(
     if not len(row):
         return lattice, 0
     dark = signs(row, col, lattice.dark)
-    points = settle(level.image, _searched(level, at, dark), sigma, rounds=2)
+    points = settle(level.image, _searched(level, at, dark), sigma)
     good = np.isfinite(points[:, 0])
     points = np.where(good[:, None], points, at.points)
     off = np.abs(at.in_squares(points - at.points)).max(axis=1)

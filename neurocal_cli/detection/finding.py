@@ -26,9 +26,10 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["find_grids"]
 
-_SEARCHED = 1.4e6  # px; the largest level that is searched when smaller ones gave something
-_REFINED = 1.4e6  # px; the largest level that grids grow on
-_TRIES, _SLIM_TRIES = 12, 4  # seeds per level that come to nothing
+# px; grids are looked for and grow on levels up to this size: on larger ones they only become
+# more precise, unless nothing has been found till there.
+_SEARCHED = 1.4e6
+_TRIES, _SLIM_TRIES = 8, 4  # seeds per level that come to nothing
 
 
 def find_grids(image: NDArray[np.generic]) -> list[Grid]:
@@ -42,21 +43,21 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
     Returns
     -------
     grids : list of Grid
-        The one that fills most of the picture first. Vertices are good to a few tenths of a pixel. Planes
-        that meet at a fold are grids of their own. A grid has at least 3 x 3 vertices: anything
-        smaller can be seen in clutter too, and its lines are not tested by a vertex between others.
+        The one that fills most of the picture first. Vertices are good to a few tenths of a pixel.
+        Planes that meet at a fold are grids of their own. A grid has at least 3 x 3 vertices:
+        anything smaller is found in clutter too, and no vertex between others tests its lines.
     """
     lattices: list[Lattice] = []
     levels = levels_of(image)
-    growing = [level for level in levels if level.image.size <= _REFINED] or levels[-1:]
+    small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
         lattices = [_finer(level, x) for x in lattices]
-        if level is growing[0]:
-            lattices = [y for x in lattices for y in _boards(cleaned(level, grown(level, x)))]
-        if level.image.size <= _SEARCHED or not lattices:
+        if level in small or not lattices:
+            if level is small[0]:
+                lattices = [y for x in lattices for y in _boards(cleaned(level, grown(level, x)))]
             lattices += _new(level, lattices)
-        if level is levels[0] or level is growing[0]:
-            lattices = _separated(level, lattices)
+            if level not in small[1:]:
+                lattices = _separated(level, lattices)
     return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
 
 
