@@ -137,7 +137,15 @@ def gauss_newton(
         gradient[:, MEAN:] -= (prior.precision @ pull[:, :, None])[:, :, 0]
         information[:, MEAN:, MEAN:] += prior.precision
         information[:, diagonal, diagonal] += _NOTHING
-        step = np.asarray(np.linalg.solve(information, gradient[:, :, None])[:, :, 0], dtype=float)
+        step = _solved(information, gradient)
+        sharpest = (values[:, BLUR] <= _LEAST_BLUR) & (step[:, BLUR] < 0)
+        if sharpest.any():
+            # A blur at its limit stays there: the others are found as if it were known.
+            information[sharpest, BLUR] = 0.0
+            information[sharpest, :, BLUR] = 0.0
+            gradient[sharpest, BLUR] = 0.0
+            information[sharpest, BLUR, BLUR] = 1.0
+            step = _solved(information, gradient)
         size = np.sqrt(np.maximum((step * gradient).sum(axis=1), 0))
         values = _moved(values, step)
         linear = model(values)
@@ -148,6 +156,10 @@ def gauss_newton(
     chi2 = np.einsum("en,en,en->e", linear.residual, linear.residual, weight).astype(float)
     count = (weight > 0).sum(axis=1).astype(np.int64)
     return Fit(values, information, prior, chi2, count, size, linear)
+
+
+def _solved(information: Array, gradient: Array) -> Array:
+    return np.asarray(np.linalg.solve(information, gradient[:, :, None])[:, :, 0], dtype=float)
 
 
 def _normal(linear: Linear, weight: Single) -> tuple[Array, Array]:
