@@ -29,6 +29,7 @@ _FLAT = 0.95  # light, of -1 to 1, beyond which the levels are reached but for l
 _LEAST_SHARE = 0.3
 _BLUR_SPREAD = 0.03  # relative, of single edges' blur around the board's at least
 _ENOUGH = 10000  # pixels to learn the profile's shape from
+_TAILS, _BENDS = 0.05, 0.3  # standard deviations of the coefficients before anything is known
 _RIDGE = 1e-5
 _LEAST_SPREAD = 0.0002  # of levels, in variances of the noise
 
@@ -92,7 +93,9 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     """
     # A share of the pixels is enough for a dozen numbers.
     step = max(1, int((data.weight[good] > 0).sum()) // _ENOUGH)
-    some = np.ix_(np.flatnonzero(good), np.arange(0, data.s.shape[1], step))
+    edges = np.flatnonzero(good)[:, None]
+    # Each edge another share, or all of them would be from the same places across the edges.
+    some = (edges, np.arange(0, data.s.shape[1] - step + 1, step) + 7 * edges % step)
     z, x, Q = fit.linear.z[some], fit.linear.x[some], data.Q[some]
     _, density = erf_and_density(z)
     scale = fit.values[good, CONTRAST].astype(np.float32)[:, None] * data.gain[some]
@@ -106,6 +109,11 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     normal = (weighted @ columns.T).astype(float)
     right = (weighted @ fit.linear.residual[some].reshape(-1)).astype(float)
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
+    # Blur, contrast, tails and the odd terms of the response can nearly stand in for one another.
+    believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _BENDS)]) ** -2
+    known = np.concatenate([shape.tails.mean(axis=0), shape.bend])
+    right[: len(known)] -= believed * known
+    normal[range(len(known)), range(len(known))] += believed
     change = np.linalg.solve(normal, right)
     return Shape(shape.tails + change[:2], shape.bend + change[2 : 2 + RESPONSE_TERMS])
 
