@@ -21,6 +21,7 @@ from neurocal_cli.detection.find_merge import merged
 from neurocal_cli.detection.find_refine import settle
 from neurocal_cli.detection.find_saddles import Saddles, find_saddles
 from neurocal_cli.detection.find_seeds import find_links, find_seeds, find_slim_seeds
+from neurocal_cli.detection.find_stretch import stretched
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
@@ -58,6 +59,8 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
             lattices += _new(level, lattices)
             if level not in small[1:]:
                 lattices = _separated(level, lattices)
+    if not lattices and levels and levels[0] in small:
+        lattices = _separated(levels[0], _slivers(levels[0]))
     return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
 
 
@@ -122,6 +125,24 @@ def _sprouted(
             tries -= 1
         if tries <= 0:
             break
+    return found
+
+
+def _slivers(level: Level) -> list[Lattice]:
+    """Grids of squares so narrow that their edges' directions are not seen."""
+    saddles = find_saddles(level).points
+    part = stretched(level, saddles) if len(saddles) >= 9 else None
+    if part is None:
+        return []
+    found = []
+    for lattice in _new(part.level, []):
+        there = part.back(lattice.pixels[lattice.seen])
+        pixels = np.full_like(lattice.pixels, np.nan)
+        settled = settle(level.image, there, smoothing(0.0))
+        close = np.hypot(*(settled - there).T) < 1
+        pixels[lattice.seen] = np.where(close[:, None], settled, there)
+        grid = grown(level, replace(lattice, pixels=pixels))
+        found += _boards(cleaned(level, grid))
     return found
 
 
