@@ -97,7 +97,7 @@ class SmoothMap:
     def shaped(self, radial: int, degree: int) -> SmoothMap:
         """The map with other free parameters; new ones are 0 and old ones dropped."""
         old = self.parameters[_REST:].reshape(2, -1)
-        rest = np.zeros((2, len(_orders(degree))))
+        rest = np.zeros((2, len(_orders(degree, self.frame))))
         common = min(old.shape[1], rest.shape[1])
         rest[:, :common] = old[:, :common]
         values = np.concatenate([self.parameters[:_REST], rest.reshape(-1)])
@@ -114,7 +114,7 @@ class SmoothMap:
             rho = (e * (e @ self._metric)).sum(axis=-1)[..., None]
             q = q + e * (rho * (values[10] + values[11] * rho))
         if self.degree:
-            terms = _rest(self.degree, scaled[..., 0], scaled[..., 1])
+            terms = _rest(self.degree, self.frame, scaled[..., 0], scaled[..., 1])
             q = q + terms @ values[_REST:].reshape(2, -1).T
         return np.asarray(frame.centre + frame.unit * q)
 
@@ -143,7 +143,7 @@ class SmoothMap:
         out[:, :, 13] = growth * e * (2 * e[:, :1] * e[:, 1:])
         q = q + e * stretch
         if self.degree:
-            terms = _rest(self.degree, x, y)
+            terms = _rest(self.degree, frame, x, y)
             m = terms.shape[1]
             out[:, 0, _REST : _REST + m] = out[:, 1, _REST + m :] = terms
             q = q + terms @ values[_REST:].reshape(2, -1).T
@@ -181,14 +181,21 @@ def _project(values: Array, x: Array, y: Array) -> tuple[Array, Array]:
     return np.stack([u, v], axis=-1), w
 
 
-def _orders(degree: int) -> list[tuple[int, int]]:
-    return [(i, total - i) for total in range(2, degree + 1) for i in range(total + 1)]
+def _orders(degree: int, frame: Frame) -> list[tuple[int, int]]:
+    """Orders (i, j) of the polynomials in x and in y.
+
+    Edges tell a place along a line only at the line's vertices. An order as high as their number less
+    one can be anything between them.
+    """
+    most_x, most_y = np.maximum(2 * frame.half - 1, 0)
+    orders = [(i, total - i) for total in range(2, degree + 1) for i in range(total + 1)]
+    return [(i, j) for i, j in orders if i <= most_x and j <= most_y]
 
 
-def _rest(degree: int, x: Array, y: Array) -> Array:
+def _rest(degree: int, frame: Frame, x: Array, y: Array) -> Array:
     """Values of the polynomials T_i(x) T_j(y), 2 <= i + j <= degree; (..., m) array."""
     tx, ty = [np.ones_like(x), x], [np.ones_like(y), y]
     for _ in range(degree - 1):
         tx.append(2 * x * tx[-1] - tx[-2])
         ty.append(2 * y * ty[-1] - ty[-2])
-    return np.stack([tx[i] * ty[j] for i, j in _orders(degree)], axis=-1)
+    return np.stack([tx[i] * ty[j] for i, j in _orders(degree, frame)], axis=-1)
