@@ -217,7 +217,9 @@ def _finished(now: SmoothMap, rows: Rows, shift: Array, residual: Array, jacobia
     )
     size = 1 / np.sqrt(np.maximum(np.diag(normal), _TINY))
     inverse = np.linalg.inv(normal * size[:, None] * size) * size[:, None] * size
-    telling = good & (rows.variance < 100 * median(rows.variance))
+    # Anchors may be more than half of the rows, and tell nothing.
+    typical = float(np.sort(rows.variance)[len(z) // 4])
+    telling = good & (rows.variance < 100 * typical)
     left = int(telling.sum()) - len(free) - len(shift)
     excess = float((z[telling] ** 2).sum()) / max(left, 0.2 * len(z))
     shrunk = min(1.0, (excess * left + _BELIEF) / (left + _BELIEF)) if left > 0 else 1.0
