@@ -136,6 +136,11 @@ def test_whole_boards_are_found_completely(name: str) -> None:
 
 
 @pytest.mark.slow
+def test_boards_seen_almost_from_the_side_are_found_unless_squares_are_three_pixels_wide() -> None:
+    assert len(missed("tilt 75", range(FIRST, FIRST + 16))) <= 2
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["2 Mpx", "5 Mpx", "5 Mpx clutter"])
 def test_boards_in_large_pictures_are_found(name: str) -> None:
     assert missed(name, range(FIRST, FIRST + 2)) == []

@@ -12,9 +12,10 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Stretched", "stretched"]
 
-_FACTOR = 3.0
+_FACTOR = 2.0
 _ONE_WAY = 1.8  # least ratio of the gradients across and along the slivers
 _AROUND = 12  # px; beyond the outermost saddles
+_STRAY = 3.0  # times the saddles' median distance from their middle
 _LARGEST = 0.25  # share of the picture that they are spread over
 
 
@@ -52,6 +53,9 @@ def stretched(level: Level, saddles: Array) -> Stretched | None:
         None where saddles are all over the picture, or edges run both ways.
     """
     height, width = level.image.shape
+    # Stray saddles do not widen the part.
+    away = np.hypot(*(saddles - np.median(saddles, axis=0)).T)
+    saddles = saddles[away <= _STRAY * np.median(away)]
     low = np.maximum(np.floor(saddles.min(axis=0)) - _AROUND, 0).astype(int)
     high = np.minimum(np.ceil(saddles.max(axis=0)) + _AROUND, [width, height]).astype(int)
     if np.prod(high - low) > _LARGEST * level.image.size:
