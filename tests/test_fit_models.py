@@ -53,7 +53,7 @@ def test_profile_has_the_slope_it_says() -> None:
 
 
 def test_response_keeps_the_levels_and_has_the_slope_it_says() -> None:
-    bend = np.array([0.2, -0.1, 0.05, 0.02])
+    bend = np.array([0.2, -0.1, 0.05, 0.02, -0.03, 0.01])
     assert len(bend) == RESPONSE_TERMS
     x = np.linspace(-1, 1, 51)
     value, steep = response(x, bend)

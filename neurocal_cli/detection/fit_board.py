@@ -33,6 +33,7 @@ _REACH = 4.0  # sigma on both sides of an edge
 _SLACK = 0.5  # px, for starts that are off
 _NEAREST = 0.5  # sigma from the crossing lines
 _STEPS = 6  # of Gauss and Newton, at most
+_LEAST_VARIANCE = 1e-12  # px^2
 _LEAST_SCALE = 0.1  # of the noise by the final residuals; less cannot be, the rounding being known
 _WIDEST = 12.0  # px, of the strips for moments
 _BLUR_OFF = 0.1  # relative error of the blur that makes the first fit be done again
@@ -192,7 +193,9 @@ def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noi
         wrong, sigma = abs(found - sigma) > _BLUR_OFF * sigma, found
         if not wrong:
             break
-    variance = np.where(good, fit.covariance[:, OFFSET, OFFSET], _ANCHOR**2)
+    variance = fit.covariance[:, OFFSET, OFFSET]
+    good &= variance > 0
+    variance = np.where(good, variance, _ANCHOR**2)
     chosen = choose_map(mapped.map, board.rows(lines, fit.values[:, OFFSET], variance), mapped.shift)
     good &= chosen.weight[: len(good)] > 0
     return Fitted(lines, fit, data, chosen, shading, shape, Noise(noise, noise, noise), good)
@@ -237,8 +240,8 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
     scale = max(median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
-    variance = fit.covariance[:, OFFSET, OFFSET]
-    trusted = np.where(smooth(fit), variance, _ANCHOR**2)
+    variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
+    trusted = np.where(smooth(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
     mapped = fit_map(first.map.map, board.rows(lines, fit.values[:, OFFSET], trusted), first.map.shift)
     expected = variance + mapped.map.variance(board.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)

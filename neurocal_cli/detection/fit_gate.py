@@ -50,8 +50,9 @@ def believable(fit: Fit, departure: Array, beyond: Array) -> NDArray[np.bool_]:
     good &= fit.step < _MOST_STEP
     # Offsets of the lines are every other value.
     offsets = range(0, fit.values.shape[1] + MEAN, 2)
-    spread = fit.covariance[:, offsets, offsets].max(axis=1)
-    good &= spread < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
+    spread = fit.covariance[:, offsets, offsets]
+    good &= (spread > 0).all(axis=1)
+    good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
     good &= np.abs(departure) < _LIMIT
     rough = fit.chi2 / np.maximum(fit.count, 1)
     usual = median(rough[good]) if good.any() else 1.0

@@ -18,6 +18,7 @@ Single = NDArray[np.float32]
 MEAN, CONTRAST, BLUR = -3, -2, -1
 _LEAST_BLUR = 0.3  # px; the pixel's box alone has 0.289
 _MOST, _SETTLED = 0.9, 0.5  # share of the fits whose last step was less, in standard deviations
+_SINGLE = 1e-6  # relative error of sums
 _NOTHING = 1e-9  # information that keeps fits without pixels from dividing by 0
 
 
@@ -103,6 +104,8 @@ class Fit:
         total = self.information.copy()
         total[:, MEAN:, MEAN:] += self.prior.precision
         diagonal = range(total.shape[1])
+        # Sums of single precision are not exactly positive where the values can hardly be told apart.
+        total[:, diagonal, diagonal] *= 1 + _SINGLE
         total[:, diagonal, diagonal] += _NOTHING
         return np.asarray(np.linalg.inv(total), dtype=float)
 

@@ -104,10 +104,11 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     tails = tail_terms(z, density) * steep
     others = np.stack([density * steep, density * z * steep, x])
     columns = np.concatenate([tails * scale, bends * scale, others * scale, np.ones_like(z)[None]])
-    columns = columns.reshape(len(columns), -1)
-    weighted = columns * data.weight[some].reshape(-1)
-    normal = (weighted @ columns.T).astype(float)
-    right = (weighted @ fit.linear.residual[some].reshape(-1)).astype(float)
+    # Edge by edge: small products, for which no threads are started.
+    columns = columns.swapaxes(0, 1)
+    weighted = columns * data.weight[some][:, None]
+    normal = (weighted @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
+    right = (weighted @ fit.linear.residual[some][:, :, None]).sum(axis=(0, 2), dtype=float)
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
     # Blur, contrast, tails and the odd terms of the response can nearly stand in for one another.
     believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _BENDS)]) ** -2
@@ -120,6 +121,8 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
 
 def blur_of(fit: Fit, good: NDArray[np.bool_]) -> tuple[float, float]:
     """Blur [px] of a board and the variance [px^2] of its edges' blur, beyond that of the fits."""
+    if not good.any():
+        good = np.ones_like(good)
     sigma = fit.values[good, BLUR]
     usual = median(sigma)
     scatter = median((sigma - usual) ** 2) / 0.455

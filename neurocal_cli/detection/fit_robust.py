@@ -158,7 +158,7 @@ def choose_map(start: SmoothMap, rows: Rows, shift: Array, enough: float = 0.0) 
         fit = fit_map(now, rows, shift)
         now, shift = fit.map, fit.shift
         cost = _loss(fit.residual / np.sqrt(rows.variance)) + _PRICE * len(now.free)
-        if cost < worth:
+        if best is None or cost < worth:
             best, worth, barren = fit, cost, 0
         else:
             barren += 1
