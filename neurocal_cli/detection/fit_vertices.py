@@ -111,12 +111,7 @@ def vertex_data(
     (s1, d1), (s2, d2) = (_coordinates(line, u, v) for line in lines)
     mine = np.abs(d1) <= np.abs(d2)
     mine[:, parts[0].u.shape[1] :] ^= True
-    Q = np.ones_like(d1) * light.astype(np.float32)[:, None]
-    for line, d in zip(lines, (d1, d2), strict=True):
-        close = line.width < _ALONE * sigma
-        for side in (-1, 1):
-            t = (line.width[close, None] + side * d[close]) / sigma[close, None]
-            Q[close] *= erf_and_density(t.astype(np.float32))[0]
+    Q = _faded(lines, (d1, d2), sigma) * light.astype(np.float32)[:, None]
     slope_a, slope_b = (g.astype(np.float32) for g in slopes)
     value = np.asarray(value - u * slope_a[:, :1] - v * slope_a[:, 1:], dtype=np.float32)
     relative = slope_b / contrast.astype(np.float32)[:, None]
@@ -125,6 +120,17 @@ def vertex_data(
     used = (inside & mine).astype(np.float32)
     beyond = np.maximum(parts[0].beyond, parts[1].beyond)
     return VertexData(s1, d1, s2, d2, value, gain, Q, rho, used, beyond)
+
+
+def _faded(lines: tuple[Lines, Lines], distances: tuple[Single, Single], sigma: Array) -> Single:
+    """What the parallel lines on both sides leave of the edges, where they are near."""
+    Q = np.ones_like(distances[0])
+    for line, d in zip(lines, distances, strict=True):
+        close = line.width < _ALONE * sigma
+        for side in (-1, 1):
+            t = (line.width[close, None] + side * d[close]) / sigma[close, None]
+            Q[close] *= erf_and_density(t.astype(np.float32))[0]
+    return Q
 
 
 def _coordinates(lines: Lines, u: Single, v: Single) -> tuple[Single, Single]:
