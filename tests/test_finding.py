@@ -182,11 +182,12 @@ def test_visible_vertices_of_partly_hidden_boards_are_found(name: str, count: in
         shot = picture(name, seed)
         grids = find_grids(shot.image)
         for truth in shot.truth.planes:
-            hit, others = best_match(grids, truth)
+            # One just under the edge of what hides it may be found beside its place.
+            hit, others = best_match(grids, truth, within=2.0)
             visible = open_around(truth, shot.image.shape[::-1])
             found, total, wrong = found + (hit & visible).sum(), total + visible.sum(), wrong + others
     assert wrong == 0
-    assert found >= 0.985 * total
+    assert found >= 0.99 * total
 
 
 @pytest.mark.parametrize("count", [3, pytest.param(30, marks=pytest.mark.slow)])
