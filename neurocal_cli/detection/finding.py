@@ -49,6 +49,7 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
         anything smaller is found in clutter too, and no vertex between others tests its lines.
     """
     lattices: list[Lattice] = []
+    saddles: Saddles
     levels = levels_of(image)
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
@@ -56,11 +57,12 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
         if level in small or not lattices:
             if level is small[0]:
                 lattices = [y for x in lattices for y in _boards(cleaned(level, grown(level, x)))]
-            lattices += _new(level, lattices)
+            saddles = find_saddles(level, _covered(level, lattices) if lattices else None)
+            lattices += _new(level, saddles, not lattices)
             if level not in small[1:]:
                 lattices = _separated(level, lattices)
     if not lattices and levels and levels[0] in small:
-        lattices = _separated(levels[0], _slivers(levels[0]))
+        lattices = _separated(levels[0], _slivers(levels[0], saddles))
     return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
 
 
@@ -92,15 +94,14 @@ def _area(pixels: Array) -> float:
     return float(np.nansum(np.abs(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])) / 2)
 
 
-def _new(level: Level, known: list[Lattice]) -> list[Lattice]:
-    """Grids of a level that are not among the known ones."""
-    saddles = find_saddles(level, _covered(level, known) if known else None)
+def _new(level: Level, saddles: Saddles, first: bool) -> list[Lattice]:
+    """Grids of a level's saddles; with more effort for the first in an image."""
     if len(saddles) < 9:
         return []
     links = find_links(level, saddles)
     seeds, _ = find_seeds(saddles, links)
     found = _sprouted(level, saddles, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES)
-    if not found and not known and level.scale == 1:
+    if not found and first and level.scale == 1:
         found = _sprouted(level, saddles, *find_slim_seeds(saddles, links), _SLIM_TRIES)
     return found
 
@@ -128,14 +129,13 @@ def _sprouted(
     return found
 
 
-def _slivers(level: Level) -> list[Lattice]:
+def _slivers(level: Level, saddles: Saddles) -> list[Lattice]:
     """Grids of squares so narrow that their edges' directions are not seen."""
-    saddles = find_saddles(level).points
-    part = stretched(level, saddles) if len(saddles) >= 9 else None
+    part = stretched(level, saddles.points) if len(saddles) >= 9 else None
     if part is None:
         return []
     found = []
-    for lattice in _new(part.level, []):
+    for lattice in _new(part.level, find_saddles(part.level), True):
         there = part.back(lattice.pixels[lattice.seen])
         pixels = np.full_like(lattice.pixels, np.nan)
         settled = settle(level.image, there, smoothing(0.0))
