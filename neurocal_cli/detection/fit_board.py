@@ -34,6 +34,7 @@ _SLACK = 0.5  # px, for starts that are off
 _NEAREST = 0.5  # sigma from the crossing lines
 _STEPS = 6  # of Gauss and Newton, at most
 _LEAST_VARIANCE = 1e-12  # px^2
+_NORMAL = 1.4826  # standard deviations in a median of absolute values
 _LEAST_SCALE = 0.1  # of the noise by the final residuals; less cannot be, the rounding being known
 _WIDEST = 12.0  # px, of the strips for moments
 _BLUR_OFF = 0.1  # relative error of the blur that makes the first fit be done again
@@ -245,6 +246,10 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     mapped = fit_map(first.map.map, board.rows(lines, fit.values[:, OFFSET], trusted), first.map.shift)
     expected = variance + mapped.map.variance(board.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
+    # A board that is uneven by itself, as paper is, departs from its map everywhere: no single edge is
+    # wrong for that, but all of them are less certain.
+    uneven = max(_NORMAL * median(np.abs(departure)), 1.0)
+    mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
     good = believable(fit, departure, data.beyond)
     return Fitted(lines, fit, data, mapped, shading, shape, noise, good)
 

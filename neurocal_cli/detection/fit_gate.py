@@ -19,7 +19,9 @@ _LIMIT = 6.0  # standard deviations
 _ROUGH = 0.5  # relative excess of chi2 that is never held against a fit
 _LEAST_SHARE = 0.2  # of good fits; fewer are so by chance, and what they share is not the board's
 _MOST_SPREAD = 0.5  # standard deviation of an offset, in sigma; more is a fit to noise
-_MOST_STEP = 1.0  # standard deviations that the last step may have
+# The last step may have this many standard deviations, or be so long [px]: sharp pictures leave little
+# noise, and less than what the model of their edges is good for.
+_MOST_STEP, _MOST_MOVE = 1.0, 0.03
 
 
 def smooth(fit: Fit) -> NDArray[np.bool_]:
@@ -47,11 +49,12 @@ def believable(fit: Fit, departure: Array, beyond: Array) -> NDArray[np.bool_]:
     good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
     good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
     good &= (beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
-    good &= fit.step < _MOST_STEP
     # Offsets of the lines are every other value.
     offsets = range(0, fit.values.shape[1] + MEAN, 2)
     spread = fit.covariance[:, offsets, offsets]
     good &= (spread > 0).all(axis=1)
+    moved = fit.step * np.sqrt(np.maximum(spread.max(axis=1), 0.0))
+    good &= (fit.step < _MOST_STEP) | (moved < _MOST_MOVE)
     good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
     good &= np.abs(departure) < _LIMIT
     rough = fit.chi2 / np.maximum(fit.count, 1)

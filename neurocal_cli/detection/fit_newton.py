@@ -109,6 +109,11 @@ class Fit:
         total[:, diagonal, diagonal] += _NOTHING
         return np.asarray(np.linalg.inv(total), dtype=float)
 
+    @property
+    def unsettled(self) -> Array:
+        """(E,) by which variances grow for what a last step of some standard deviations leaves open."""
+        return np.where(self.step > 1, 1 + self.step**2, 1.0)
+
     def scaled(self, noise: float) -> Fit:
         """The same fits, the pixels' variance being another by a factor."""
         return replace(self, information=self.information / noise, chi2=self.chi2 / noise)

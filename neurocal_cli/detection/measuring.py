@@ -94,8 +94,8 @@ def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
     d += 0.5 * lines.curvature * s * s - mapped.shift[0]
     pixels = lines.middle + s[:, None] * lines.tangent + d[:, None] * lines.normal
     along = mapped.map.variance(centre, lines.tangent) * mapped.excess
-    across = fit.covariance[:, OFFSET, OFFSET] * min(mapped.excess, 1.0) + mapped.shift_variance[0]
-    across += fitted.unevenness
+    across = fit.covariance[:, OFFSET, OFFSET] * fit.unsettled * min(mapped.excess, 1.0)
+    across += mapped.shift_variance[0] + fitted.unevenness
     (tu, tv), (nu, nv) = lines.tangent.T, lines.normal.T
     covariance = np.stack(
         [
@@ -125,7 +125,7 @@ def _vertices(board: Board, fitted: Fitted, vertices: Array) -> Measured:
     inverse = np.linalg.inv(np.stack([first.normal, second.normal], axis=1))
     offsets = fit.values[:, [FIRST, SECOND]]
     pixels = first.middle + (inverse @ offsets[:, :, None])[:, :, 0]
-    spread = fit.covariance[:, [[FIRST], [SECOND]], [FIRST, SECOND]]
+    spread = fit.covariance[:, [[FIRST], [SECOND]], [FIRST, SECOND]] * fit.unsettled[:, None, None]
     spread = inverse @ spread @ inverse.swapaxes(1, 2)
     uneven = fitted.unevenness
     covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
