@@ -89,7 +89,8 @@ class Correspondences:
         for name in ("view", "point", "lines"):
             labels = getattr(self, name)
             if labels is not None:
-                labels = np.array(labels)  # a copy: it is made read-only
+                if not isinstance(labels, np.ndarray) or labels.flags.writeable:
+                    labels = np.array(labels)  # a copy: it is made read-only
                 if labels.shape != (n,):
                     raise InputError(f"{self.source}: {name} needs one entry for each of the {n} points")
                 self._set(**{name: _frozen(labels)})
@@ -179,7 +180,9 @@ class Correspondences:
 
 def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
     try:
-        array = np.array(values, dtype=float)
+        # A copy, so that nobody else writes into it; of a million rows only if anybody could.
+        shared = not isinstance(values, np.ndarray) or values.flags.writeable or values.base is not None
+        array = np.array(values, dtype=float) if shared else np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name} must be an array of numbers, shape (N, {columns})") from error
     if array.ndim != 2 or array.shape[1] != columns:

@@ -56,7 +56,9 @@ class Table:
 
     def stack(self, names: tuple[str, ...]) -> Array:
         """(N, k) array of some columns."""
-        return np.column_stack([self.numbers[name] for name in names])
+        columns = np.column_stack([self.numbers[name] for name in names])
+        columns.setflags(write=False)
+        return columns
 
 
 def read_table(path: str | Path, schema: Schema) -> Table:
