@@ -1,0 +1,59 @@
+"""Detection beside OpenCV's finders, on the same rendered pictures, a board there or not.
+
+Run with ``pytest tests/benchmarks/test_detection_speed.py --benchmark-enable``.
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pytest_benchmark.fixture import BenchmarkFixture
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from rendered import picture
+
+from neurocal_cli.detection.finding import find_grids
+from neurocal_cli.detection.measuring import measure
+
+cv2 = pytest.importorskip("cv2")
+CONDITIONS = ["base", "2 Mpx", "5 Mpx", "clutter only"]
+
+
+def seen(condition: str) -> NDArray[np.uint8]:
+    cv2.setNumThreads(1)
+    image = picture(condition, 900).image
+    assert image.dtype == np.uint8
+    return image
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_neurocal_finds_and_measures(benchmark: BenchmarkFixture, condition: str) -> None:
+    image = seen(condition)
+    benchmark.group = f"{condition}, {image.size / 1e6:.1f} Mpx"
+    points = benchmark(lambda: [measure(image, grid) for grid in find_grids(image)])
+    assert bool(points) == (condition != "clutter only")
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_opencv_classic_and_subpix(benchmark: BenchmarkFixture, condition: str) -> None:
+    image = seen(condition)
+    benchmark.group = f"{condition}, {image.size / 1e6:.1f} Mpx"
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.001)
+
+    def find() -> bool:
+        found, corners = cv2.findChessboardCorners(image, (9, 6))
+        if found:
+            cv2.cornerSubPix(image, corners.reshape(-1, 1, 2), (11, 11), (-1, -1), criteria)
+        return bool(found)
+
+    assert benchmark(find) == (condition != "clutter only")
+
+
+@pytest.mark.parametrize("condition", CONDITIONS)
+def test_opencv_sector_based(benchmark: BenchmarkFixture, condition: str) -> None:
+    image = seen(condition)
+    benchmark.group = f"{condition}, {image.size / 1e6:.1f} Mpx"
+    found = benchmark(lambda: cv2.findChessboardCornersSB(image, (9, 6))[0])
+    assert bool(found) == (condition != "clutter only")
