@@ -56,7 +56,10 @@ class Table:
 
     def stack(self, names: tuple[str, ...]) -> Array:
         """(N, k) array of some columns."""
-        columns = np.column_stack([self.numbers[name] for name in names])
+        first = self.numbers[names[0]]
+        columns = np.empty((len(first), len(names)))
+        for k, name in enumerate(names):
+            columns[:, k] = self.numbers[name]
         columns.setflags(write=False)
         return columns
 
@@ -82,7 +85,8 @@ def read_table(path: str | Path, schema: Schema) -> Table:
 
 def parse_table(data: bytes, source: str, schema: Schema) -> Table:
     """Read a table from bytes; see `read_table`."""
-    decode(data, source, f"a CSV file of {schema.kind}")  # refuses what is not UTF-8
+    if not data.isascii() or b"\0" in data:
+        decode(data, source, f"a CSV file of {schema.kind}")  # refuses what is not UTF-8
     data = data.removeprefix(b"\xef\xbb\xbf")
     if b"\r" in data:
         data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
