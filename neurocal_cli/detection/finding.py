@@ -30,6 +30,9 @@ __all__ = ["find_grids"]
 # px; grids are looked for and grow on levels up to this size: on larger ones they only become
 # more precise, unless nothing has been found till there.
 _SEARCHED = 1.4e6
+# Pixels of the largest level that is searched when smaller ones gave nothing: a board that is not seen
+# at this size would have to be a speck in a picture that fills the memory.
+_MOST_SEARCHED = 30_000_000
 _TRIES, _SLIM_TRIES = 8, 4  # seeds per level that come to nothing
 
 
@@ -54,7 +57,7 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
         lattices = [_finer(level, x) for x in lattices]
-        if level in small or not lattices:
+        if level in small or (not lattices and level.image.size <= _MOST_SEARCHED):
             if level is small[0]:
                 lattices = [y for x in lattices for y in _boards(cleaned(level, grown(level, x)))]
             saddles = find_saddles(level, _covered(level, lattices) if lattices else None)
