@@ -199,7 +199,7 @@ def test_midpoints_in_every_condition(name: str) -> None:
 # What vertices do not reach yet; mid-points do.
 SHORT = {
     "tilt 75": "98.6 % are kept: windows of slanted vertices reach into their neighbours",
-    "three planes across": "variances are half of what they should be next to a fold that the pattern crosses",
+    "three planes across": "variances are half what they should be beside a fold that the pattern crosses",
 }
 
 
