@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.lens import bend, distort
 from neurocal_cli.rendering.scene import Camera
 
 __all__ = ["Lens", "Rays"]
@@ -116,27 +117,12 @@ class Lens:
         return Rays(u, v, x, y, i11 * xu, i11 * xv + i12 * yv, i12 * xu, i12 * xv + i22 * yv)
 
     def _distort(self, x: Array, y: Array) -> tuple[Array, Array]:
-        if self.straight:
-            return x, y
-        k1, k2, p1, p2, k3 = self.camera.distortion
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        return xd, yd
+        return (x, y) if self.straight else distort("plumb_bob", self.camera.distortion, x, y)
 
     def _jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
         """Entries (0, 0), (0, 1) = (1, 0) and (1, 1) of the derivative of `_distort`."""
-        k1, k2, p1, p2, k3 = self.camera.distortion
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
-        cross = x * y * slope + 2 * p1 * x + 2 * p2 * y
-        return (
-            radial + x * x * slope + 2 * p1 * y + 6 * p2 * x,
-            cross,
-            radial + y * y * slope + 6 * p1 * y + 2 * p2 * x,
-        )
+        _, (xx, xy, _, yy), _ = bend("plumb_bob", self.camera.distortion, x, y)
+        return xx, xy, yy
 
     def _undistort(self, xd: Array, yd: Array, near: tuple[Array, Array] | None) -> tuple[Array, Array]:
         """Newton's method; it climbs to the root from the inside, so it needs no damping."""
