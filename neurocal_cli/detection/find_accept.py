@@ -6,7 +6,6 @@ import numpy as np
 
 from neurocal_cli.detection.find_grow import Lattice, signs
 from neurocal_cli.detection.find_levels import Level, sampled
-from neurocal_cli.detection.find_predict import expected
 from neurocal_cli.geometry import Array
 
 __all__ = ["edges_seen", "has_block", "is_smooth"]
@@ -36,8 +35,7 @@ def is_smooth(level: Level, lattice: Lattice) -> bool:
 
 def roughness(level: Level, lattice: Lattice) -> float:
     """How far vertices are from where their neighbours put them, over what is tolerated."""
-    row, col = np.nonzero(lattice.seen)
-    at = expected(lattice.pixels, row, col)
+    row, col, at = lattice.known
     off = at.in_squares(lattice.pixels[row, col] - at.points) / np.maximum(at.spread, 1.0)[:, None]
     contrast = max(float(np.nanmedian(lattice.contrast)), 1e-3)
     tolerated = _OFF + (_OFF_PX + _OFF_NOISE * level.noise / contrast) / max(float(np.median(at.width)), 1.0)
@@ -46,20 +44,24 @@ def roughness(level: Level, lattice: Lattice) -> float:
 
 def edges_seen(level: Level, lattice: Lattice) -> bool:
     """Whether dark and bright are told apart across the edges between neighbouring vertices."""
+    row, col, at = lattice.known
+    pixels, contrast = lattice.pixels, lattice.contrast
+    c, r = np.full_like(pixels, np.nan), np.full_like(pixels, np.nan)
+    c[row, col], r[row, col] = at.c, at.r
     held = [
-        _held(level, lattice.pixels, lattice.contrast, lattice.dark),
+        _held(level, pixels, r, contrast, lattice.dark),
         # With rows and columns exchanged, the squares on either side are too.
-        _held(level, lattice.pixels.transpose(1, 0, 2), lattice.contrast.T, lattice.dark),
+        _held(level, pixels.transpose(1, 0, 2), c.transpose(1, 0, 2), contrast.T, lattice.dark),
     ]
     return float(np.concatenate(held).mean()) >= _EDGES
 
 
-def _held(level: Level, pixels: Array, contrast: Array, dark: int) -> Array:
-    """Whether each edge along a row is seen."""
+def _held(level: Level, pixels: Array, ways: Array, contrast: Array, dark: int) -> Array:
+    """Whether each edge along a row is seen; ways (rows, cols, 2) lead from row to row."""
     known = np.isfinite(pixels[..., 0])
     row, col = np.nonzero(known[:, :-1] & known[:, 1:])
     start, end = pixels[row, col], pixels[row, col + 1]
-    across = 0.5 * (expected(pixels, row, col).r + expected(pixels, row, col + 1).r)
+    across = 0.5 * (ways[row, col] + ways[row, col + 1])
     middle = 0.5 * (start + end)
     sides = np.stack([middle + _ASIDE * across, middle - _ASIDE * across], axis=1)
     value = sampled(level.smooth, sides)

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.find_grow import Lattice, cropped
-from neurocal_cli.detection.find_predict import expected
 from neurocal_cli.geometry import Array
 
 __all__ = ["joined", "unfolded"]
@@ -65,14 +64,15 @@ def _restricted(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:
 def joined(lattice: Lattice) -> list[Lattice]:
     """Parts whose vertices are neighbours of each other along rows and columns."""
     count, label = cv2.connectedComponents(lattice.seen.astype(np.uint8), connectivity=4)
+    if count == 2:
+        return [cropped(lattice)]
     return [_restricted(lattice, label == k) for k in range(1, count)]
 
 
 def _folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
     """The sharpest folds along a row and along a column, see `_fold`."""
     pixels = lattice.pixels
-    row, col = np.nonzero(lattice.seen)
-    at = expected(pixels, row, col)
+    row, col, at = lattice.known
     width = max(float(np.median(at.width)), 1.0)
     folds = []
     for axis in (0, 1):
@@ -131,5 +131,8 @@ def _size(values: Array) -> Array:
     length = np.sqrt((values**2).sum(axis=-1))
     count = np.isfinite(length).sum(axis=1)
     size = np.zeros(len(length))
-    size[count >= 2] = np.nanmedian(length[count >= 2], axis=1)
+    # Unknown ones come last.
+    ordered, row = np.sort(length, axis=1), np.arange(len(length))
+    median = 0.5 * (ordered[row, (count - 1) // 2] + ordered[row, count // 2])
+    size[count >= 2] = median[count >= 2]
     return size

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +49,12 @@ class Lattice:
     def seen(self) -> NDArray[np.bool_]:
         """(rows, cols) which vertices are known."""
         return np.isfinite(self.pixels[..., 0])
+
+    @cached_property
+    def known(self) -> tuple[Index, Index, Expected]:
+        """Rows and columns (N,) of the known vertices, and where their neighbours put them."""
+        row, col = np.nonzero(self.seen)
+        return row, col, expected(self.pixels, row, col)
 
     @property
     def width(self) -> float:
@@ -119,8 +126,10 @@ def cropped(lattice: Lattice) -> Lattice:
     row, col = np.nonzero(lattice.seen)
     if not len(row):
         return lattice
-    top, left = row.min(), col.min()
-    part = slice(top, row.max() + 1), slice(left, col.max() + 1)
+    top, left, bottom, right = row.min(), col.min(), row.max() + 1, col.max() + 1
+    if top == left == 0 and (bottom, right) == lattice.contrast.shape:
+        return lattice
+    part = slice(top, bottom), slice(left, right)
     dark = int(lattice.dark + top + left) % 2
     return Lattice(lattice.pixels[part], lattice.contrast[part], dark)
 
@@ -164,7 +173,7 @@ def _layer(
     off = np.abs(at.in_squares(points - at.points)).max(axis=1)
     good &= off < _tolerance(at)
     sight = look(level, points, at, dark)
-    known = np.nan_to_num(lattice.contrast)
+    known = np.where(lattice.seen, lattice.contrast, 0.0)
     weight = _around(_around(lattice.seen))[row, col]
     usual = _around(_around(known))[row, col] / np.maximum(weight, 1)
     good &= sight.like & (sight.contrast > _WEAKEST * usual)

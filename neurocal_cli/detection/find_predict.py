@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
@@ -81,19 +80,20 @@ def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Exp
     row, col : (N,) int arrays
     """
     rows, cols = pixels.shape[:2]
-    framed = np.full((rows + 2 * _REACH, cols + 2 * _REACH, 2), np.nan)
-    framed[_REACH:-_REACH, _REACH:-_REACH] = pixels
-    size = 2 * _REACH + 1
-    near = sliding_window_view(framed, (size, size), axis=(0, 1))[row, col].reshape(len(row), 2, -1)
-    unknown = np.isnan(near[:, 0])
-    known = 1.0 - unknown
+    framed = np.full((2, rows + 2 * _REACH, cols + 2 * _REACH), np.nan)
+    framed[:, _REACH:-_REACH, _REACH:-_REACH] = pixels.transpose(2, 0, 1)
+    size, width = np.arange(2 * _REACH + 1), framed.shape[2]
+    window = (size[:, None] * width + size).ravel()
+    near = framed.reshape(2, -1)[:, (row * width + col)[:, None] + window]
+    seen = ~np.isnan(near[0])
+    known = seen.astype(float)
     # About the mean of the neighbours, for the sake of rounding.
-    near[np.broadcast_to(unknown[:, None], near.shape)] = 0.0
-    origin = near.sum(axis=2) / np.maximum(known.sum(axis=1), 1.0)[:, None]
-    near -= origin[:, :, None] * known[:, None]
+    near = np.where(seen, near, 0.0)
+    origin = near.sum(axis=2) / np.maximum(known.sum(axis=1), 1.0)
+    near -= origin[:, :, None] * known
     normal = (known @ _PRODUCTS).reshape(-1, 6, 6)
     normal += _HELD_BACK
     inverse = np.linalg.inv(normal)
-    right = (near.reshape(-1, near.shape[2]) @ _RIGHT).reshape(-1, 2, 6)
-    solution = inverse @ right.transpose(0, 2, 1)
-    return Expected(solution[:, 0] + origin, solution[:, 1], solution[:, 2], np.sqrt(inverse[:, 0, 0]))
+    right = (near.reshape(-1, len(window)) @ _RIGHT).reshape(2, -1, 6)
+    solution = inverse @ right.transpose(1, 2, 0)
+    return Expected(solution[:, 0] + origin.T, solution[:, 1], solution[:, 2], np.sqrt(inverse[:, 0, 0]))

@@ -53,20 +53,22 @@ def settle(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
         return np.full(start.shape, np.nan)
     offset = np.arange(-half, half + 1)
     window = (offset[:, None] * width + offset).ravel()
-    low, high = np.full(2, half), np.array([width, height]) - 1 - half
-    flat, point = image.ravel(), start.astype(float)
+    low, high = np.full((2, 1), half), np.array([[width], [height]]) - 1 - half
+    # Both coordinates in rows: sums over many short rows take longer.
+    flat, given = image.ravel(), start.T
+    point = np.nan_to_num(given)
     good = np.ones(len(start), dtype=bool)
     for _ in range(rounds):
-        centre = np.clip(np.rint(np.nan_to_num(point)), low, high).astype(np.intp)
-        values = flat[(centre[:, 1] * width + centre[:, 0])[:, None] + window]
-        u, v, uu, uv, vv = (values @ kernels).T.astype(float)
+        centre = np.minimum(np.maximum(np.rint(point), low), high)
+        place = (centre[1] * width + centre[0]).astype(np.intp)
+        u, v, uu, uv, vv = (flat[place[:, None] + window] @ kernels).T.astype(float)
         determinant = uu * vv - uv * uv
         good = determinant < 0
-        safe = np.where(good, determinant, -1.0)
-        step = np.stack([uv * v - vv * u, uv * u - uu * v], axis=-1) / safe[:, None]
-        length = np.maximum(np.hypot(*step.T), 1e-12)
-        point = centre + step * np.minimum(1.0, _LONGEST_STEP / length)[:, None]
-    good &= (
-        (np.abs(point - centre) < 1).all(axis=1) & (start >= low).all(axis=1) & (start <= high).all(axis=1)
-    )
-    return np.where(good[:, None], point, np.nan)
+        step = np.stack([uv * v - vv * u, uv * u - uu * v])
+        step /= np.where(good, determinant, -1.0)
+        length = np.maximum(np.hypot(step[0], step[1]), 1e-12)
+        step *= np.minimum(1.0, _LONGEST_STEP / length)
+        point = centre + step
+    close, framed = np.abs(point - centre) < 1, (given >= low) & (given <= high)
+    good &= close[0] & close[1] & framed[0] & framed[1]
+    return np.where(good, point, np.nan).T

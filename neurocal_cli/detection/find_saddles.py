@@ -70,12 +70,13 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     points = _strongest(level, covered)
     points = settle(level.image, points, 1.0, rounds=2)
     points = points[np.isfinite(points[:, 0])]
+    curved, sharp = _curved(level, points)
+    points, curved = points[sharp], curved[sharp]
     if not len(points):
         return Saddles(np.zeros((0, 2)), np.zeros((0, 4)), np.zeros(0))
     noise = level.noise
     rings = [_ring(sampled(level.smooth, points[:, None] + r * _DIRECTIONS), noise) for r in _RADII]
     (ports, contrast, good), (ports_small, contrast_small, good_small) = rings
-    curved, sharp = _curved(level, points)
     # Where squares are small, rings reach into the next ones: trust a ring that agrees with a
     # smaller one, and curvature where none does.
     good &= ~(good_small & (_differ(ports, ports_small) > _MOST_DIFFERENT))
@@ -83,7 +84,7 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     ports_small = np.where(astray[:, None], curved, ports_small)
     ports = np.where(good[:, None], ports, ports_small)
     contrast = np.where(good, contrast, contrast_small)
-    kept = np.flatnonzero((good | good_small) & sharp)
+    kept = np.flatnonzero(good | good_small)
     kept = kept[np.argsort(-contrast[kept], kind="stable")[:_MOST]]
     return Saddles(points[kept], ports[kept], contrast[kept])
 
@@ -116,18 +117,20 @@ _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:
     """Whole pixels where the saddle is steepest; (N, 2)."""
     uu, uv, vv = level.curvature
-    steepness = cv2.subtract(cv2.multiply(uv, uv), cv2.multiply(uu, vv))
-    steepness = np.asarray(steepness, dtype=np.float32)
-    # The largest within two pixels, and above the noise.
-    largest = np.asarray(cv2.dilate(steepness, np.ones((5, 5), np.uint8)))
-    least = np.maximum(largest, np.float32((_THRESHOLD * level.noise) ** 2))
-    peak = np.asarray(cv2.compare(steepness, least, cv2.CMP_GE), dtype=np.uint8)
+    steepness, largest = uv * uv, uu * vv
+    steepness -= largest
+    # The largest within two pixels, and above the noise. New memory would cost more than the sums.
+    cv2.dilate(steepness, np.ones((5, 5), np.uint8), dst=largest)
+    least = np.float32((_THRESHOLD * level.noise) ** 2)
+    np.maximum(largest, least, out=largest)
+    inner = slice(_BORDER, -_BORDER)
+    peak = steepness[inner, inner] >= largest[inner, inner]
+    v, u = np.divmod(np.flatnonzero(peak), peak.shape[1])
+    v, u = v + _BORDER, u + _BORDER
     if covered is not None:
-        peak[covered > 0] = 0
-    b = _BORDER
-    v, u = np.nonzero(peak[b:-b, b:-b])
-    v, u = v + b, u + b
-    limit = max(_LEAST, round(_PER_MEGAPIXEL * peak.size / 1e6))
+        free = covered[v, u] == 0
+        v, u = v[free], u[free]
+    limit = max(_LEAST, round(_PER_MEGAPIXEL * steepness.size / 1e6))
     if len(u) > limit:
         best = np.argpartition(-steepness[v, u], limit)[:limit]
         best.sort()
