@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.arrowhead import arrowhead_step, solve_scaled
 from neurocal_cli.geometry import Array, orthonormalised
 from neurocal_cli.pixel_error import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.tiles import Tiles
@@ -159,7 +160,7 @@ class _Descent:
         H, g = N[:, columns[:, None], columns], N[:, columns, -1]
         ridge = self.damping[:, None] * (np.diagonal(H, axis1=1, axis2=2) + 1e-300)
         H[:, range(len(columns)), range(len(columns))] += ridge
-        step = _solve_scaled(H, g[..., None])[..., 0]
+        step = solve_scaled(H, g[..., None])[..., 0]
         predicted = (step * (g + ridge * step)).sum(axis=1)
         step[self.done] = 0.0
         whole = np.zeros((len(N), N.shape[1]))
@@ -169,33 +170,9 @@ class _Descent:
 
     def _solve_together(self) -> tuple[Array, Array, Array]:
         """One A, a pose for each view: the poses are eliminated by the Schur complement."""
-        N, f, damping = self.normal, self.camera[self.free], float(self.damping[0])
-        total = N.sum(axis=0)
-        U, g = total[f[:, None], f], total[f, -1]
-        g_pose = N[:, POSE, -1]
-        ridge = damping * (np.diagonal(U) + 1e-300)
-        B = N[:, POSE, POSE].copy()
-        ridge_pose = damping * (np.diagonal(B, axis1=1, axis2=2) + 1e-300)
-        B[:, range(6), range(6)] += ridge_pose
-        C = N[:, f, POSE]  # (V, f, 6)
-        solved = _solve_scaled(B, np.concatenate([np.swapaxes(C, 1, 2), g_pose[..., None]], axis=2))
-        # (f, 6 V) times (6 V, f + 1): one product sums over views and poses.
-        flat_C = np.swapaxes(C, 0, 1).reshape(len(f), -1)
-        eliminated = flat_C @ solved.reshape(-1, len(f) + 1)
-        S = U + np.diag(ridge) - eliminated[:, :-1]
-        step = _solve_scaled(S, (g - eliminated[:, -1])[:, None])[:, 0]
-        by_pose = solved[:, :, -1] - solved[:, :, :-1] @ step
-        gain = (by_pose * (g_pose + ridge_pose * by_pose)).sum() + step @ (g + ridge * step)
+        own = np.arange(POSE.start, POSE.stop)
+        damping = float(self.damping[0])
+        step, by_pose, gain = arrowhead_step(self.normal, self.camera[self.free], own, damping)
         by_camera = np.zeros((1, len(self.camera)))
         by_camera[0, self.free] = step
         return by_camera, by_pose, np.array([gain])
-
-
-def _solve_scaled(H: Array, rhs: Array) -> Array:
-    """Solve symmetric systems scaled to a unit diagonal; a singular one yields nan."""
-    scale = 1.0 / np.sqrt(np.abs(np.diagonal(H, axis1=-2, axis2=-1)) + 1e-300)
-    scaled = H * scale[..., :, None] * scale[..., None, :]
-    try:
-        return scale[..., :, None] * np.linalg.solve(scaled, scale[..., :, None] * rhs)
-    except np.linalg.LinAlgError:
-        return np.full(rhs.shape, np.nan)
