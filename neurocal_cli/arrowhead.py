@@ -74,7 +74,7 @@ def arrowhead_step(
     C = N[:, f[:, None], own]  # (V, f, p)
     solved = solve_scaled(B, np.concatenate([np.swapaxes(C, 1, 2), g_own[..., None]], axis=2))
     # (f, p V) times (p V, f + 1): one product sums over blocks and own unknowns.
-    flat_C = np.swapaxes(C, 0, 1).reshape(len(f), -1)
+    flat_C = np.swapaxes(C, 0, 1).reshape(len(f), C.shape[0] * C.shape[2])
     eliminated = flat_C @ solved.reshape(-1, len(f) + 1)
     S = U + np.diag(ridge) - eliminated[:, :-1]
     step = solve_scaled(S, (g - eliminated[:, -1])[:, None])[:, 0]

@@ -12,11 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.arrowhead import arrowhead_covariance, inverse_scaled
 from neurocal_cli.geometry import Array
 from neurocal_cli.pixel_error import POSE, camera_columns
 
 __all__ = ["Covariance", "covariance"]
+
+_ROUNDING = 1e-30  # an eigenvalue this far below the diagonal is not there
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +58,33 @@ def covariance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residu
     variance = float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
     U = normal[:, f[:, None], f].sum(axis=0)
     if not free_pose:
-        inverse_of_all, smallest = inverse_scaled(U, U)
-        return Covariance(variance * inverse_of_all, np.zeros((V, 6, 6)), smallest)
-    own = np.arange(POSE.start, POSE.stop)
-    inverse = arrowhead_covariance(normal, f, own)
-    return Covariance(variance * inverse.shared, variance * inverse.own, inverse.smallest)
+        inverse, smallest = _inverse(U, U)
+        return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
+    B = normal[:, POSE, POSE]
+    B_inverse, smallest = _inverse(B, B)
+    if not f.size:
+        return Covariance(np.zeros((0, 0)), variance * B_inverse, smallest)
+    C = normal[:, f, POSE]  # (V, f, 6)
+    gain = C @ B_inverse
+    S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
+    S_inverse, smallest_shared = _inverse(S, U)
+    poses = B_inverse + np.swapaxes(gain, 1, 2) @ S_inverse @ gain
+    return Covariance(variance * S_inverse, variance * poses, min(smallest, smallest_shared))
+
+
+def _inverse(H: Array, reference: Array) -> tuple[Array, float]:
+    """Inverse of symmetric matrices, and their smallest eigenvalue relative to `reference`'s diagonal.
+
+    The inverse is nan and the eigenvalue 0 where a matrix is singular.
+    """
+    scale = 1.0 / np.sqrt(np.diagonal(reference, axis1=-2, axis2=-1) + 1e-300)
+    outer = scale[..., :, None] * scale[..., None, :]
+    scaled = H * outer
+    if not np.isfinite(scaled).all():
+        return np.full_like(H, np.nan), 0.0
+    values, vectors = np.linalg.eigh(scaled)
+    smallest = float(values.min(initial=1.0))
+    if smallest < _ROUNDING:
+        return np.full_like(H, np.nan), 0.0
+    inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return inverse * outer, smallest

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-import sys
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import click
 
 from neurocal_cli.commands.estimation import given_camera
+from neurocal_cli.commands.evaluate_stereo import stereo
 from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
-from neurocal_cli.commands.streams import check_one_stdin, is_terminal, note, warn
+from neurocal_cli.commands.streams import check_one_stdin, note, warn
+from neurocal_cli.commands.tables import show
 from neurocal_cli.errors import FormatError
 
 if TYPE_CHECKING:
@@ -29,7 +29,11 @@ def evaluate() -> None:
     Examples:
       neurocal evaluate camera camera.yaml
       neurocal evaluate camera camera.yaml other_points.csv --json
+      neurocal evaluate stereo left.yaml right.yaml
     """  # noqa: D301 - as in the group
+
+
+evaluate.add_command(stereo)
 
 
 @evaluate.command(cls=Command)
@@ -117,22 +121,5 @@ def _show(evaluation: CameraEvaluation, as_json: bool) -> None:
 
     if as_json:
         click.echo(json.dumps(evaluation_json(evaluation), indent=2, allow_nan=False))
-    elif is_terminal(sys.stdout):
-        _show_tables(evaluation_tables(evaluation))
     else:
-        click.echo(evaluation_report(evaluation))
-
-
-def _show_tables(tables: Sequence[Sequence[Sequence[str]]]) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console()
-    for rows in tables:
-        table = Table()
-        for k, heading in enumerate(rows[0]):
-            table.add_column(Text(heading), justify="left" if k == 0 else "right")
-        for row in rows[1:]:
-            table.add_row(*(Text(cell) for cell in row))
-        console.print(table)
+        show(evaluation_report(evaluation), evaluation_tables(evaluation))

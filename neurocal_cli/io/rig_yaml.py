@@ -1,0 +1,156 @@
+"""Rig files: two calibrations and how the right camera stands to the left, in one YAML file.
+
+``left`` and ``right`` are each a calibration file's content, whose rectification and projection matrices
+are those of the rectified pair; ``stereo`` is the rest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from neurocal_cli.camera import POSE_NAMES, Pose
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.geometry import euler_to_rotation
+from neurocal_cli.io.calibration_text import calibration_lines
+from neurocal_cli.io.calibration_tree import calibration_from_field
+from neurocal_cli.io.files import write_whole
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
+from neurocal_cli.io.yaml_tree import read_yaml
+from neurocal_cli.stereo.rig import Rig
+
+__all__ = ["format_rig", "read_rig", "rig_from_field", "write_rig"]
+
+FORMAT = 1  # of the stereo block; a change that older readers cannot follow makes it 2
+_GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
+_SAME = 1e-6  # E, F and the baseline follow from R, t and the cameras; more means an edit of one
+
+
+def format_rig(rig: Rig) -> str:
+    """Text of a rig file; the same rig gives the same text."""
+    return "\n".join([*_rig_lines(rig), ""])
+
+
+def write_rig(rig: Rig, path: str | Path) -> None:
+    """Write a rig file, whole or not at all; ``-`` is stdout."""
+    write_whole(path, format_rig(rig))
+
+
+def _rig_lines(rig: Rig) -> Iterator[str]:
+    for name, camera in (("left", rig.left), ("right", rig.right)):
+        yield f"{name}:"
+        for line in calibration_lines(camera):
+            # A table of rows is one long text.
+            yield "\n".join(f"  {part}" for part in line.split("\n"))
+    yield "stereo:"
+    yield f"  format: {FORMAT}"
+    yield f"  unit: {text(rig.unit)}"
+    for key, matrix in (("R", rig.R), ("t", rig.t), ("E", rig.E), ("F", rig.F)):
+        yield f"  {key}: {flow(matrix)}"
+    yield f"  baseline: {number(rig.baseline)}"
+    yield f"  baseline_std: {number(rig.std['baseline'])}"
+    values = dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
+    for group, members in _GROUPS:
+        entries = {n: mapping(value=number(values[n]), std=number(rig.std[n])) for n in members}
+        yield f"  {group}: {mapping(**entries)}"
+    names = f"[{', '.join(POSE_NAMES)}]"
+    yield f"  covariance: {mapping(names=names, data=flow(rig.covariance))}"
+    yield f"  rmse_px: {number(rig.rmse_px)}"
+    yield f"  max_px: {number(rig.max_px)}"
+    yield f"  converged: {str(bool(rig.converged)).lower()}"
+    yield f"  stop_reason: {text(str.__str__(rig.stop_reason))}"
+    yield f"  iterations: {rig.iterations}"
+    yield "  pairs:"
+    for left, right in rig.pairs:
+        yield f"    - [{quoted(left)}, {quoted(right)}]"
+    yield "  left_out:" if rig.left_out else "  left_out: []"
+    for (left, right), reason in rig.left_out.items():
+        yield f"    - [{quoted(left)}, {quoted(right)}, {quoted(reason)}]"
+    yield "  warnings:" if rig.warnings else "  warnings: []"
+    for warning in rig.warnings:
+        yield f"    - {quoted(warning)}"
+
+
+def read_rig(path: str | Path) -> Rig:
+    """Read a rig file that neurocal wrote; ``-`` is stdin.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read, is no YAML, or a key is missing or wrong.
+    """
+    tree, source = read_yaml(path)
+    return rig_from_field(Field(tree, source))
+
+
+def rig_from_field(root: Field) -> Rig:
+    """Read a rig; see `read_rig`."""
+    if not isinstance(root.value, dict) or "stereo" not in root:
+        if "neurocal" in root:
+            raise FormatError(
+                "is the calibration of one camera; give a rig, or the calibrations of both cameras",
+                root.source,
+            )
+        raise FormatError("is not a rig; give a file that neurocal stereo wrote", root.source)
+    block = root["stereo"]
+    if block["format"].integer() != FORMAT:
+        raise FormatError(
+            f"stereo.format is {block['format'].integer()}, not {FORMAT}; update neurocal", root.source
+        )
+    left, right = calibration_from_field(root["left"]), calibration_from_field(root["right"])
+    if left.unit != right.unit:
+        raise FormatError("left and right have different units; correct one", root.source)
+    try:
+        pose = Pose(block["R"].array(3, 3), block["t"].array(3))
+    except InputError as error:
+        raise FormatError(f"stereo: {error}; correct it", root.source) from error
+    rig = Rig(
+        left,
+        right,
+        pose,
+        _std(block),
+        block["covariance"]["data"].array(6, 6, unknown=True),
+        tuple(_names(entry, 2) for entry in block["pairs"].items()),  # type: ignore[misc]
+        {_names(entry, 3)[:2]: _names(entry, 3)[2] for entry in block["left_out"].items()},  # type: ignore[misc]
+        rmse_px=block["rmse_px"].number_or_nan(),
+        max_px=block["max_px"].number_or_nan(),
+        converged=block["converged"].boolean(),
+        stop_reason=block["stop_reason"].text(),
+        iterations=block["iterations"].integer(),
+        warnings=tuple(entry.text() for entry in block["warnings"].items()),
+    )
+    _check_consistent(rig, block)
+    return rig
+
+
+def _std(block: Field) -> dict[str, float]:
+    std = {name: block[group][name]["std"].number_or_nan() for group, names in _GROUPS for name in names}
+    return std | {"baseline": block["baseline_std"].number_or_nan()}
+
+
+def _names(entry: Field, count: int) -> tuple[str, ...]:
+    names = tuple(name.text() for name in entry.items())
+    if len(names) != count:
+        entry.fail(f"a list of {count} texts")
+    return names
+
+
+def _check_consistent(rig: Rig, block: Field) -> None:
+    """Refuse a file in which one of several statements of the same was edited."""
+    values = [block[g][n]["value"].number() for g, names in _GROUPS for n in names]
+    stated = (
+        ("E", block["E"].array(3, 3), rig.E),
+        ("F", block["F"].array(3, 3), rig.F),
+        ("baseline", np.array([block["baseline"].number()]), np.array([rig.baseline])),
+        ("rotation", euler_to_rotation(*values[:3]), rig.R),
+        ("translation", np.array(values[3:]), rig.t),
+    )
+    for name, found, expected in stated:
+        if np.abs(found - expected).max() > _SAME * np.abs(expected).max():
+            raise FormatError(
+                f"stereo.{name} and stereo.R, stereo.t or the cameras disagree; correct the one edited",
+                block.source,
+            )

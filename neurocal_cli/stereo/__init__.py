@@ -1,0 +1,1 @@
+"""Two cameras: which of their views and points belong together, their rig, points through both."""

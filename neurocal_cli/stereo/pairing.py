@@ -1,0 +1,228 @@
+"""Which views of two cameras were taken together, and which points they share.
+
+Views pair by name. Equal names are a pair. Only where the cameras have no name in common do names pair
+that are equal without the word for the side: ``left``, ``l`` or ``cam0`` in the left camera's names,
+``right``, ``r`` or ``cam1`` in the right one's, in letters of any case, between anything but letters
+(``left01`` and ``right01``, ``IMG_L_07`` and ``IMG_R_07``, ``cam0-3`` and ``cam1-3``). Nothing ever pairs
+by its order.
+
+Within a pair of views, points pair by their ids or, where one of the files has none, by X, Y, Z.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+
+__all__ = ["Pairs", "ViewPairs", "pair_points", "pair_views"]
+
+_SIDES = (
+    re.compile(r"(?<![a-z])(?:left|l(?![a-z])|cam(?:era)?[ _-]?0(?![0-9]))(?![a-z])", re.IGNORECASE),
+    re.compile(r"(?<![a-z])(?:right|r(?![a-z])|cam(?:era)?[ _-]?1(?![0-9]))(?![a-z])", re.IGNORECASE),
+)
+_SHOWN = 5  # names in a message
+_SAME_PLACE = 1e-6  # of the target's size: how far apart one point's X, Y, Z may be in two files
+
+
+@dataclass(frozen=True)
+class ViewPairs:
+    """Names of the views.
+
+    Attributes
+    ----------
+    both : tuple of (left name, right name)
+        In the left camera's order.
+    left_only, right_only : tuple of str
+    """
+
+    both: tuple[tuple[str, str], ...]
+    left_only: tuple[str, ...]
+    right_only: tuple[str, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    """Points that both cameras saw.
+
+    Attributes
+    ----------
+    left, right : (N,) int arrays
+        Rows in each camera's points.
+    view : (N,) int array
+        Pair of views of each, sorted.
+    n_unpaired : int
+        Points in paired views that only one camera has.
+    """
+
+    left: NDArray[np.intp]
+    right: NDArray[np.intp]
+    view: NDArray[np.intp]
+    n_unpaired: int
+
+
+def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
+    """Pair the names of two cameras' views.
+
+    Raises
+    ------
+    InputError
+        No pair, names that would pair with several, or names that say the cameras are swapped.
+    """
+    if not set(left).isdisjoint(right):
+        keys = dict(zip(left, left, strict=True)), dict(zip(right, right, strict=True))
+    else:
+        _refuse_swapped(left, right)
+        keys = _keys(left, _SIDES[0]), _keys(right, _SIDES[1])
+    both = tuple((name, keys[1][key]) for key, name in keys[0].items() if key in keys[1])
+    if not both:
+        raise InputError(
+            f"no view of the left camera has its pair in the right one: left has {_listed(left)}, right has "
+            f"{_listed(right)}; give views taken together the same name, or names such as left01 and right01"
+        )
+    paired = set(sum(both, ()))
+    return ViewPairs(
+        both,
+        tuple(name for name in left if name not in paired),
+        tuple(name for name in right if name not in paired),
+    )
+
+
+def _keys(names: Sequence[str], side: re.Pattern[str]) -> dict[str, str]:
+    """Names by what is left of them without the side; names that do not say it are left out."""
+    keys: dict[str, str] = {}
+    for name in names:
+        key, found = side.subn("", name)
+        key = re.sub(r"[\W_]+", "_", key).strip("_")
+        if not found:
+            continue
+        if key in keys:
+            raise InputError(
+                f"the views {keys[key]!r} and {name!r} are both {key!r} without the camera's side; give "
+                "views taken together by the two cameras the same name"
+            )
+        keys[key] = name
+    return keys
+
+
+def _refuse_swapped(left: Sequence[str], right: Sequence[str]) -> None:
+    crossed = [name for name in left if _SIDES[1].search(name) and not _SIDES[0].search(name)]
+    other = [name for name in right if _SIDES[0].search(name) and not _SIDES[1].search(name)]
+    if len(crossed) == len(left) and len(other) == len(right):
+        raise InputError(
+            f"the cameras are swapped: the left one's views are {_listed(crossed)}, the right one's "
+            f"{_listed(other)}; give the left camera first"
+        )
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(repr(name[:60]) for name in names[:_SHOWN])
+    return shown + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+
+
+def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs) -> Pairs:
+    """Pair the points of paired views.
+
+    Raises
+    ------
+    InputError
+        Different units, no common point, ids that name different places, or several points at one place.
+    """
+    if left.unit != right.unit:
+        raise InputError(
+            f"{left.source} is in {left.unit}, {right.source} in {right.unit}; give both in the same unit"
+        )
+    sides = [_in_pairs(left, [a for a, _ in views.both]), _in_pairs(right, [b for _, b in views.both])]
+    rows, order = [side[0] for side in sides], [side[1] for side in sides]
+    by_id = left.point is not None and right.point is not None
+    if by_id:
+        codes = _codes(
+            np.asarray(left.point)[rows[0]].astype(str), np.asarray(right.point)[rows[1]].astype(str)
+        )
+    else:
+        codes = _place_codes(left.world[rows[0]], right.world[rows[1]])
+    n_codes = 1 + max(int(code.max(initial=0)) for code in codes)
+    keys = [view * n_codes + code for view, code in zip(order, codes, strict=True)]
+    for points, row, key in zip((left, right), rows, keys, strict=True):
+        _refuse_repeated(points, row, key, by_id)
+    common, first, second = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
+    if not common.size:
+        what = "id" if by_id else "X, Y, Z"
+        raise InputError(
+            f"{left.source} and {right.source}: the paired views have no point in common, by {what}; measure "
+            "the same target in both, in the same coordinates"
+        )
+    pairs = Pairs(
+        rows[0][first], rows[1][second], common // n_codes, len(rows[0]) + len(rows[1]) - 2 * len(common)
+    )
+    if by_id:
+        _refuse_moved(left, right, pairs)
+    return pairs
+
+
+def _in_pairs(points: Correspondences, names: list[str]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of paired views and the pair of each."""
+    place = {name: k for k, name in enumerate(names)}
+    pair = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
+    rows = np.flatnonzero(pair >= 0)
+    return rows, pair[rows]
+
+
+def _codes(left: NDArray[np.str_], right: NDArray[np.str_]) -> list[NDArray[np.intp]]:
+    """A whole number for each label, the same for the same label."""
+    _, inverse = np.unique(np.concatenate([left, right]), return_inverse=True)
+    inverse = inverse.reshape(-1)
+    return [inverse[: len(left)], inverse[len(left) :]]
+
+
+def _place_codes(left: Array, right: Array) -> list[NDArray[np.intp]]:
+    """A whole number for each place in the world, the same for places that differ by rounding only."""
+    world = np.concatenate([left, right])
+    size = float(np.ptp(world, axis=0).max(initial=0.0)) or 1.0
+    codes = np.zeros(len(world), dtype=np.intp)
+    for column in world.T:
+        values = np.sort(column)
+        # A new value begins after every gap that is more than rounding.
+        starts = values[np.concatenate([[True], np.diff(values) > _SAME_PLACE * size])]
+        codes = codes * len(starts) + np.searchsorted(starts, column, side="right") - 1
+        codes = np.unique(codes, return_inverse=True)[1].reshape(-1)  # kept small: no product overflows
+    return [codes[: len(left)], codes[len(left) :]]
+
+
+def _refuse_repeated(
+    points: Correspondences, rows: NDArray[np.intp], keys: NDArray[np.intp], by_id: bool
+) -> None:
+    order = np.argsort(keys, kind="stable")
+    repeated = np.flatnonzero(np.diff(keys[order]) == 0)
+    if not repeated.size:
+        return
+    first, second = sorted(int(rows[order[repeated[0] + k]]) for k in (0, 1))
+    what = "has the same id" if by_id else "is at the same X, Y, Z (in the same view)"
+    hint = "" if by_id else ", or give a column point with an id of each point in both files"
+    raise InputError(
+        f"{points.place(second)}: the point {what} as {points.place(first)}; remove one of the rows{hint}"
+    )
+
+
+def _refuse_moved(left: Correspondences, right: Correspondences, pairs: Pairs) -> None:
+    """Refuse ids that stand for another place in the other file."""
+    a, b = left.world[pairs.left], right.world[pairs.right]
+    apart = np.abs(a - b).max(axis=1)
+    size = max(float(np.ptp(a, axis=0).max()), float(np.ptp(b, axis=0).max()))
+    if not apart.max() > _SAME_PLACE * size:
+        return
+    row = int(np.argmax(apart))
+    assert left.point is not None
+    name = str(left.point[pairs.left[row]])
+    places = [f"({', '.join(f'{x:g}' for x in places[row])})" for places in (a, b)]
+    raise InputError(
+        f"{right.place(int(pairs.right[row]))}: the point {name[:60]!r} is at {places[1]}, but "
+        f"at {places[0]} in {left.source}; use one board and one unit for both cameras"
+    )

@@ -1,0 +1,155 @@
+"""Two calibrations as one problem: common frames for the views of both, normalised, with a start."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera import Pose
+from neurocal_cli.geometry import Array
+from neurocal_cli.lens import coefficient_names
+from neurocal_cli.pixel_error import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.stereo.pairing import ViewPairs
+from neurocal_cli.stereo.pixel_error import Frames, RigState, Sightings
+from neurocal_cli.tiles import tile
+from neurocal_cli.views import Views, arrange
+
+__all__ = ["RigProblem", "free_parameters", "rig_problem"]
+
+# Noise of one camera as a share of the other's, and in normalised pixels, that is taken for real:
+# below, it is rounding in data without noise.
+_LEAST_SHARE = 1e-3
+_LEAST_NOISE = 1e-12
+# Names of what each entry A11, A12, A22, A13, A23 moves.
+_ENTRY_NAMES = ("alpha_u", "theta", "alpha_v", "u0", "v0")
+
+
+@dataclass(frozen=True, eq=False)
+class RigProblem:
+    """What the cameras saw, in common frames, and where each camera alone put the views.
+
+    Attributes
+    ----------
+    names : two tuples of str
+        Each camera's views, in its sightings' order.
+    frames : Frames
+        Those of the left camera's views, in their order, then those of views that only the right one saw.
+    sightings : two of Sightings
+    cameras : two of CameraState
+        As calibrated alone, with the poses of its views.
+    own_cost : two (V_c,) arrays
+        Whitened squared residuals of each view in its camera alone.
+    paired : (P,) int array
+        Frames that both cameras saw.
+    paired_right : (P,) int array
+        Their places among the right camera's views.
+    spread : (P, 5, 3) array
+        Of each paired target, in local coordinates: its centre, and one rms extent to both sides along
+        its longest two axes.
+    axes : (P, 3, 3) array
+        The target's principal axes, longest first, as columns.
+    flat : (P,) bool array
+    """
+
+    names: tuple[tuple[str, ...], tuple[str, ...]]
+    frames: Frames
+    sightings: tuple[Sightings, Sightings]
+    cameras: tuple[CameraState, CameraState]
+    own_cost: tuple[Array, Array]
+    paired: NDArray[np.intp]
+    paired_right: NDArray[np.intp]
+    spread: Array
+    axes: Array
+    flat: NDArray[np.bool_]
+
+    def start(self, rig: Pose) -> RigState:
+        """The cameras as calibrated, with the left one's poses, and the right one's where it is alone."""
+        left, right = self.cameras
+        R = np.concatenate([left.R, np.zeros((len(self.frames.scale) - len(left.R), 3, 3))])
+        t = np.concatenate([left.t, np.zeros((len(R) - len(left.t), 3))])
+        alone = np.flatnonzero(~self.frames.through_rig[self.sightings[1].view])
+        frame = self.sightings[1].view[alone]
+        R[frame], t[frame] = right.R[alone], right.t[alone]
+        return RigState(self.cameras, rig.R.copy(), rig.t / self.frames.unit, R, t)
+
+
+def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
+    """(5 + K,) which of A's entries and the lens's coefficients were estimated."""
+    names = (*_ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
+    return np.array([name not in calibration.fixed for name in names])
+
+
+def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigProblem:
+    """Bring two calibrations of one world unit together."""
+    arranged = arrange(left.points), arrange(right.points)
+    names = arranged[0].names, arranged[1].names
+    place = {b: names[0].index(a) for a, b in views.both}
+    n_left = len(names[0])
+    frame = np.array([place.get(name, -1) for name in names[1]])
+    alone = np.flatnonzero(frame < 0)
+    frame[alone] = n_left + np.arange(len(alone))
+    through = np.zeros(n_left + len(alone), dtype=bool)
+    through[frame[frame < n_left]] = True
+    frames = Frames(
+        np.concatenate([arranged[0].centre, arranged[1].centre[alone]]),
+        scale := np.concatenate([arranged[0].scale, arranged[1].scale[alone]]),
+        through,
+        float(np.median(scale)),
+    )
+    sides = [
+        _side(calibration, view, frames, frame_of)
+        for calibration, view, frame_of in zip(
+            (left, right), arranged, (np.arange(n_left), frame), strict=True
+        )
+    ]
+    noise = [max(side[3], _LEAST_NOISE) for side in sides]
+    real = [seen.pixel_scale * s for (seen, *_), s in zip(sides, noise, strict=True)]
+    sightings, costs = [], []
+    for (seen, _, cost, _), s, own in zip(sides, noise, real, strict=True):
+        weight = 1.0 / (s * max(1.0, _LEAST_SHARE * max(real) / own)) ** 2
+        sightings.append(
+            Sightings(seen.tiles, seen.view, seen.pixel_centre, seen.pixel_scale, weight, seen.n_points)
+        )
+        costs.append(weight * cost)
+    paired_right = np.flatnonzero(through[frame] & (frame < n_left))
+    paired = frame[paired_right]
+    return RigProblem(
+        names, frames, (sightings[0], sightings[1]), (sides[0][1], sides[1][1]), (costs[0], costs[1]),
+        paired, paired_right, _spread(arranged[0], paired), arranged[0].basis[paired],
+        arranged[0].nearly_flat[paired],
+    )  # fmt: skip
+
+
+def _side(
+    calibration: Calibration, views: Views, frames: Frames, frame: NDArray[np.intp]
+) -> tuple[Sightings, CameraState, Array, float]:
+    """One camera's sightings (without weight), its own state, squares by view and noise, normalised."""
+    centre, scale = frames.centre[frame], frames.scale[frame]
+    local = views.local * np.repeat(views.scale / scale, views.counts)[:, None]
+    local += np.repeat((views.centre - centre) / scale[:, None], views.counts, axis=0)
+    tiles = tile(local, views.pixels, views.whitening, views.index, views.n_views)
+    entries = calibration.K[ENTRIES]
+    entries[3:] -= views.pixel_centre
+    poses = [calibration.views[name].pose for name in views.names]
+    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+    state = CameraState(
+        entries[None] / views.pixel_scale,
+        R,
+        ((R @ centre[..., None])[..., 0] + t) / scale[:, None],
+        calibration.distortion_model,
+        np.array(calibration.distortion, dtype=float),
+    )
+    cost = normal_blocks(tiles, state)[0][:, -1, -1]
+    spare = 2 * len(views.index) - int(free_parameters(calibration).sum()) - 6 * views.n_views
+    noise = float(np.sqrt(cost.sum() / max(spare, 1)))
+    seen = Sightings(tiles, frame, views.pixel_centre, views.pixel_scale, 1.0, len(views.index))
+    return seen, state, cost, noise
+
+
+def _spread(views: Views, which: NDArray[np.intp]) -> Array:
+    along = views.basis[which] * views.extent[which][:, None, :]  # (P, 3, axis)
+    first, second = along[:, :, 0], along[:, :, 1]
+    return np.stack([np.zeros_like(first), first, -first, second, -second], axis=1)

@@ -1,0 +1,99 @@
+"""A stereo rig: two cameras and how the right one stands to the left, ``X_right = R X_left + t``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.geometry import Array, cross_matrix
+
+__all__ = ["Rig", "essential_matrix", "fundamental_matrix"]
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Two calibrated cameras on one rig.
+
+    Attributes
+    ----------
+    left, right : Calibration
+        The pose of every view that both cameras saw is one pose: the right camera's is the left one's
+        led through the rig.
+    pose : Pose
+        R and t, ``X_right = R X_left + t``.
+    std : dict
+        Standard deviation of R_x, R_y, R_z [rad], t_x, t_y, t_z and baseline [world unit].
+    covariance : (6, 6) array
+        Of R_x, R_y, R_z, t_x, t_y, t_z.
+    pairs : tuple of (left name, right name)
+        The views that made the rig.
+    left_out : dict of str by (left name, right name)
+        Views of both cameras that contradict the rig, with the reason; each still helps its camera.
+    rmse_px : float [px]
+        ``sqrt(mean(du^2 + dv^2))`` over all points of both cameras.
+    max_px : float [px]
+    converged : bool
+    stop_reason : str
+    iterations : int
+        Steps of the last, common refinement.
+    warnings : tuple of str
+    """
+
+    left: Calibration
+    right: Calibration
+    pose: Pose
+    std: Mapping[str, float]
+    covariance: Array
+    pairs: tuple[tuple[str, str], ...]
+    left_out: Mapping[tuple[str, str], str] = field(default_factory=dict)
+    rmse_px: float = float("nan")
+    max_px: float = float("nan")
+    converged: bool = True
+    stop_reason: str = ""
+    iterations: int = 0
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def R(self) -> Array:
+        """(3, 3) rotation from the left camera's frame to the right one's."""
+        return self.pose.R
+
+    @property
+    def t(self) -> Array:
+        """(3,) where the left camera stands in the right one's frame [world unit]."""
+        return self.pose.t
+
+    @property
+    def baseline(self) -> float:
+        """Distance of the cameras [world unit]."""
+        return float(np.linalg.norm(self.pose.t))
+
+    @property
+    def E(self) -> Array:
+        """(3, 3) essential matrix [t]x R: x_right^T E x_left = 0."""
+        return essential_matrix(self.pose)
+
+    @property
+    def F(self) -> Array:
+        """(3, 3) fundamental matrix of pixels without the lenses, of unit norm."""
+        return fundamental_matrix(self.left.intrinsics, self.right.intrinsics, self.pose)
+
+    @property
+    def unit(self) -> str:
+        """Unit of the world coordinates."""
+        return self.left.unit
+
+
+def essential_matrix(pose: Pose) -> Array:
+    """Essential matrix ``[t]x R`` of ``X_right = R X_left + t``: x_right^T E x_left = 0."""
+    return np.asarray(cross_matrix(pose.t) @ pose.R)
+
+
+def fundamental_matrix(left: Intrinsics, right: Intrinsics, pose: Pose) -> Array:
+    """Fundamental matrix ``A_right^-T E A_left^-1`` of unit Frobenius norm: m_right^T F m_left = 0."""
+    F = np.linalg.solve(right.A.T, essential_matrix(pose)) @ np.linalg.inv(left.A)
+    return np.asarray(F / np.linalg.norm(F))
