@@ -19,8 +19,13 @@ if TYPE_CHECKING:
     from neurocal_cli.io.calibration_yaml import read_calibration, write_calibration
     from neurocal_cli.io.images import read_image
     from neurocal_cli.io.points_csv import read_points, write_points
+    from neurocal_cli.io.rig_yaml import read_rig, write_rig
     from neurocal_cli.methods import calibrate
     from neurocal_cli.points import Correspondences
+    from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
+    from neurocal_cli.stereo.fitting import fit_rig
+    from neurocal_cli.stereo.rig import Rig
+    from neurocal_cli.stereo.triangulation import triangulate
 
 __version__ = "0.1.0"
 
@@ -31,15 +36,22 @@ _HOMES = {
     "Intrinsics": "camera",
     "NeurocalError": "errors",
     "Pose": "camera",
+    "Rig": "stereo.rig",
     "calibrate": "methods",
     "detect_points": "detection.detect",
     "evaluate_camera": "evaluation",
+    "evaluate_rig": "stereo.evaluation",
+    "evaluate_stereo": "stereo.evaluation",
+    "fit_rig": "stereo.fitting",
     "read_board": "io.board_yaml",
     "read_calibration": "io.calibration_yaml",
     "read_image": "io.images",
     "read_points": "io.points_csv",
+    "read_rig": "io.rig_yaml",
+    "triangulate": "stereo.triangulation",
     "write_calibration": "io.calibration_yaml",
     "write_points": "io.points_csv",
+    "write_rig": "io.rig_yaml",
 }
 
 __all__ = [
@@ -49,15 +61,22 @@ __all__ = [
     "Intrinsics",
     "NeurocalError",
     "Pose",
+    "Rig",
     "calibrate",
     "detect_points",
     "evaluate_camera",
+    "evaluate_rig",
+    "evaluate_stereo",
+    "fit_rig",
     "read_board",
     "read_calibration",
     "read_image",
     "read_points",
+    "read_rig",
+    "triangulate",
     "write_calibration",
     "write_points",
+    "write_rig",
 ]
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from neurocal_cli.errors import FormatError, NeurocalError
-from neurocal_cli.io.files import decode, read_bytes, write_whole
+from neurocal_cli.io.files import decode, read_blocks, read_bytes, write_chunks, write_whole
 
 AS_ROOT = hasattr(os, "geteuid") and os.geteuid() == 0
 
@@ -195,3 +195,31 @@ def test_a_named_pipe_is_written_directly(tmp_path):
 def test_a_full_device_is_an_error_in_one_line():
     with pytest.raises(NeurocalError, match="no space left"):
         write_whole("/dev/full", "x")
+
+
+def test_blocks_end_at_line_ends_and_add_up(tmp_path):
+    data = b"".join(b"%d" % k * (k % 7) + b"\n" for k in range(100)) + b"no end"
+    (tmp_path / "f").write_bytes(data)
+    blocks = list(read_blocks(tmp_path / "f", 20))
+    assert b"".join(blocks) == data
+    assert len(blocks) > 5
+    assert all(block.endswith(b"\n") for block in blocks[:-1])
+    (tmp_path / "f").write_bytes(b"")
+    assert list(read_blocks(tmp_path / "f", 20)) == []
+    with pytest.raises(FormatError, match="there is no such file"):
+        next(read_blocks(tmp_path / "absent", 20))
+
+
+def test_a_fault_among_the_chunks_leaves_the_former_file(tmp_path):
+    (tmp_path / "f").write_text("old")
+
+    def chunks():
+        yield "new"
+        raise FormatError("is wrong", "input", 7)
+
+    with pytest.raises(FormatError, match="input:7: is wrong"):
+        write_chunks(tmp_path / "f", chunks())
+    assert (tmp_path / "f").read_text() == "old"
+    assert [path.name for path in tmp_path.iterdir()] == ["f"]
+    write_chunks(tmp_path / "f", iter(["a", b"b", "c"]))
+    assert (tmp_path / "f").read_text() == "abc"

@@ -35,6 +35,16 @@ _FILES = (
         "A ROS camera_info file with one more block, `neurocal`: all parameters with their standard "
         "deviations, the pose of each view, how the training went, and the points.",
     ),
+    (
+        "RIG.yaml",
+        "Two calibrations, `left` and `right`, and `stereo`: how the right camera stands to the left one, "
+        "X_right = R X_left + t.",
+    ),
+    (
+        "MATCHES.csv",
+        "A line for each point seen by both cameras, with columns uL, vL, uR, vR (pixels of the images as "
+        "taken) and optionally point, an id.",
+    ),
 )
 
 _ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, unexpected errors show where in the program they arose."),)

@@ -10,12 +10,14 @@ import os
 import secrets
 import stat
 import sys
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
 
-__all__ = ["decode", "one_line", "read_bytes", "read_text", "write_whole"]
+__all__ = ["decode", "one_line", "read_blocks", "read_bytes", "read_text", "write_chunks", "write_whole"]
 
 # Opening these anew would truncate what the shell appends to, so they are written as stdout is.
 _STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
@@ -49,9 +51,48 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
     if str(path) == "-":
         return _read_stdin(), "<stdin>"
     source = one_line(path)
+    with _reading_failures(source), open(path, "rb") as file:
+        return file.read(), source
+
+
+def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
+    """Read a file, or stdin for ``-``, in blocks of whole lines of about `size` bytes; see `read_bytes`.
+
+    A file without line ends comes as one block.
+    """
+    if str(path) == "-":
+        with _stdin_failures():
+            yield from _whole_lines(sys.stdin.buffer, size)
+        return
+    with _reading_failures(one_line(path)):
+        file = open(path, "rb")  # noqa: SIM115 - the caller's own errors are not the file's
+    with file:
+        blocks = _whole_lines(file, size)
+        while True:
+            with _reading_failures(one_line(path)):
+                block = next(blocks, None)
+            if block is None:
+                return
+            yield block
+
+
+def _whole_lines(file: IO[bytes], size: int) -> Iterator[bytes]:
+    rest: list[bytes] = []
+    while block := file.read(size):
+        end = block.rfind(b"\n") + 1
+        if end:
+            yield b"".join([*rest, block[:end]])
+            rest = []
+        rest.append(block[end:])
+    if any(rest):
+        yield b"".join(rest)
+
+
+@contextmanager
+def _reading_failures(source: str) -> Iterator[None]:
+    """Turn what can go wrong with a file into a line."""
     try:
-        with open(path, "rb") as file:
-            return file.read(), source
+        yield
     except FileNotFoundError as error:
         raise FormatError("there is no such file; check the path", source) from error
     except IsADirectoryError as error:
@@ -121,29 +162,46 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
         The file cannot be written. A reader that closed its pipe stays a BrokenPipeError, which
         command lines end quietly on.
     """
-    data = _encode(content)
+    write_chunks(path, [_encode(content)])
+
+
+def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
+    """Write a file from its parts as they come, or, where one of them fails, nothing; see `write_whole`.
+
+    What has gone to stdout or a pipe by then stays there.
+    """
     if str(path) in _STDOUT_NAMES:
-        _write_stdout(data)
+        for chunk in chunks:
+            _write_stdout(_encode(chunk))
         return
     shown = one_line(path)
     try:
         former = _status(path)
         if former is not None and not stat.S_ISREG(former.st_mode):
             with open(path, "wb") as file:
-                file.write(data)
+                for chunk in chunks:
+                    file.write(_encode(chunk))
             return
         if former is not None and not os.access(path, os.W_OK):
             raise PermissionError("write-protected")
-        _replace(os.path.realpath(path), data, former)
-    except BrokenPipeError:
+        _replace(os.path.realpath(path), chunks, former)
+    except (BrokenPipeError, NeurocalError):
         raise
     except (OSError, ValueError) as error:
         raise NeurocalError(f"{shown}: {_write_failure(path, error)}") from error
 
 
 def _read_stdin() -> bytes:
-    try:
+    with _stdin_failures():
         return sys.stdin.buffer.read()
+
+
+@contextmanager
+def _stdin_failures() -> Iterator[None]:
+    try:
+        yield
+    except NeurocalError:  # the caller's own
+        raise
     except (AttributeError, ValueError, OSError) as error:  # absent or closed
         raise FormatError("stdin cannot be read; give a file", "<stdin>") from error
 
@@ -180,13 +238,14 @@ def _status(path: str | Path) -> os.stat_result | None:
         return None
 
 
-def _replace(target: str, data: bytes, former: os.stat_result | None) -> None:
+def _replace(target: str, chunks: Iterable[str | bytes], former: os.stat_result | None) -> None:
     temporary = os.path.join(os.path.dirname(target), f".neurocal-{secrets.token_hex(8)}.tmp")
     try:
         # os.open applies the umask to 0o666, as for any new file.
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)
         with os.fdopen(os.open(temporary, flags, 0o666), "wb") as file:
-            file.write(data)
+            for chunk in chunks:
+                file.write(_encode(chunk))
             file.flush()
             os.fsync(file.fileno())
         if former is not None:

@@ -19,9 +19,9 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import decode, read_bytes
 from neurocal_cli.io.table_careful import read_carefully
 from neurocal_cli.io.table_fast import read_fast
-from neurocal_cli.io.table_layout import Metadata, Schema, find_layout
+from neurocal_cli.io.table_layout import Layout, Metadata, Schema, find_layout
 
-__all__ = ["Schema", "Table", "read_table"]
+__all__ = ["Schema", "Table", "parse_rows", "plain_lines", "read_table"]
 
 Labels = NDArray[Any]
 
@@ -85,15 +85,31 @@ def read_table(path: str | Path, schema: Schema) -> Table:
 
 def parse_table(data: bytes, source: str, schema: Schema) -> Table:
     """Read a table from bytes; see `read_table`."""
+    data = plain_lines(data, source, schema)
+    layout = find_layout(data, source, schema)
+    table = parse_rows(data, source, schema, layout)
+    if not len(table):
+        raise FormatError(f"there are no {schema.kind} below the header; add rows", source, layout.line)
+    return table
+
+
+def plain_lines(data: bytes, source: str, schema: Schema) -> bytes:
+    r"""UTF-8 without a mark and with ``\n`` line ends.
+
+    Raises
+    ------
+    FormatError
+        Bytes that are not UTF-8.
+    """
     if not data.isascii() or b"\0" in data:
         decode(data, source, f"a CSV file of {schema.kind}")  # refuses what is not UTF-8
     data = data.removeprefix(b"\xef\xbb\xbf")
-    if b"\r" in data:
-        data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    layout = find_layout(data, source, schema)
+    return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
+
+
+def parse_rows(data: bytes, source: str, schema: Schema, layout: Layout) -> Table:
+    """Read the rows below a header, if there are any."""
     columns = read_fast(data, layout, schema) or read_carefully(data, layout, schema, source)
-    if not len(columns.lines):
-        raise FormatError(f"there are no {schema.kind} below the header; add rows", source, layout.line)
     return Table(
         source, columns.numbers, columns.labels, columns.lines, columns.metadata, layout.unknown(schema)
     )

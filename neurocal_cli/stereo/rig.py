@@ -83,6 +83,11 @@ class Rig:
         return fundamental_matrix(self.left.intrinsics, self.right.intrinsics, self.pose)
 
     @property
+    def sigma(self) -> float:
+        """Standard deviation of the pixels that the rig was found from, in u and in v [px]."""
+        return self.rmse_px / float(np.sqrt(2.0))
+
+    @property
     def unit(self) -> str:
         """Unit of the world coordinates."""
         return self.left.unit

@@ -1,0 +1,152 @@
+"""``neurocal triangulate``: pixels of both cameras in, points in space out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
+from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from neurocal_cli.io.matches_csv import Matches
+    from neurocal_cli.stereo.rig import Rig
+    from neurocal_cli.stereo.triangulation import Triangulated
+
+__all__ = ["triangulate"]
+
+_MANY_OFF = 0.5  # share of the points that no bad luck explains
+
+
+@click.command(cls=Command)
+@click.argument(
+    "inputs",
+    metavar="RIG.yaml MATCHES.csv",
+    nargs=-1,
+    required=True,
+    type=INPUT,
+    cls=Argument,
+    description="A rig, or LEFT.yaml RIGHT.yaml, two calibrations that share a view; then the pixels, "
+    "columns uL,vL,uR,vR and optionally point. - is standard input.",
+)
+@click.option(
+    "--sigma",
+    type=FiniteNumber(positive=True),
+    metavar="PX",
+    show_default="what the calibration's own points had",
+    help="Standard deviation of the pixels, in u and in v.",
+)
+@click.option(
+    "--epipolar-limit",
+    type=FiniteNumber(positive=True),
+    metavar="PX",
+    show_default="5 sigma",
+    help="Flag points whose pixels must move by more than this for their rays to meet.",
+)
+@output_option("XYZ.csv", "the points")
+def triangulate(
+    inputs: tuple[str, ...], sigma: float | None, epipolar_limit: float | None, output: str
+) -> None:
+    """Find points in space from their pixels in the left and the right image.
+
+    The pixels are those of the images as taken: distorted, not rectified. Each point is the one whose two
+    images are nearest to its pixels, by least squares. X, Y, Z are in the left camera's frame (X right, Y
+    down, Z forward) and in the calibration's unit; sXX to sZZ is their covariance for pixels of standard
+    deviation --sigma, the cameras taken for exact; epipolar is by how much both pixels together must move
+    for their rays to meet. No row is dropped; the column flag says
+
+    \b
+      ok      nothing is wrong
+      off     the pixels are not each other's: far off the epipolar lines
+      behind  not in front of both cameras, or at infinity; nan if nowhere
+
+    Rows are read and written as they come, so there may be any number of them.
+
+    \b
+    Examples:
+      neurocal triangulate rig.yaml matches.csv -o xyz.csv
+      neurocal triangulate left.yaml right.yaml matches.csv --sigma 0.3
+      cat matches.csv | neurocal triangulate rig.yaml - > xyz.csv
+    """  # noqa: D301 - as in the group
+    if len(inputs) not in (2, 3):
+        raise UsageError("triangulate takes RIG.yaml MATCHES.csv or LEFT.yaml RIGHT.yaml MATCHES.csv")
+    check_one_stdin(*inputs)
+    rig = _rig(inputs[:-1])
+    from neurocal_cli.io.files import write_chunks
+    from neurocal_cli.io.matches_csv import read_matches
+    from neurocal_cli.io.points_in_space_csv import format_space_points
+    from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
+
+    sigma = rig.sigma if sigma is None else sigma
+    limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
+    notes: list[str] = []
+    tally = _Tally(rig, limit)
+    # The first rows come before the file is touched, and with them all that may be wrong with the header.
+    matches = read_matches(inputs[-1], notes)
+    matches = chain([next(matches)], matches)
+    note(notes)
+    write_chunks(
+        output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
+    )
+    tally.tell()
+
+
+def _rig(names: tuple[str, ...]) -> Rig:
+    if len(names) == 1:
+        from neurocal_cli.io.rig_yaml import read_rig
+
+        return read_rig(names[0])
+    from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.stereo.fitting import fit_rig
+
+    left, right = (read_calibration(name) for name in names)
+    rig = fit_rig(left, right)
+    views = "1 view" if len(rig.pairs) == 1 else f"{len(rig.pairs)} views"
+    note([f"the rig is fitted to {views} that both cameras saw: baseline {rig.baseline:.6g} {rig.unit}"])
+    warn(rig.warnings)
+    return rig
+
+
+class _Tally:
+    """Triangulates batch by batch and counts what is wrong with the points."""
+
+    def __init__(self, rig: Rig, limit: float) -> None:
+        self.rig, self.limit = rig, limit
+        self.points = self.behind = self.off = self.outside = 0
+
+    def triangulated(self, batches: Iterable[Matches]) -> Iterator[tuple[Triangulated, Any]]:
+        from neurocal_cli.stereo.triangulation import triangulate as solve
+
+        rig = self.rig
+        for batch in batches:
+            found = solve(rig.left, rig.right, rig.pose, batch.left, batch.right)
+            self.points += len(batch)
+            self.behind += int(found.behind.sum())
+            self.off += int((found.off(self.limit) & ~found.behind).sum())
+            for camera, pixels in ((rig.left, batch.left), (rig.right, batch.right)):
+                if camera.image_size is not None:
+                    inside = (pixels > -1).all(axis=1) & (pixels < camera.image_size).all(axis=1)
+                    self.outside += len(pixels) - int(inside.sum())
+            yield found, batch.point
+
+    def tell(self) -> None:
+        """Say what came out, on stderr."""
+        parts = [f"{self.points} point{'s' * (self.points != 1)}"]
+        if self.off:
+            parts.append(f"{self.off} off their epipolar lines by more than {self.limit:.3g} px")
+        if self.behind:
+            parts.append(f"{self.behind} behind a camera or nowhere")
+        say(", ".join(parts))
+        if self.outside:
+            warn([f"{self.outside} pixels lie outside their images; check that the cameras belong to them"])
+        if self.off + self.behind > _MANY_OFF * self.points:
+            warn(
+                [
+                    "most points are off or behind; check that uL,vL are the left camera's pixels, and that "
+                    "they are those of the images as taken, neither undistorted nor rectified"
+                ]
+            )
