@@ -3,11 +3,11 @@
 A camera's point (x, y) = (Xc_1, Xc_2) / Xc_3 goes to (x', y') and then through A. The models and the
 order of coefficients are OpenCV's:
 
-    k1, k1k2, plumb_bob, rational
+    k1, k1k2, k1k2p1p2, plumb_bob, rational
         x' = x R + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = y R + p1 (r^2 + 2 y^2) + 2 p2 x y,
         R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6);
         coefficients k1, k2, p1, p2, k3, k4, k5, k6, of which the simpler models have the first
-        1, 2, 5 and 8                                             (Brown 1971; Heikkila 2000)
+        1, 2, 4, 5 and 8                                          (Brown 1971; Heikkila 2000)
     fisheye
         (x', y') = (x, y) theta (1 + k1 theta^2 + ... + k4 theta^8) / r,  theta = atan(r)
                                                                   (Kannala and Brandt 2006)
@@ -39,6 +39,7 @@ MODELS = {
     "none": (),
     "k1": ("k1",),
     "k1k2": ("k1", "k2"),
+    "k1k2p1p2": ("k1", "k2", "p1", "p2"),
     "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
     "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     "fisheye": ("k1", "k2", "k3", "k4"),
@@ -177,7 +178,9 @@ def _bend_polynomial(
         mixed = 2 * (p1 * x + p2 * y)
         cross = cross + mixed
         xx, yy = xx + 2 * p1 * y + 6 * p2 * x, yy + 6 * p1 * y + 2 * p2 * x
-        by += [(xy2, r2 + 2 * y * y), (r2 + 2 * x * x, xy2), (x * r6 * inverse, y * r6 * inverse)]
+        by += [(xy2, r2 + 2 * y * y), (r2 + 2 * x * x, xy2)]
+    if count > 4:
+        by.append((x * r6 * inverse, y * r6 * inverse))
     if count > 5:
         by += [(-x * R * p * inverse, -y * R * p * inverse) for p in (r2, r4, r6)]
     return (bent_x, bent_y), (xx, cross, cross, yy), by

@@ -124,7 +124,9 @@ def calibrations(draw):
         tuple(draw(st.lists(UNKNOWN, max_size=3))),
     )
     model, size = draw(
-        st.sampled_from([("none", 0), ("k1", 1), ("k1k2", 2), ("plumb_bob", 5), ("rational", 8)])
+        st.sampled_from(
+            [("none", 0), ("k1", 1), ("k1k2", 2), ("k1k2p1p2", 4), ("plumb_bob", 5), ("rational", 8)]
+        )
     )
     return Calibration(
         intrinsics=Intrinsics(

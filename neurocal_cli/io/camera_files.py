@@ -33,7 +33,7 @@ class CameraFile:
     ----------
     intrinsics : Intrinsics
     distortion_model : str
-        ``none``, ``k1``, ``k1k2``, ``plumb_bob``, ``rational`` or ``fisheye``.
+        ``none``, ``k1``, ``k1k2``, ``k1k2p1p2``, ``plumb_bob``, ``rational`` or ``fisheye``.
     distortion : (n,) array
         Coefficients in OpenCV's order.
     image_size : (width, height), optional [px]
