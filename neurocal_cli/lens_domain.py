@@ -1,0 +1,109 @@
+"""Where a lens model means something: up to the radius at which it folds the image back.
+
+A polynomial goes on beyond the largest angle that its lens sees: with barrel distortion the image turns
+back inwards from some radius on, and a pixel then has a second, false straight point far outside. The
+true one lies within the first fold.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.polynomial import polynomial
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.lens import Lens, bend, coefficient_names, distort
+
+__all__ = ["first_fold", "is_seen", "straightened"]
+
+_FARTHEST = 1e3  # radius of straight points that no image reaches
+_TABLE = 4096
+_NEWTON_STEPS = 30
+_STEP = 1e-15
+_ACCURACY = 1e-11
+_REAL = 1e-6  # imaginary part of a double root, over its real part, that rounding makes
+
+
+def first_fold(lens: Lens) -> float:
+    """Radius of straight normalised points from which on the lens maps inwards; infinity if it never does.
+
+    The first zero of the slope of the radius, or of the rational model's denominator; tangential terms,
+    small within any image, are left out.
+    """
+    if lens.model == "fisheye":
+        slope = np.array([1.0, *(lens.coefficients * [3, 5, 7, 9])])
+        theta = np.sqrt(_first_root(slope))
+        return float(np.tan(theta)) if theta < np.pi / 2 else np.inf
+    k1, k2, _, _, k3, k4, k5, k6 = np.r_[lens.coefficients, np.zeros(8 - len(lens.coefficients))]
+    top, bottom = np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
+    # With s = r^2: d/dr (r top / bottom) is 0 where (top + 2 s top') bottom = 2 s top bottom'.
+    growth = polynomial.polymul(polynomial.polyadd(top, _twice_s_slope(top)), bottom)
+    slope = polynomial.polysub(growth, polynomial.polymul(top, _twice_s_slope(bottom)))
+    return float(np.sqrt(min(_first_root(slope), _first_root(bottom))))
+
+
+def _twice_s_slope(p: Array) -> Array:
+    return 2.0 * np.arange(len(p)) * p
+
+
+def _first_root(coefficients: Array) -> float:
+    """Smallest positive real root of a polynomial, infinity if there is none; lowest order first."""
+    roots = polynomial.polyroots(np.trim_zeros(coefficients, "b"))
+    real = roots.real[(np.abs(roots.imag) <= _REAL * np.abs(roots.real)) & (roots.real > 0)]
+    return float(real.min(initial=np.inf))
+
+
+def is_seen(lens: Lens, x: Array, y: Array) -> NDArray[np.bool_]:
+    """Whether straight normalised points lie where the lens does not fold."""
+    with np.errstate(all="ignore"):
+        _, (xx, xy, yx, yy), _ = bend(lens.model, lens.coefficients, x, y)
+        return np.asarray((np.hypot(x, y) < first_fold(lens)) & (xx * yy - xy * yx > 0))
+
+
+def straightened(lens: Lens, x: Array, y: Array) -> tuple[Array, Array]:
+    """Take a lens off normalised points, within its first fold.
+
+    Newton's method from where the lens without its tangential terms has the point. Unlike `undistort`
+    it never finds a point beyond the fold, nor loses one before it.
+
+    Parameters
+    ----------
+    lens : Lens
+    x, y : arrays of one shape
+
+    Returns
+    -------
+    x, y : arrays of that shape
+        ``nan`` where the lens cannot have seen any.
+    """
+    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
+    if not lens.bends:
+        return x, y
+    sx, sy = _radially(lens, x, y)
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            (bx, by), (xx, xy, yx, yy), _ = bend(lens.model, lens.coefficients, sx, sy)
+            dx, dy, det = x - bx, y - by, xx * yy - xy * yx
+            step = (yy * dx - xy * dy) / det, (xx * dy - yx * dx) / det
+            sx, sy = sx + step[0], sy + step[1]
+            if not np.nanmax(np.hypot(*step) / (1 + np.hypot(sx, sy)), initial=0.0) > _STEP:
+                break
+        bx, by = distort(lens.model, lens.coefficients, sx, sy)
+        good = np.hypot(bx - x, by - y) < _ACCURACY * (1 + np.hypot(x, y))
+    good &= is_seen(lens, sx, sy)
+    return np.where(good, sx, np.nan), np.where(good, sy, np.nan)
+
+
+def _radially(lens: Lens, x: Array, y: Array) -> tuple[Array, Array]:
+    """Straight points without the tangential terms, nearly: by a table of radii."""
+    names = coefficient_names(lens.model)
+    radial = [0.0 if name in ("p1", "p2") else k for name, k in zip(names, lens.coefficients, strict=True)]
+    # Even steps of the angle reach any radius.
+    last = min(np.arctan(first_fold(lens)), np.arctan(_FARTHEST))
+    r = np.tan(np.linspace(0, last, _TABLE, endpoint=False))  # at a pole there is no image
+    with np.errstate(all="ignore"):
+        bent, _ = distort(lens.model, radial, r, np.zeros(_TABLE))
+        seen = np.hypot(x, y)
+        straight = np.interp(seen, bent, r)
+        stretch = np.where(seen > 0, straight / seen, 1.0)
+    return x * stretch, y * stretch
