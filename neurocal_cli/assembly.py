@@ -53,7 +53,9 @@ class _Assembly:
     def calibration(self, method: str, trainer: str, seed: int, name: str) -> Calibration:
         views, known, solution = self.views, self.known, self.solution
         refined = solution.refined
-        cov = covariance(refined.normal, known.free_camera, known.free_poses, 2 * len(views.index))
+        cov = covariance(
+            refined.normal, known.free_camera, known.free_poses, 2 * len(views.index), solution.shared
+        )
         self._check(cov)
         A = known.matrix(refined.state.entries[0], views)
         intrinsics = known.intrinsics or Intrinsics.from_matrix(A)

@@ -12,7 +12,7 @@ from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Calibration", "NetworkRecord", "StopReason", "ViewResult"]
+__all__ = ["Calibration", "NetworkRecord", "StopReason", "StraightLines", "ViewResult"]
 
 
 class StopReason(str, Enum):
@@ -63,6 +63,27 @@ class NetworkRecord:
     rmse_before: float
     rmse_after: float
     curve: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class StraightLines:
+    """What a lens was found from, where it was found from straight lines alone.
+
+    Attributes
+    ----------
+    n_lines, n_points : int
+        Lines, counted in each view that shows them, and points on them.
+    centre : (u, v) [px]
+        Of distortion.
+    rms_before, rms_after : float [px]
+        Distance of the points from straight lines as seen, and seen through the lens.
+    """
+
+    n_lines: int
+    n_points: int
+    centre: tuple[float, float]
+    rms_before: float
+    rms_after: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +148,7 @@ class Calibration:
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     covariance_names: tuple[str, ...] = ()
     network: NetworkRecord | None = None
+    straight_lines: StraightLines | None = None
     camera_name: str = "camera"
     warnings: tuple[str, ...] = ()
 

@@ -98,10 +98,14 @@ class Solution:
     ----------
     refined : Refined
     tally : Tally
+    shared : (n, n) array, optional
+        Covariance of A's free entries and the lens's free coefficients, where it is not that of the
+        normal matrix.
     """
 
     refined: Refined
     tally: Tally
+    shared: Array | None = None
 
 
 @dataclass(frozen=True, eq=False)

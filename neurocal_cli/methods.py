@@ -18,6 +18,8 @@ from neurocal_cli.job import Job, Strategy
 from neurocal_cli.lens import MODELS, Lens, coefficient_names
 from neurocal_cli.neuro import solve
 from neurocal_cli.observability import check_points
+from neurocal_cli.plumb_camera import lens_and_camera
+from neurocal_cli.plumb_line import PlumbLine, fit_plumb_line
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, KnownCamera, known_for
 from neurocal_cli.starts import Agreement
@@ -32,7 +34,7 @@ __all__ = ["DISTORTIONS", "METHODS", "OUTLIERS", "TRAINERS", "calibrate"]
 
 METHODS = ("neuro",)
 TRAINERS = ("lm", "backprop")
-DISTORTIONS = tuple(MODELS)
+DISTORTIONS = (*MODELS, "plumb-line")
 OUTLIERS = ("keep",)
 
 Progress = Callable[[str, float], None]
@@ -73,9 +75,10 @@ def calibrate(
         Type 4.
     method : {"neuro"}
     trainer : {"lm", "backprop"}
-    distortion : {"none", "k1", "k1k2", "plumb_bob", "rational", "fisheye"}
-        The lens model whose coefficients are estimated with everything else. Type 3 takes the lens of
-        the given camera instead.
+    distortion : {"none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"}
+        The lens model whose coefficients are estimated with everything else; or, the paper's way,
+        k1, k2, p1 and p2 from the images of straight lines alone, then the pinhole camera. Type 3 takes
+        the lens of the given camera instead.
     skew : bool
         False: theta is pi/2.
     outliers : {"keep"}
@@ -104,16 +107,24 @@ def calibrate(
     _check_options(method, trainer, distortion, outliers, starts, seed)
     camera, lens = _given_camera(intrinsics)
     known = known_for(points, type, image_center, camera, extrinsics, skew)
+    plumb: PlumbLine | None = None
     known = _with_lens(known, distortion, lens)
     ideal = straighten(points, known)
     report = progress or (lambda stage, share: None)
     try:
+        if distortion == "plumb-line":
+            plumb = fit_plumb_line(points, known.given_centre)
+            ideal = plumb.corrected(points)
         views = arrange(ideal)
         check_points(views, known)
         strategy = _strategy(trainer, starts, backprop, report)
         job = Job(views, known, strategy, np.random.default_rng(seed), report)
-        job, solution = check_lens(job, solve(job), points)
-        return assemble(job, points, solution, trainer=trainer, method=method, seed=seed, name=camera_name)
+        solution = solve(job)
+        if plumb is not None:
+            job, solution = lens_and_camera(job, solution, plumb, points)
+        job, solution = check_lens(job, solution, points)
+        found = assemble(job, points, solution, trainer=trainer, method=method, seed=seed, name=camera_name)
+        return found if plumb is None else replace(found, straight_lines=plumb.record)
     except DegenerateGeometryError as error:
         # Views and normal matrices do not know the file that the user should look at.
         if points.lines is None or str(error).startswith(points.source):
@@ -133,7 +144,8 @@ def _given_camera(given: Intrinsics | KnownCamera | Array | None) -> tuple[Intri
 
 def _with_lens(known: Known, distortion: str, given: Lens) -> Known:
     if known.type != 3:
-        return replace(known, lens=Lens(distortion), free_lens=distortion != "none")
+        model = "none" if distortion == "plumb-line" else distortion  # its lens comes later
+        return replace(known, lens=Lens(model), free_lens=model != "none")
     if distortion not in ("none", given.model):
         raise UsageError(
             f"type 3 takes the lens of the given camera ({given.model}), not distortion {distortion}"

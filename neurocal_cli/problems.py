@@ -83,6 +83,11 @@ class Known:
         return np.concatenate([self.free, np.full(len(self.lens.coefficients), self.free_lens)])
 
     @property
+    def given_centre(self) -> Array | None:
+        """(2,) the image centre [px], where it is given."""
+        return None if self.free[3] else self.entries[3:]
+
+    @property
     def free_poses(self) -> bool:
         """Whether the poses are estimated."""
         return self.poses is None

@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, ViewResult
+from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, ViewResult
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.evaluation import CameraEvaluation
 from neurocal_cli.lens import coefficient_names
@@ -207,7 +207,18 @@ def _training_lines(calibration: Calibration) -> list[str]:
     if calibration.n_rejected:
         fit += f", {_plural(calibration.n_rejected, 'point')} rejected"
     training = [] if calibration.network is None else _network_lines(calibration.network)
+    if calibration.straight_lines is not None:
+        training.insert(0, _lens_line(calibration.straight_lines))
     return [fit, *training, calibration.stop_reason]
+
+
+def _lens_line(found: StraightLines) -> str:
+    u, v = found.centre
+    return (
+        f"lens: {_plural(found.n_points, 'point')} on {_plural(found.n_lines, 'straight line')}, "
+        f"{_pixels(found.rms_before)} px beside them as seen, {_pixels(found.rms_after)} px through the "
+        f"lens; centre of distortion ({u:.1f}, {v:.1f})"
+    )
 
 
 def _network_lines(network: NetworkRecord) -> list[str]:

@@ -39,7 +39,9 @@ class Covariance:
     smallest: float
 
 
-def covariance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: int) -> Covariance:
+def covariance(
+    normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: int, shared: Array | None = None
+) -> Covariance:
     """Invert the normal matrix of a refined calibration.
 
     Parameters
@@ -51,6 +53,8 @@ def covariance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residu
     free_pose : bool
     n_residuals : int
         Twice the number of points.
+    shared : (f, f) array, optional
+        Covariance of what is free of A and the lens, where it comes from elsewhere; the poses' follows.
     """
     f = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     V = len(normal)
@@ -58,6 +62,8 @@ def covariance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residu
     variance = float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
     U = normal[:, f[:, None], f].sum(axis=0)
     if not free_pose:
+        if shared is not None:
+            return Covariance(shared, np.zeros((V, 6, 6)), 1.0)
         inverse, smallest = _inverse(U, U)
         return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
     B = normal[:, POSE, POSE]
@@ -66,6 +72,8 @@ def covariance(normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residu
         return Covariance(np.zeros((0, 0)), variance * B_inverse, smallest)
     C = normal[:, f, POSE]  # (V, f, 6)
     gain = C @ B_inverse
+    if shared is not None:
+        return Covariance(shared, variance * B_inverse + np.swapaxes(gain, 1, 2) @ shared @ gain, smallest)
     S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
     S_inverse, smallest_shared = _inverse(S, U)
     poses = B_inverse + np.swapaxes(gain, 1, 2) @ S_inverse @ gain

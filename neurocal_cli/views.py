@@ -14,7 +14,7 @@ from neurocal_cli.network import Patterns
 from neurocal_cli.points import Correspondences
 from neurocal_cli.tiles import Tiles, tile
 
-__all__ = ["Views", "arrange"]
+__all__ = ["Views", "arrange", "noise_model"]
 
 # A target thinner than this share of its length is a plane up to rounding ...
 _EXACTLY_FLAT = 1e-6
@@ -181,7 +181,7 @@ def arrange(points: Correspondences) -> Views:
     if np.ptp(pixels, axis=0).max() == 0 and len(pixels) > 1:
         raise DegenerateGeometryError(f"{points.source}: all pixels u,v are the same; check the columns")
     basis, extent = _principal_axes(local, counts, first)
-    weights, whitening = _noise_model(covariance)
+    weights, whitening = noise_model(covariance)
     if weights is None:
         weights = np.ones(len(index))
     return Views(
@@ -215,7 +215,7 @@ def _distinct(local: Array, index: NDArray[np.intp], n_views: int) -> NDArray[np
     return np.bincount(view[fresh], minlength=n_views)
 
 
-def _noise_model(covariance: Array | None) -> tuple[Array | None, Array | None]:
+def noise_model(covariance: Array | None) -> tuple[Array | None, Array | None]:
     """Scalar weights (N,) and whitening factors (N, 3), both of mean square 1."""
     if covariance is None:
         return None, None

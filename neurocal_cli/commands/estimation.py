@@ -264,9 +264,12 @@ _OPTIONS = [
     ),
     click.option(
         "--distortion",
-        type=click.Choice(["none", "k1", "k1k2", "plumb_bob", "rational", "fisheye"]),
+        type=click.Choice(
+            ["none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"]
+        ),
         default="none",
-        help="Lens model, estimated with everything else, coefficients as in OpenCV; none is the pinhole.",
+        help="Lens model, estimated with everything else, coefficients as in OpenCV; none is the pinhole; "
+        "plumb-line takes k1, k2, p1 and p2 from the images of straight lines alone.",
     ),
     click.option(
         "--no-skew",

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from neurocal_cli import __version__
-from neurocal_cli.calibration import Calibration, NetworkRecord
+from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
 from neurocal_cli.io.distortion_names import to_ros
@@ -30,6 +30,8 @@ def calibration_lines(cal: Calibration) -> Iterator[str]:
     yield "neurocal:"
     for lines in (_record_lines(cal), _parameter_lines(cal), _view_lines(cal), _network_lines(cal.network)):
         yield from (f"  {line}" for line in lines)
+    if cal.straight_lines is not None:
+        yield f"  straight_lines: {_straight_lines(cal.straight_lines)}"
     yield from _observation_lines(cal.points)
 
 
@@ -135,6 +137,16 @@ def _network_lines(network: NetworkRecord | None) -> Iterator[str]:
     for name in ("loss", "rmse_before", "rmse_after"):
         yield f"  {name}: {number(getattr(network, name))}"
     yield f"  curve: {flow(np.array(network.curve, dtype=float))}"
+
+
+def _straight_lines(found: StraightLines) -> str:
+    return mapping(
+        n_lines=str(found.n_lines),
+        n_points=str(found.n_points),
+        center=flow(np.array(found.centre)),
+        rms_before_px=number(found.rms_before),
+        rms_after_px=number(found.rms_after),
+    )
 
 
 def _matrix_lines(name: str, matrices: Mapping[str, Array]) -> Iterator[str]:

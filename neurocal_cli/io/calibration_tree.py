@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, ViewResult
+from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, ViewResult
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
@@ -76,6 +76,7 @@ def calibration_from_field(root: Field) -> Calibration:
         covariance=covariance,
         covariance_names=names,
         network=_network(block.get("network")),
+        straight_lines=_straight_lines(block.get("straight_lines")),
         camera_name=root["camera_name"].text() if "camera_name" in root else "camera",
         warnings=tuple(entry.text() for entry in block["warnings"].items()) if "warnings" in block else (),
     )
@@ -216,6 +217,19 @@ def _network(field: Field | None) -> NetworkRecord | None:
         rmse_before=field["rmse_before"].number_or_nan(),
         rmse_after=field["rmse_after"].number_or_nan(),
         curve=tuple(field["curve"].array(-1, unknown=True).tolist()),
+    )
+
+
+def _straight_lines(field: Field | None) -> StraightLines | None:
+    if field is None:
+        return None
+    u, v = field["center"].array(2).tolist()
+    return StraightLines(
+        n_lines=field["n_lines"].integer(),
+        n_points=field["n_points"].integer(),
+        centre=(u, v),
+        rms_before=field["rms_before_px"].number_or_nan(),
+        rms_after=field["rms_after_px"].number_or_nan(),
     )
 
 
