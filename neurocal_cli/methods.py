@@ -22,6 +22,7 @@ from neurocal_cli.plumb_camera import lens_and_camera
 from neurocal_cli.plumb_line import PlumbLine, fit_plumb_line
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, KnownCamera, known_for
+from neurocal_cli.reweighting import reweighted
 from neurocal_cli.starts import Agreement
 from neurocal_cli.training import Task, Trained
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
@@ -119,7 +120,7 @@ def calibrate(
         check_points(views, known)
         strategy = _strategy(trainer, starts, backprop, report)
         job = Job(views, known, strategy, np.random.default_rng(seed), report)
-        solution = solve(job)
+        job, solution = reweighted(job, solve(job), points)
         if plumb is not None:
             job, solution = lens_and_camera(job, solution, plumb, points)
         job, solution = check_lens(job, solution, points)

@@ -221,6 +221,7 @@ def test_only_ratios_of_the_noise_matter(points: Correspondences) -> None:
     rng = np.random.default_rng(0)
     s = rng.uniform(0.1, 2.0, (len(points), 2))
     covariance = np.column_stack([s[:, 0] ** 2, 0.3 * s[:, 0] * s[:, 1], s[:, 1] ** 2])
+    points = replace(points, pixels=points.pixels + s * rng.normal(size=s.shape))  # as stated, nearly
     one = calibrate(replace(points, covariance=covariance))
     for factor in (7.0, 1e-6, 1e6):
         assert_same(one, calibrate(replace(points, covariance=factor**2 * covariance)))

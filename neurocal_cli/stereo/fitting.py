@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Pose
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
-from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.assembly import assemble_rig
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views
@@ -26,6 +25,7 @@ __all__ = ["fit_rig", "poses_on_rig"]
 # median of all pairs is the yard-stick where it is larger.
 _MEDIAN_GROWTH = 5.35
 _SUSPECT = 60.0
+_OWN_SHARE = 2.0  # of its error in both cameras alone, and the pair must have grown by more than this
 _TOLD_APART = 3.0  # standard deviations of the baseline
 _SHOWN = 5  # names in a message
 
@@ -88,12 +88,14 @@ def _agreed(
             [free_parameters(c) & refine_cameras for c in (left, right)] + [np.ones(6, dtype=bool)]
         )
         refined = refine_rig(problem.frames, problem.sightings, start, free)
-        growth = _growth(problem, refined)
+        alone = problem.own_cost[0][problem.paired] + problem.own_cost[1][problem.paired_right]
+        growth = refined.normal[problem.paired, -1, -1] - alone
         limit = _SUSPECT * max(1.0, float(np.median(growth)) / _MEDIAN_GROWTH)
-        if not growth.max() > limit or len(growth) < 2 or 2 * len(left_out) >= len(views.both):
+        suspect = (growth > limit) & (growth > _OWN_SHARE * alone)
+        if not suspect.any() or len(growth) < 2 or 2 * len(left_out) >= len(views.both):
             return problem, refined, free, left_out
         # Sound pairs suffer from the worst ones: only what stands out among them leaves at once.
-        for k in np.flatnonzero((growth > limit) & (growth > 0.3 * growth.max())):
+        for k in np.flatnonzero(suspect & (growth > 0.3 * growth.max())):
             left_out[_pair(problem, int(k))] = UNSYNCHRONISED
 
 
@@ -103,12 +105,6 @@ def _pair(problem: RigProblem, k: int) -> tuple[str, str]:
 
 def _without(views: ViewPairs, left_out: dict[tuple[str, str], str]) -> ViewPairs:
     return ViewPairs(tuple(pair for pair in views.both if pair not in left_out), (), ())
-
-
-def _growth(problem: RigProblem, refined: RefinedRig) -> Array:
-    """By how much each pair's whitened squared error is larger on the rig than in each camera alone."""
-    alone = problem.own_cost[0][problem.paired] + problem.own_cost[1][problem.paired_right]
-    return np.asarray(refined.normal[problem.paired, -1, -1] - alone)
 
 
 def _contradiction(left_out: dict[tuple[str, str], str], n_pairs: int, outliers: str) -> str:

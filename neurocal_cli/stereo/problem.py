@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Pose
+from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import coefficient_names
+from neurocal_cli.noise import common_share, measured, with_common_share
 from neurocal_cli.pixel_error import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.pixel_error import Frames, RigState, Sightings
 from neurocal_cli.tiles import tile
@@ -84,7 +87,7 @@ def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
 
 def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigProblem:
     """Bring two calibrations of one world unit together."""
-    arranged = arrange(left.points), arrange(right.points)
+    arranged = arrange(_believed(left)), arrange(_believed(right))
     names = arranged[0].names, arranged[1].names
     place = {b: names[0].index(a) for a, b in views.both}
     n_left = len(names[0])
@@ -121,6 +124,15 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
         paired, paired_right, _spread(arranged[0], paired), arranged[0].basis[paired],
         arranged[0].nearly_flat[paired],
     )  # fmt: skip
+
+
+def _believed(calibration: Calibration) -> Correspondences:
+    """A camera's points, their covariances as far as its residuals bear them out."""
+    points = calibration.points
+    if points.covariance is None or not measured(points.covariance):
+        return points
+    share = common_share(points.covariance, evaluate_camera(calibration).residuals)
+    return replace(points, covariance=with_common_share(points.covariance, share))
 
 
 def _side(
