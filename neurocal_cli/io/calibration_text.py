@@ -14,7 +14,7 @@ from neurocal_cli import __version__
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
-from neurocal_cli.io.distortion_names import to_ros
+from neurocal_cli.io.camera_info import camera_info_lines
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.lens import coefficient_names
 from neurocal_cli.points import Correspondences
@@ -26,31 +26,13 @@ FORMAT = 1  # of the neurocal block; a change that older readers cannot follow m
 
 def calibration_lines(cal: Calibration) -> Iterator[str]:
     """Lines of the file, without line ends."""
-    yield from _ros_lines(cal)
+    yield from camera_info_lines(cal.camera_name, cal.image_size, cal.K, cal.distortion_model, cal.distortion)
     yield "neurocal:"
     for lines in (_record_lines(cal), _parameter_lines(cal), _view_lines(cal), _network_lines(cal.network)):
         yield from (f"  {line}" for line in lines)
     if cal.straight_lines is not None:
         yield f"  straight_lines: {_straight_lines(cal.straight_lines)}"
     yield from _observation_lines(cal.points)
-
-
-def _ros_lines(cal: Calibration) -> Iterator[str]:
-    width, height = cal.image_size or (0, 0)  # ROS's readers want numbers
-    model, coefficients = to_ros(cal.distortion_model, cal.distortion)
-    yield f"camera_name: {text(cal.camera_name)}"
-    yield f"image_width: {width}"
-    yield f"image_height: {height}"
-    yield f"camera_matrix: {_ros_matrix(cal.K)}"
-    yield f"distortion_model: {model}"
-    yield f"distortion_coefficients: {_ros_matrix(coefficients[None])}"
-    yield f"rectification_matrix: {_ros_matrix(np.eye(3))}"
-    yield f"projection_matrix: {_ros_matrix(np.column_stack([cal.K, np.zeros(3)]))}"
-
-
-def _ros_matrix(matrix: Array) -> str:
-    rows, cols = matrix.shape
-    return mapping(rows=str(rows), cols=str(cols), data=flow(matrix.ravel()))
 
 
 def _record_lines(cal: Calibration) -> Iterator[str]:

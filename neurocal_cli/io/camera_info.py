@@ -1,0 +1,50 @@
+"""A camera without poses as a ROS camera_info file, which every calibration file begins with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.distortion_names import to_ros
+from neurocal_cli.io.yaml_text import flow, mapping, text
+
+__all__ = ["camera_info_lines", "format_camera_info"]
+
+
+def camera_info_lines(
+    name: str, size: tuple[int, int] | None, A: Array, model: str, coefficients: Array
+) -> Iterator[str]:
+    """Lines of the file, without line ends.
+
+    Parameters
+    ----------
+    name : str
+        Of the camera.
+    size : (width, height) or None [px]
+    A : (3, 3) array
+    model : str
+        One of `lens.MODELS`.
+    coefficients : (K,) array
+    """
+    width, height = size or (0, 0)  # ROS's readers want numbers
+    model, coefficients = to_ros(model, coefficients)
+    yield f"camera_name: {text(name)}"
+    yield f"image_width: {width}"
+    yield f"image_height: {height}"
+    yield f"camera_matrix: {_matrix(A)}"
+    yield f"distortion_model: {model}"
+    yield f"distortion_coefficients: {_matrix(coefficients[None])}"
+    yield f"rectification_matrix: {_matrix(np.eye(3))}"
+    yield f"projection_matrix: {_matrix(np.column_stack([A, np.zeros(3)]))}"
+
+
+def format_camera_info(name: str, size: tuple[int, int] | None, A: Array) -> str:
+    """Text of the file of a camera without a lens; `read_intrinsics` reads it."""
+    return "\n".join([*camera_info_lines(name, size, A, "none", np.zeros(0)), ""])
+
+
+def _matrix(matrix: Array) -> str:
+    rows, cols = matrix.shape
+    return mapping(rows=str(rows), cols=str(cols), data=flow(matrix.ravel()))
