@@ -22,10 +22,12 @@ if TYPE_CHECKING:
     from neurocal_cli.io.rig_yaml import read_rig, write_rig
     from neurocal_cli.methods import calibrate
     from neurocal_cli.points import Correspondences
+    from neurocal_cli.remapping import undistort_image
     from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
     from neurocal_cli.stereo.fitting import fit_rig
     from neurocal_cli.stereo.rig import Rig
     from neurocal_cli.stereo.triangulation import triangulate
+    from neurocal_cli.undistortion import undistort_points
 
 __version__ = "0.1.0"
 
@@ -49,6 +51,8 @@ _HOMES = {
     "read_points": "io.points_csv",
     "read_rig": "io.rig_yaml",
     "triangulate": "stereo.triangulation",
+    "undistort_image": "remapping",
+    "undistort_points": "undistortion",
     "write_calibration": "io.calibration_yaml",
     "write_points": "io.points_csv",
     "write_rig": "io.rig_yaml",
@@ -74,6 +78,8 @@ __all__ = [
     "read_points",
     "read_rig",
     "triangulate",
+    "undistort_image",
+    "undistort_points",
     "write_calibration",
     "write_points",
     "write_rig",

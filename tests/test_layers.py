@@ -20,7 +20,7 @@ HOMES = {
     "rich": ("commands/",),
     "matplotlib": ("plots.py",),
     "yaml": ("io/",),
-    "cv2": ("detection/", "rendering/", "io/images.py"),
+    "cv2": ("detection/", "rendering/", "io/images.py", "remapping.py"),
     "scipy": (),
 }
 METHODS = {"read_text", "read_bytes", "write_text", "write_bytes", "open"}

@@ -28,6 +28,7 @@ _SUMMARIES = {
     "detect": "Find chessboards in images and measure the mid-points of their squares' edges.",
     "evaluate": "Measure how good a result is.",
     "triangulate": "Find points in space from their pixels in the left and the right image.",
+    "undistort": "Take a lens's distortion off images and points.",
     "man": None,
 }
 

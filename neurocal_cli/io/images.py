@@ -18,7 +18,16 @@ from neurocal_cli.errors import FormatError, InputError, NeurocalError
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.image_headers import Header, read_header
 
-__all__ = ["MOST_PIXELS", "Image", "encode_png", "parse_image", "read_image"]
+__all__ = [
+    "MOST_PIXELS",
+    "Image",
+    "Picture",
+    "encode_image",
+    "encode_png",
+    "parse_image",
+    "read_image",
+    "read_picture",
+]
 
 MOST_PIXELS = 200_000_000  # larger than any camera's; what a file claims beyond is refused
 
@@ -31,6 +40,9 @@ _TURNS = {
     7: "mirrored along its other diagonal",
     8: "turned by 90 degrees counter-clockwise",
 }
+_SIXTEEN_BITS = (".png", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
+_JPEG = (".jpg", ".jpeg", ".jpe")
+_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95]
 _STDERR = 2
 _ONE_AT_A_TIME = threading.Lock()  # the program's stderr is one
 
@@ -64,6 +76,30 @@ class Image:
         return self.grey.shape[1], self.grey.shape[0]
 
 
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A picture with its colours.
+
+    Attributes
+    ----------
+    pixels : (height, width) or (height, width, 3) uint8 or uint16 array [DN]
+        Colours in the order red, green, blue; transparency is left out.
+    source : str
+        Name for messages.
+    notes : tuple of str
+        What was done to the pixels that a user may not expect.
+    """
+
+    pixels: NDArray[np.uint8] | NDArray[np.uint16]
+    source: str = "image"
+    notes: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]."""
+        return self.pixels.shape[1], self.pixels.shape[0]
+
+
 def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
     """Read an image: PNG, JPEG, TIFF, BMP, PGM or PPM, grey or colour, of 8 or 16 bits.
 
@@ -85,8 +121,23 @@ def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
     return parse_image(*read_bytes(path), most_pixels)
 
 
+def read_picture(path: str | Path, most_pixels: int = MOST_PIXELS) -> Picture:
+    """Read an image with its colours; else as `read_image` does."""
+    data, source = read_bytes(path)
+    pixels, notes = _upright(data, source, most_pixels, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    return Picture(pixels if pixels.ndim == 2 else pixels[..., ::-1], source, notes)
+
+
 def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXELS) -> Image:
     """Read an image from the bytes of a file; see `read_image`."""
+    grey, notes = _upright(data, source, most_pixels, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    return Image(grey, source, notes)
+
+
+def _upright(
+    data: bytes, source: str, most_pixels: int, flags: int
+) -> tuple[NDArray[np.uint8] | NDArray[np.uint16], tuple[str, ...]]:
+    """Pixels of a file, its EXIF orientation applied, and what is to be said of that."""
     header = read_header(data, source)
     if header.width * header.height > most_pixels:
         raise FormatError(
@@ -94,14 +145,14 @@ def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXE
             "read; scale it down",
             source,
         )
-    grey = _decoded(data, header, source)
-    notes = []
-    if header.orientation != 1:
-        notes.append(
-            f"{_TURNS[header.orientation]}, as its EXIF orientation says and OpenCV does; pixel coordinates "
-            "are those of the turned image"
-        )
-    return Image(grey, source, tuple(notes))
+    pixels = _decoded(data, header, source, flags)
+    if header.orientation == 1:
+        return pixels, ()
+    note = (
+        f"{_TURNS[header.orientation]}, as its EXIF orientation says and OpenCV does; pixel coordinates "
+        "are those of the turned image"
+    )
+    return pixels, (note,)
 
 
 def encode_png(picture: NDArray[np.uint8]) -> bytes:
@@ -127,16 +178,44 @@ def encode_png(picture: NDArray[np.uint8]) -> bytes:
     return data.tobytes()
 
 
-def _decoded(data: bytes, header: Header, source: str) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Grey values of a file that looks whole; the decoder's complaints stay off the user's screen."""
+def encode_image(pixels: NDArray[np.uint8] | NDArray[np.uint16], ending: str) -> bytes:
+    """Picture as the bytes of an image file.
+
+    Parameters
+    ----------
+    pixels : (height, width) or (height, width, 3) uint8 or uint16 array
+        Colours in the order red, green, blue.
+    ending : str
+        Of the file's name: .png, .tif and so on; JPEG is written with a quality of 95.
+
+    Raises
+    ------
+    InputError
+        The kind of file does not hold such a picture.
+    """
+    if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
+        raise InputError(f"16 bits a pixel do not go into {ending} files; write {', '.join(_SIXTEEN_BITS)}")
+    if pixels.ndim == 3 and ending.lower() == ".pgm":
+        raise InputError("colours do not go into .pgm files; write .ppm or .png")
+    ordered = pixels[..., ::-1] if pixels.ndim == 3 else pixels
+    settings = _QUALITY if ending.lower() in _JPEG else []
+    try:
+        done, data = cv2.imencode(ending.lower(), np.ascontiguousarray(ordered), settings)
+    except cv2.error as error:
+        raise InputError(f"a picture of the shape {pixels.shape} cannot be written as {ending}") from error
+    if not done:
+        raise NeurocalError(f"the picture cannot be written as {ending}")
+    return data.tobytes()
+
+
+def _decoded(data: bytes, header: Header, source: str, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Pixels of a file that looks whole; the decoder's complaints stay off the user's screen."""
     with _captured_stderr() as complaints:
         try:
-            grey = cv2.imdecode(
-                np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
-            )
+            pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
         except cv2.error:
-            grey = None
-    if grey is None:
+            pixels = None
+    if pixels is None:
         raise FormatError(
             f"cannot be decoded: a damaged {header.kind}, or a variety of it that few programs read; "
             "save it as PNG of 8 or 16 bits",
@@ -147,12 +226,12 @@ def _decoded(data: bytes, header: Header, source: str) -> NDArray[np.uint8] | ND
         raise FormatError("is damaged; copy the image again", source)
     turned = header.orientation >= 5
     size = (header.width, header.height) if turned else (header.height, header.width)
-    if grey.shape != size:
+    if pixels.shape[:2] != size:
         raise FormatError(f"is no single picture of {header.width} x {header.height} px", source)
-    if grey.dtype == np.uint8:
-        return grey.astype(np.uint8, copy=False)
-    if grey.dtype == np.uint16:
-        return grey.astype(np.uint16, copy=False)
+    if pixels.dtype == np.uint8:
+        return pixels.astype(np.uint8, copy=False)
+    if pixels.dtype == np.uint16:
+        return pixels.astype(np.uint16, copy=False)
     raise FormatError("has pixels of neither 8 nor 16 bits; convert it to one of these", source)
 
 

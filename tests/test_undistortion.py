@@ -1,0 +1,336 @@
+"""Lenses taken off points and images, beside OpenCV."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scenes import random_flat_set
+from test_lens import LENSES
+from test_lens_calibration import bent
+
+from neurocal_cli import Correspondences, calibrate, undistort_image, undistort_points
+from neurocal_cli.camera import Intrinsics
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.lens import Lens
+from neurocal_cli.undistortion import new_camera, undistortion
+
+SIZE = (640, 480)
+BENDING = [model for model in LENSES if model != "none"]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera as a file states it."""
+
+    intrinsics: Intrinsics
+    distortion_model: str = "none"
+    distortion: Array = field(default_factory=lambda: np.zeros(0))
+    image_size: tuple[int, int] | None = SIZE
+
+    @property
+    def K(self) -> Array:
+        return self.intrinsics.A
+
+
+def camera(model: str, skew: bool = False, f: float = 640.0) -> Camera:
+    theta = 1.57 if skew else np.pi / 2
+    return Camera(Intrinsics(f, 1.02 * f, 310.0, 250.0, theta), model, np.array(LENSES[model]))
+
+
+def inside(n: int = 300) -> Array:
+    return np.random.default_rng(0).uniform([0, 0], [639, 479], (n, 2))
+
+
+def by_opencv(seen: Array, cam: Camera, new: Array) -> Array:
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-15)
+    if cam.distortion_model == "fisheye":
+        out = cv2.fisheye.undistortPoints(seen[:, None], cam.K, cam.distortion, P=new, criteria=criteria)
+    else:
+        k = np.zeros(8)
+        k[: len(cam.distortion)] = cam.distortion
+        precise = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4, OpenCV 5
+        out = precise(seen[:, None], cam.K, k, R=np.eye(3), P=new, criteria=criteria)
+    return out.reshape(-1, 2)  # (N, 1, 2) of OpenCV 4, (N, 2) of some functions of OpenCV 5
+
+
+# Points
+
+
+@pytest.mark.parametrize("model", BENDING)
+def test_points_are_those_of_opencv(model: str) -> None:
+    cam = camera(model)
+    seen = inside()
+    points = Correspondences(np.zeros((len(seen), 3)), seen, image_size=SIZE)
+    assert undistort_points(points, cam).pixels == pytest.approx(by_opencv(seen, cam, cam.K), abs=1e-9)
+
+
+@pytest.mark.parametrize("model", BENDING)
+@pytest.mark.parametrize("skew", [True, False])
+def test_points_go_there_and_back(model: str, skew: bool) -> None:
+    step = undistortion(camera(model, skew))
+    seen = inside()
+    corrected = step.points(seen)
+    assert np.abs(corrected - seen).max() > 3
+    assert np.column_stack(step.sources(*corrected.T)) == pytest.approx(seen, abs=1e-9)
+
+
+def test_without_a_lens_points_stay() -> None:
+    seen = inside()
+    assert undistortion(camera("none", True)).points(seen) == pytest.approx(seen, abs=1e-12)
+
+
+@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize("model", ["k1k2", "plumb_bob", "fisheye"])
+def test_corrected_points_give_the_same_camera_without_distortion(model: str, skew: bool) -> None:
+    flat = random_flat_set(np.random.default_rng(7), 12, skew, cols=11, rows=8, f=900, width=1000)
+    points = Correspondences(flat.world, bent(flat, model, LENSES[model]), flat.view, flat.image_size)
+    cam = Camera(flat.intrinsics, model, np.array(LENSES[model]), flat.image_size)
+    found = calibrate(undistort_points(points, cam), distortion="none")
+    assert found.intrinsics.values() == pytest.approx(flat.intrinsics.values(), rel=1e-6)
+    assert found.rmse_px < 1e-6
+
+
+def test_a_zoomed_camera_is_that_of_the_corrected_points() -> None:
+    flat = random_flat_set(np.random.default_rng(7), 8, False, cols=11, rows=8, f=900, width=1000)
+    points = Correspondences(flat.world, bent(flat, "k1k2", LENSES["k1k2"]), flat.view, flat.image_size)
+    cam = Camera(flat.intrinsics, "k1k2", np.array(LENSES["k1k2"]), flat.image_size)
+    found = calibrate(undistort_points(points, cam, alpha=0.0), distortion="none")
+    assert (
+        pytest.approx(undistortion(cam, 0.0, flat.image_size).new.A, rel=1e-6, abs=1e-8) == found.intrinsics.A
+    )
+
+
+@pytest.mark.parametrize("model", BENDING)
+def test_covariances_are_those_of_many_points(model: str) -> None:
+    step = undistortion(camera(model, True), 0.3, SIZE)
+    seen = np.array([[600.0, 30.0]])
+    C = np.array([[0.04, 0.01, 0.02]])
+    square = C[0, [0, 1, 1, 2]].reshape(2, 2)
+    cloud = step.points(seen + np.random.default_rng(0).multivariate_normal([0, 0], square, 20000))
+    expected = np.cov(cloud.T)[[0, 0, 1], [0, 1, 1]]
+    assert step.covariance(step.points(seen), C)[0] == pytest.approx(expected, abs=0.04 * expected[0])
+
+
+def test_what_belongs_to_points_is_carried_over() -> None:
+    n = 4
+    points = Correspondences(
+        np.eye(4)[:, :3],
+        inside(n),
+        ["a", "a", "b", "b"],
+        image_size=SIZE,
+        image_center=(300.0, 260.0),
+        point=["1", "2", "1", "2"],
+        covariance=np.tile([0.1, 0.0, 0.1], (n, 1)),
+        unit="inch",
+    )
+    cam = camera("plumb_bob")
+    done = undistort_points(points, cam)
+    assert (done.view_names, done.unit, done.image_size) == (("a", "b"), "inch", SIZE)
+    assert list(done.point) == ["1", "2", "1", "2"]  # type: ignore[arg-type]
+    assert np.array_equal(done.world, points.world)
+    assert done.covariance is not None
+    assert not np.allclose(done.covariance, points.covariance)
+    assert done.image_center == pytest.approx(undistortion(cam).points(np.array([[300.0, 260.0]]))[0])
+
+
+def test_a_pixel_that_the_lens_cannot_have_seen_is_named() -> None:
+    points = Correspondences(
+        np.zeros((3, 3)), [[320, 240], [630, 470], [0, 0]], source="p.csv", lines=[2, 3, 4]
+    )
+    with pytest.raises(
+        InputError, match=r"^p.csv:3: the lens cannot have seen anything at the pixel \(630, 470\)"
+    ):
+        undistort_points(points, Camera(Intrinsics(300, 300, 320, 240), "k1", np.array([-0.3])))
+
+
+# The new camera
+
+
+@pytest.mark.parametrize("model", ["k1", "k1k2", "plumb_bob"])
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 1.0])
+def test_the_new_camera_is_opencv_s_nearly(model: str, alpha: float) -> None:
+    """OpenCV looks at nine pixels along each side."""
+    cam = camera(model)
+    k = np.zeros(5)
+    k[: len(cam.distortion)] = cam.distortion
+    theirs, _ = cv2.getOptimalNewCameraMatrix(cam.K, k, SIZE, alpha)
+    assert pytest.approx(np.asarray(theirs), abs=2.0) == undistortion(cam, alpha, SIZE).new.A
+
+
+@pytest.mark.parametrize("model", BENDING)
+@pytest.mark.parametrize("skew", [True, False])
+def test_alpha_0_shows_only_seen_pixels_and_alpha_1_all_of_them(model: str, skew: bool) -> None:
+    cam = camera(model, skew)
+    u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    su, sv = undistortion(cam, 0.0, SIZE).sources(u, v)
+    assert su.min() > -0.02
+    assert sv.min() > -0.02
+    assert su.max() < 639.02
+    assert sv.max() < 479.02
+    shown = undistortion(cam, 1.0, SIZE).points(np.column_stack([u.ravel(), v.ravel()]))
+    assert shown.min() > -0.02
+    assert (shown.max(axis=0) < [639.02, 479.02]).all()
+    assert undistortion(cam, 1.0, SIZE).new.skewed is False
+
+
+def test_a_lens_that_sees_to_the_side_shows_at_most_79_degrees() -> None:
+    """Half of the circle of a fisheye lies behind any plane."""
+    new = new_camera(np.array([[200.0, 0, 320], [0, 200, 240], [0, 0, 1]]), Lens("fisheye"), SIZE, 1.0)
+    assert new.alpha_u == pytest.approx(639 / 10.0, rel=0.01)
+
+
+def test_alpha_needs_a_size_and_a_sensible_lens() -> None:
+    with pytest.raises(InputError, match="size of the images"):
+        undistortion(replace(camera("k1"), image_size=None), 0.5, None)
+    with pytest.raises(InputError, match="between 0 and 1"):
+        undistortion(camera("k1"), 2.0, SIZE)
+    with pytest.raises(InputError, match="leaves no rectangle"):
+        undistortion(Camera(Intrinsics(100, 100, 9000, 240), "k1", np.array([-0.3])), 0.0, SIZE)
+
+
+# Images
+
+
+def smooth(dtype: type = np.uint8, channels: int = 0) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(640), np.arange(480))
+    one = 0.5 + 0.25 * np.sin(u / 9.0) + 0.25 * np.cos(v / 7.0)
+    picture = one if not channels else np.stack([one, one**2, 1 - one], axis=-1)
+    return (picture * np.iinfo(dtype).max).astype(dtype)
+
+
+def full(cam: Camera) -> Array:
+    k = np.zeros(8)
+    k[: len(cam.distortion)] = cam.distortion
+    return k
+
+
+@pytest.mark.parametrize("model", BENDING)
+def test_images_are_those_of_opencv(model: str) -> None:
+    cam, image = camera(model), smooth()
+    if model == "fisheye":
+        theirs = cv2.fisheye.undistortImage(image, cam.K, cam.distortion, Knew=cam.K)
+    else:
+        theirs = cv2.undistort(image, cam.K, full(cam))
+    ours = undistort_image(image, cam, interpolation="linear").astype(int)
+    # Up to the 1/32 px to which remap rounds, and the border where one of them is black.
+    assert np.abs(ours - theirs)[30:-30, 30:-30].max() <= 3
+    assert np.abs(ours - theirs).mean() < 0.3
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [0, 3])
+@pytest.mark.parametrize("interpolation", ["nearest", "linear", "cubic", "lanczos"])
+def test_depth_and_colours_stay(dtype: type, channels: int, interpolation: str) -> None:
+    image = smooth(dtype, channels)
+    done = undistort_image(image, camera("k1k2", True), interpolation=interpolation)
+    assert (done.shape, done.dtype) == (image.shape, image.dtype)
+    assert done[200:300, 200:300].std() > 0.1 * np.iinfo(dtype).max
+    if channels:
+        for k in range(3):
+            alone = undistort_image(image[..., k], camera("k1k2", True), interpolation=interpolation)
+            assert np.array_equal(done[..., k], alone)
+
+
+def test_without_a_lens_an_image_stays() -> None:
+    assert np.array_equal(undistort_image(smooth(), camera("none", True)), smooth())
+
+
+def test_an_image_and_its_points_agree() -> None:
+    """A dot is found where its pixel is corrected to."""
+    cam = camera("plumb_bob", True)
+    for alpha in (None, 0.0, 1.0):
+        step = undistortion(cam, alpha, SIZE)
+        for u, v in ((100.0, 90.0), (500.0, 330.0), (320.0, 200.0)):
+            x, y = np.meshgrid(np.arange(640), np.arange(480))
+            dot = 255 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 4.0**2))
+            done = undistort_image(dot.astype(np.uint8), cam, alpha).astype(float)
+            centre = np.array([(done * x).sum(), (done * y).sum()]) / done.sum()
+            assert centre == pytest.approx(step.points(np.array([[u, v]]))[0], abs=0.15)
+
+
+def test_nothing_is_mirrored_beyond_the_fold() -> None:
+    """A strong barrel: without care a ring of false picture surrounds the true one."""
+    cam = Camera(Intrinsics(250, 250, 320, 240), "k1", np.array([-0.25]))
+    white = np.full((480, 640), 255, np.uint8)
+    zoomed_out = Camera(Intrinsics(60, 60, 320, 240))
+    step = replace(undistortion(cam), new=zoomed_out.intrinsics)
+    u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    su, _ = step.sources(u, v)
+    radius = np.hypot(u - 320, v - 240) / 60
+    fold = 1 / np.sqrt(0.75)
+    assert np.isfinite(su[radius < fold - 0.01]).all()
+    assert np.isnan(su[radius > fold + 0.01]).all()
+    naive = cv2.undistort(white, cam.K, np.array([-0.25, 0, 0, 0]), newCameraMatrix=zoomed_out.K)
+    assert naive[radius > 1.5].any()  # what others show there
+    from neurocal_cli.remapping import Remapping
+
+    done = Remapping(step, SIZE)(white)
+    assert done[radius < fold - 0.05].min() == 255
+    assert not done[radius > fold + 0.05].any()
+
+
+def test_large_images_are_done_in_parts() -> None:
+    cam = Camera(Intrinsics(1500, 1500, 1000, 800), "k1k2", np.array([-0.2, 0.1]), (2000, 1600))
+    image = np.random.default_rng(0).integers(0, 255, (1600, 2000), dtype=np.uint8)
+    theirs = cv2.undistort(image, cam.K, full(cam))
+    close = np.abs(undistort_image(image, cam, interpolation="linear").astype(int) - theirs)
+    assert np.mean(close <= 9) > 0.99
+
+
+def test_an_image_of_another_size_is_refused() -> None:
+    with pytest.raises(InputError, match=r"has 100 x 50 px, the camera's images have 640 x 480"):
+        undistort_image(np.zeros((50, 100), np.uint8), camera("k1"))
+    with pytest.raises(InputError, match="interpolation must be one of"):
+        undistort_image(smooth(), camera("k1"), interpolation="best")
+
+
+def test_images_too_long_for_opencv_are_refused() -> None:
+    with pytest.raises(InputError, match="at most 32767 px"):
+        undistort_image(np.zeros((1, 40000), np.uint8), replace(camera("k1"), image_size=None))
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=40, deadline=None)
+def test_any_lens_gives_a_picture_or_a_reason(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    model = str(rng.choice(BENDING))
+    k = rng.normal(size=len(LENSES[model])) * 0.3
+    cam = Camera(Intrinsics(rng.uniform(20, 500), 60, 30, 20, rng.uniform(1.4, 1.7)), model, k, (64, 48))
+    image = rng.integers(0, 255, (48, 64), dtype=np.uint8)
+    try:
+        done = undistort_image(image, cam, [None, 0.0, 0.5, 1.0][rng.integers(4)])
+    except InputError:
+        return
+    assert done.shape == image.shape
+
+
+# Photographs
+
+
+def test_a_photograph_has_straight_edges_afterwards() -> None:
+    from neurocal_cli import Board, detect_points, read_image
+
+    path = Path(__file__).resolve().parents[2] / "shared" / "data" / "opencv_stereo"
+    if not path.is_dir():
+        pytest.skip("the photographs are not beside the project")
+    cam = Camera(
+        Intrinsics(533.93, 533.89, 342.6, 233.37),
+        "plumb_bob",
+        np.array([-0.256, -0.150, 0.00117, -0.0002, 0.543]),
+    )
+    image = read_image(str(path / "left02.jpg")).grey
+    rms = []
+    for picture in (image, undistort_image(image, cam)):
+        found = detect_points(picture, Board.single(9, 6, 25.0))
+        rows = [found.pixels[found.world[:, 1] == y] for y in 25.0 * np.arange(6)]
+        off = [np.linalg.svd(row - row.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(row)) for row in rows]
+        rms.append(np.sqrt(np.mean(np.square(off))))
+    assert rms[0] > 0.3
+    assert rms[1] < 0.12
