@@ -76,7 +76,11 @@ def lens_and_camera(
     held = np.concatenate([known.free, np.zeros(len(k), dtype=bool)])
     start = refine(job.views.tiles, replace(state, lens=MODEL, k=k), held, known.free_poses)
     job.tally.refinements += start.iterations
-    lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale)
+    whitening = views.whitening
+    if whitening is not None and views.order is not None:
+        whitening = np.empty_like(whitening)
+        whitening[views.order] = views.whitening
+    lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
     together = _Together(job, bent_lines(lines, start.state.entries[0], Lens(MODEL, start.state.k)))
     refined = together.solved(start)
     return job, Solution(refined, job.tally, together.covariance(refined))
@@ -139,8 +143,10 @@ class _Together:
                 normal = equations.normal
                 step = _solve(equations.matrix, equations.right)
                 state, taken = self._moved(state, equations, step)
-                done = bool(taken * np.abs(step).max(initial=0.0) < _TOLERANCE) and taken == 1.0
+                done = taken == 1.0 and bool(np.abs(step).max(initial=0.0) < _TOLERANCE)
                 iterations += 1
+                if not taken:
+                    break
             normal, _ = normal_blocks(self.job.views.tiles, state)
         self.job.tally.refinements += iterations
         settled = np.array([done and start.converged])

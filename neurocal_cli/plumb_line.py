@@ -120,7 +120,7 @@ def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> Plum
         )
     middle, scale = _frame(points)
     start = (np.asarray(centre) - middle) / scale if centre is not None else np.zeros(2)
-    seen = lines_in_pixels(points, lines, middle, scale)
+    seen = lines_in_pixels(points, lines, middle, scale, noise_model(points.covariance)[1])
     curves = bent_lines(seen, np.array([1.0, 0.0, 1.0, *start]), Lens(_MODEL))
     free = _COEFFICIENTS if centre is not None else _CENTRE + _COEFFICIENTS
     spare = equations - len(free)
@@ -129,9 +129,20 @@ def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> Plum
     return PlumbLine(lines, found.entries[3:] * scale + middle, scale, found.lens, before, after)
 
 
-def lines_in_pixels(points: Correspondences, lines: LinesSeen, centre: Array, scale: float) -> SeenLines:
-    """Where the places on lines were seen, in pixels from a centre in units of a scale."""
-    _, whitening = noise_model(points.covariance)
+def lines_in_pixels(
+    points: Correspondences, lines: LinesSeen, centre: Array, scale: float, whitening: Array | None = None
+) -> SeenLines:
+    """Where the places on lines were seen, in pixels from a centre in units of a scale.
+
+    Parameters
+    ----------
+    points : Correspondences
+    lines : LinesSeen
+    centre : (2,) array [px]
+    scale : float [px]
+    whitening : (N, 3) array, optional
+        Factors of the points, as from `views.noise_model`.
+    """
     pixels = (points.pixels[lines.row] - centre) / scale
     return SeenLines(lines, pixels, None if whitening is None else whitening[lines.row])
 

@@ -27,6 +27,7 @@ from neurocal_cli.lens import Lens
 from neurocal_cli.plumb_line import PlumbLine, fit_plumb_line, lines_in_pixels
 from neurocal_cli.plumb_lines import FEWEST_ON_LINE, LinesSeen, find_lines
 from neurocal_cli.straightness import bent_lines
+from neurocal_cli.views import noise_model
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIZE = (1000, 800)
@@ -124,9 +125,8 @@ def test_derivatives_are_those_of_differences() -> None:
     weights = np.column_stack(
         [np.linspace(0.5, 2, len(points)), np.full(len(points), 0.2), np.ones(len(points))]
     )
-    seen = lines_in_pixels(
-        replace(points, covariance=weights), find_lines(points), np.array([480, 390]), 900.0
-    )
+    whitening = noise_model(weights)[1]
+    seen = lines_in_pixels(points, find_lines(points), np.array([480, 390]), 900.0, whitening)
     entries, k = np.array([1.0, 0.02, 0.98, 0.03, -0.02]), np.array([-0.21, 0.08, 0.01, -0.02])
     curves = bent_lines(seen, entries, Lens("k1k2p1p2", k))
     r, J, nu = curves.derivatives()
