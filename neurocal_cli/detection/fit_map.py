@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["Frame", "SmoothMap", "homography_start"]
+__all__ = ["Frame", "Places", "SmoothMap", "homography_start"]
 
 _HOMOGRAPHY, _LENS = 8, 6
 _REST = _HOMOGRAPHY + _LENS
@@ -54,6 +54,23 @@ class Frame:
         half = np.maximum(0.5 * (high - low), 0.5)
         centre = 0.5 * (np.array(size, dtype=float) - 1)
         return cls(0.5 * (low + high), half, centre, float(0.5 * np.hypot(*size)))
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Grid points as maps of one form need them.
+
+    Attributes
+    ----------
+    x, y : (N,) arrays
+        Scaled coordinates.
+    rest : (m, N) array or None
+        Values of the polynomials there.
+    """
+
+    x: Array
+    y: Array
+    rest: Array | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +125,7 @@ class SmoothMap:
         """Pixels of grid coordinates; (..., 2) -> (..., 2)."""
         frame, values = self.frame, self.parameters
         scaled = (grid - frame.origin) / frame.half
-        q, _ = _project(values, scaled[..., 0], scaled[..., 1])
+        q = _project(values, scaled[..., 0], scaled[..., 1])
         if self.radial:
             e = q - values[8:10]
             rho = (e * (e @ self._metric)).sum(axis=-1)[..., None]
@@ -118,36 +135,59 @@ class SmoothMap:
             q = q + terms @ values[_REST:].reshape(2, -1).T
         return np.asarray(frame.centre + frame.unit * q)
 
-    def derivatives(self, grid: Array) -> tuple[Array, Array]:
-        """Pixels (N, 2) of grid points (N, 2) and their derivatives (N, 2, P) by the parameters."""
+    def places(self, grid: Array) -> Places:
+        """Grid points (N, 2), prepared for maps of this form."""
+        x, y = ((grid - self.frame.origin) / self.frame.half).T
+        return Places(x, y, _rest(self.degree, self.frame, x, y).T if self.degree else None)
+
+    def along(self, places: Places, direction: Array) -> tuple[Array, Array]:
+        """Pixels along one direction for each place, and what they change by.
+
+        Parameters
+        ----------
+        places : Places
+            Of N grid points.
+        direction : (2, N) array
+            Unit vectors.
+
+        Returns
+        -------
+        value : (N,) array [px]
+        derivatives : (P, N) array
+            By the parameters; 0 for those of the lens that are held.
+        """
         frame, values = self.frame, self.parameters
-        x, y = ((grid - frame.origin) / frame.half).T
-        q, w = _project(values, x, y)
-        n = len(x)
-        dq = np.zeros((n, 2, 8))
-        ground = np.stack([x, y, np.ones(n)], axis=-1) / w[:, None]
-        dq[:, 0, 0:3] = dq[:, 1, 3:6] = ground
-        dq[:, :, 6] = -q * ground[:, :1]
-        dq[:, :, 7] = -q * ground[:, 1:2]
-        e = q - values[8:10]
-        slope = e @ self._metric
-        rho = (e * slope).sum(axis=-1)[:, None]
-        k1, k2 = values[10:12]
-        stretch, growth = rho * (k1 + k2 * rho), k1 + 2 * k2 * rho
-        bent = np.eye(2) * stretch[:, :, None] + 2 * (growth * e)[:, :, None] * slope[:, None, :]
-        out = np.zeros((n, 2, len(values)))
-        out[:, :, :8] = dq + bent @ dq
-        out[:, :, 8:10] = -bent
-        out[:, :, 10], out[:, :, 11] = e * rho, e * rho**2
-        out[:, :, 12] = growth * e * (e[:, :1] ** 2 - e[:, 1:] ** 2)
-        out[:, :, 13] = growth * e * (2 * e[:, :1] * e[:, 1:])
-        q = q + e * stretch
-        if self.degree:
-            terms = _rest(self.degree, frame, x, y)
-            m = terms.shape[1]
-            out[:, 0, _REST : _REST + m] = out[:, 1, _REST + m :] = terms
-            q = q + terms @ values[_REST:].reshape(2, -1).T
-        return frame.centre + frame.unit * q, frame.unit * out
+        x, y = places.x, places.y
+        w = 1 / (1 + values[6] * x + values[7] * y)
+        q_u = (values[0] * x + values[1] * y + values[2]) * w
+        q_v = (values[3] * x + values[4] * y + values[5]) * w
+        d_u, d_v = frame.unit * direction
+        value = frame.centre @ direction + d_u * q_u + d_v * q_v
+        out = np.zeros((len(values), len(x)))
+        if places.rest is not None:
+            m = len(places.rest)
+            np.multiply(places.rest, d_u, out=out[_REST : _REST + m])
+            np.multiply(places.rest, d_v, out=out[_REST + m :])
+            value += values[_REST:] @ out[_REST:]
+        if self.radial:
+            (c_u, c_v, k1, k2), metric = values[8:12], self._metric
+            e_u, e_v = q_u - c_u, q_v - c_v
+            slope_u, slope_v = metric @ np.stack([e_u, e_v])
+            rho = e_u * slope_u + e_v * slope_v
+            length = d_u * e_u + d_v * e_v
+            stretch, growth = rho * (k1 + k2 * rho), (k1 + 2 * k2 * rho) * length
+            value += length * stretch
+            bent_u, bent_v = d_u * stretch + 2 * growth * slope_u, d_v * stretch + 2 * growth * slope_v
+            out[8], out[9] = -bent_u, -bent_v
+            out[10], out[11] = length * rho, length * rho**2
+            out[12], out[13] = growth * (e_u * e_u - e_v * e_v), growth * (2 * e_u * e_v)
+            d_u, d_v = d_u + bent_u, d_v + bent_v
+        ground_x, ground_y = x * w, y * w
+        out[0], out[1], out[2] = d_u * ground_x, d_u * ground_y, d_u * w
+        out[3], out[4], out[5] = d_v * ground_x, d_v * ground_y, d_v * w
+        towards = d_u * q_u + d_v * q_v
+        out[6], out[7] = -towards * ground_x, -towards * ground_y
+        return value, out
 
     @property
     def _metric(self) -> Array:
@@ -157,9 +197,8 @@ class SmoothMap:
     def variance(self, grid: Array, direction: Array) -> Array:
         """Variance [px^2] of the map along unit vectors (N, 2) at grid points (N, 2)."""
         assert self.covariance is not None
-        _, jacobian = self.derivatives(grid)
-        along = np.einsum("ni,nip->np", direction, jacobian)
-        return np.einsum("np,pq,nq->n", along, self.covariance, along)
+        _, along = self.along(self.places(grid), direction.T)
+        return np.asarray((along * (self.covariance @ along)).sum(axis=0))
 
 
 def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
@@ -174,11 +213,11 @@ def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
     return SmoothMap(frame, values)
 
 
-def _project(values: Array, x: Array, y: Array) -> tuple[Array, Array]:
+def _project(values: Array, x: Array, y: Array) -> Array:
     w = 1 + values[6] * x + values[7] * y
     u = (values[0] * x + values[1] * y + values[2]) / w
     v = (values[3] * x + values[4] * y + values[5]) / w
-    return np.stack([u, v], axis=-1), w
+    return np.stack([u, v], axis=-1)
 
 
 def _orders(degree: int, frame: Frame) -> list[tuple[int, int]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_map import SmoothMap
+from neurocal_cli.detection.fit_map import Places, SmoothMap
 from neurocal_cli.geometry import Array
 
 __all__ = ["FORMS", "MapFit", "Rows", "choose_map", "fit_map", "median"]
@@ -112,17 +112,19 @@ def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> 
     free, m = start.free, len(start.free)
     prior = np.concatenate([start.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
     values = np.concatenate([start.parameters[free], shift])
-    residual, jacobian = _residual(start, rows, shift, free)
+    rows_there = _Rows.of(start, rows)
+    residual, jacobian = rows_there.residual(start, shift, free)
     # Before the first step everything may be off, the shifts above all.
-    weight, damping = 1 / rows.variance, _DAMPING
+    precision = 1 / rows.variance
+    weight, damping = precision, _DAMPING
     for _ in range(steps):
-        normal = (jacobian.T * weight) @ jacobian
-        gradient = jacobian.T @ (weight * residual) - prior * values
-        normal[np.diag_indices_from(normal)] += prior
+        normal = (jacobian * weight) @ jacobian.T
+        gradient = jacobian @ (weight * residual) - prior * values
+        normal.ravel()[:: len(values) + 1] += prior
         step = _solved(normal, gradient, damping)
         tried, moved = replace(start, parameters=start.parameters.copy()), values + step
         tried.parameters[free] = moved[:m]
-        ahead, slopes = _residual(tried, rows, moved[m:], free)
+        ahead, slopes = rows_there.residual(tried, moved[m:], free)
         before = weight @ residual**2 + prior @ values**2
         after = weight @ ahead**2 + prior @ moved**2
         if not after <= before:
@@ -130,8 +132,8 @@ def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> 
             continue
         start, values, residual, jacobian = tried, moved, ahead, slopes
         damping *= 0.1
-        z = residual / np.sqrt(rows.variance)
-        weight = _tukey(z / _scale(z)) / rows.variance
+        z = residual * rows_there.steep
+        weight = _tukey(z / _scale(z)) * precision
         if before - after < _SETTLED and damping < _DAMPING:
             break
     return _finished(start, rows, values[m:], residual, jacobian)
@@ -191,18 +193,32 @@ def _scale(z: Array) -> float:
     return max(1.0, 1.5 * median(np.abs(z)))
 
 
-def _residual(now: SmoothMap, rows: Rows, shift: Array, free: NDArray[np.intp]) -> tuple[Array, Array]:
-    pixels, derivatives = now.derivatives(rows.grid)
-    residual = rows.value - (rows.direction * pixels).sum(axis=1) - rows.shift @ shift
-    along = np.einsum("ni,nip->np", rows.direction, derivatives)[:, free]
-    return residual, np.concatenate([along, rows.shift], axis=1)
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows, prepared for maps of one form."""
+
+    rows: Rows
+    places: Places
+    direction: Array
+    steep: Array  # inverse standard deviations
+
+    @classmethod
+    def of(cls, form: SmoothMap, rows: Rows) -> _Rows:
+        direction = np.ascontiguousarray(rows.direction.T)
+        return cls(rows, form.places(rows.grid), direction, 1 / np.sqrt(rows.variance))
+
+    def residual(self, now: SmoothMap, shift: Array, free: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Residuals (N,), and derivatives (P, N) of what they are compared with."""
+        value, along = now.along(self.places, self.direction)
+        residual = self.rows.value - value - self.rows.shift @ shift
+        return residual, np.concatenate([along[free], self.rows.shift.T])
 
 
 def _solved(normal: Array, gradient: Array, damping: float) -> Array:
     """Solution of damped normal equations whose parameters have very different sizes."""
-    size = 1 / np.sqrt(np.maximum(np.diag(normal), _TINY))
+    size = 1 / np.sqrt(np.maximum(normal.diagonal(), _TINY))
     scaled = normal * size[:, None] * size
-    scaled[np.diag_indices_from(scaled)] += damping
+    scaled.ravel()[:: len(size) + 1] += damping
     return np.asarray(size * np.linalg.solve(scaled, gradient * size))
 
 
@@ -211,7 +227,7 @@ def _finished(now: SmoothMap, rows: Rows, shift: Array, residual: Array, jacobia
     z = residual / np.sqrt(rows.variance)
     weight = _tukey(z / _scale(z))
     good = weight > 0
-    normal = (jacobian.T * (good / rows.variance)) @ jacobian
+    normal = (jacobian * (good / rows.variance)) @ jacobian.T
     normal[np.diag_indices_from(normal)] += np.concatenate(
         [now.prior[free], np.full(len(shift), _SHIFT_PRIOR)]
     )
