@@ -158,7 +158,7 @@ def gauss_newton(
         values = _moved(values, step)
         linear = model(values)
         # What most fits still lack is little; those that cannot settle must not hold up the others.
-        if np.quantile(size, _MOST) < _SETTLED:
+        if (size < _SETTLED).mean() >= _MOST:
             break
     information, _ = _normal(linear, weight)
     chi2 = np.einsum("en,en,en->e", linear.residual, linear.residual, weight).astype(float)

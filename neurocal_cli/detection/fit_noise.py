@@ -99,13 +99,17 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     z, x, Q = fit.linear.z[some], fit.linear.x[some], data.Q[some]
     _, density = erf_and_density(z)
     scale = fit.values[good, CONTRAST].astype(np.float32)[:, None] * data.gain[some]
-    steep = response(x, shape.bend)[1] * Q
-    bends = response_terms(x)
-    tails = tail_terms(z, density) * steep
-    others = np.stack([density * steep, density * z * steep, x])
-    columns = np.concatenate([tails * scale, bends * scale, others * scale, np.ones_like(z)[None]])
+    steep = scale * Q if not shape.bend.any() else response(x, shape.bend)[1] * Q * scale
     # Edge by edge: small products, for which no threads are started.
-    columns = columns.swapaxes(0, 1)
+    columns = np.empty((len(z), RESPONSE_TERMS + 6, z.shape[1]), dtype=np.float32)
+    tails, bends, others = np.split(columns, [2, 2 + RESPONSE_TERMS], axis=1)
+    tail_terms(z, density, out=tails)
+    tails *= steep[:, None]
+    response_terms(x, scale, out=bends)
+    np.multiply(density, steep, out=others[:, 0])
+    np.multiply(others[:, 0], z, out=others[:, 1])
+    np.multiply(x, scale, out=others[:, 2])
+    others[:, 3] = 1
     weighted = columns * data.weight[some][:, None]
     normal = (weighted @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
     right = (weighted @ fit.linear.residual[some][:, :, None]).sum(axis=(0, 2), dtype=float)

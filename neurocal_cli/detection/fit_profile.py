@@ -92,11 +92,12 @@ def profile(z: Real, tails: Real) -> tuple[Real, Real, Real]:
     return value, slope, density
 
 
-def tail_terms(z: Real, density: Real) -> Real:
-    """The functions ``phi He_3`` and ``phi He_5``; (2, ...) array."""
+def tail_terms(z: Real, density: Real, out: Real) -> None:
+    """The functions ``phi He_3`` and ``phi He_5`` of z (E, N); out is an (E, 2, N) array."""
     square = z * z
     odd = density * z
-    return np.stack([odd * (square - 3), odd * (square * (square - 10) + 15)])
+    np.multiply(odd, square - 3, out=out[:, 0])
+    np.multiply(odd, square * (square - 10) + 15, out=out[:, 1])
 
 
 def response(x: Real, bend: Array) -> tuple[Real, Real]:
@@ -112,12 +113,11 @@ def response(x: Real, bend: Array) -> tuple[Real, Real]:
     return x + room * rest, 1 + room * steep - 2 * x * rest
 
 
-def response_terms(x: Real) -> Real:
-    """The functions ``(1 - x^2) x^k``; (RESPONSE_TERMS, ...) array."""
-    terms = [1 - x * x]
-    for _ in range(RESPONSE_TERMS - 1):
-        terms.append(terms[-1] * x)
-    return np.stack(terms)
+def response_terms(x: Real, scale: Real, out: Real) -> None:
+    """The functions ``scale (1 - x^2) x^k`` of x (E, N); out is an (E, RESPONSE_TERMS, N) array."""
+    np.multiply(scale, 1 - x * x, out=out[:, 0])
+    for k in range(1, RESPONSE_TERMS):
+        np.multiply(out[:, k - 1], x, out=out[:, k])
 
 
 def box_kurtosis(normal: Array, sigma: Array) -> Array:

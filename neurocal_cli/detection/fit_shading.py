@@ -18,6 +18,7 @@ _LATTICE = np.linspace(0.25, 0.75, 8)  # of a square; its interior, away from th
 _STEPS = 2  # after the last degree
 _TUKEY = 5.0  # standard deviations beyond which a level counts as an outlier
 _TINY = 1e-9  # DN^2
+_RIDGE = 1e-12
 _LEAST_CONTRAST = 1e-3  # DN; where there is none, the fits fail by themselves but must not divide by it
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 
@@ -122,9 +123,11 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
         scatter = median(residual**2) / 0.455 * n / max(n - used, 1)
         weight = np.clip(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6, None) ** 2
         root = np.sqrt(weight / (levels.variance + spread))
-        coefficients[:used] = np.linalg.lstsq(
-            terms[:, :used] * root[:, None], levels.level * root, rcond=None
-        )[0]
+        weighted = terms[:, :used].T * root
+        normal = weighted @ weighted.T
+        # Of terms that can't be told apart none is made up.
+        normal.ravel()[:: used + 1] *= 1 + _RIDGE
+        coefficients[:used] = np.linalg.solve(normal, weighted @ (levels.level * root))
         residual = levels.level - terms[:, :used] @ coefficients[:used]
         # What the levels' own errors may do by chance is not taken for spread of the squares.
         chance = 1 + 4 / np.sqrt(n)

@@ -136,6 +136,7 @@ def gather(
     steep = np.abs(lines.tangent[:, 1]) > np.abs(lines.tangent[:, 0])
     order = np.where(steep[:, None], [[1, 0]], [[0, 1]])
     t = np.take_along_axis(lines.tangent, order, axis=1)
+    n = np.take_along_axis(lines.normal, order, axis=1)
     middle = np.take_along_axis(lines.middle, order, axis=1)
     low, high = lines.ends[:, 0] + trim, lines.ends[:, 1] - trim
     reach = 0.5 * (high - low) * np.abs(t[:, 0]) + half_width * np.abs(t[:, 1])
@@ -143,40 +144,108 @@ def gather(
     count = int(np.ceil((2 * reach.max() + 1) / stride))
     first = np.ceil(centre[:, 0] - reach)
     column = first[:, None] + stride * np.arange(count)
-    along = (column - middle[:, :1]) / t[:, :1]
+    a = column - middle[:, :1]
+    along = a / t[:, :1]
     # The chord's height over the tangent, to the first order: columns are cut straight.
-    normal_b = np.take_along_axis(lines.normal, order, axis=1)[:, 1:]
-    height = middle[:, 1:] + along * t[:, 1:] + 0.5 * lines.curvature[:, None] * along**2 / normal_b
+    height = middle[:, 1:] + along * t[:, 1:] + 0.5 * lines.curvature[:, None] * along**2 / n[:, 1:]
     spread = half_width / np.abs(t[:, 0])
     rows = int(np.ceil(2 * spread.max() + 1))
     top = np.ceil(height - spread[:, None])
-    row = top[:, :, None] + np.arange(rows)
-    a, b = np.broadcast_arrays(column[:, :, None], row)
-    flat = (len(lines.middle), -1)
-    a, b = a.reshape(flat), b.reshape(flat)
-    u, v = np.where(steep[:, None], b, a), np.where(steep[:, None], a, b)
-    return _seen(image, lines, half_width, low, high, u, v)
-
-
-def _seen(
-    image: NDArray[np.generic], lines: Lines, half_width: Array, low: Array, high: Array, u: Array, v: Array
-) -> Strips:
-    height, width = image.shape
-    framed = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-    place = (v * width + u).astype(np.intp)
-    if not framed.all():
-        place[~framed] = 0
-    value = image.reshape(-1)[place].astype(np.float32)
-    du = (u - lines.middle[:, :1]).astype(np.float32)
-    dv = (v - lines.middle[:, 1:]).astype(np.float32)
-    t, n = lines.tangent.astype(np.float32), lines.normal.astype(np.float32)
-    s = du * t[:, :1] + dv * t[:, 1:]
-    d = du * n[:, :1] + dv * n[:, 1:]
-    d -= (0.5 * lines.curvature[:, None]).astype(np.float32) * s * s
-    single = np.float32
-    inside = np.abs(d) <= half_width[:, None].astype(single)
-    inside &= (s >= low[:, None].astype(single)) & (s <= high[:, None].astype(single))
+    window = _Window(column, top, rows, a, top - middle[:, 1:])
+    s, d = window.seen_along(t), window.seen_along(n)
+    d -= _column(0.5 * lines.curvature) * s * s
+    inside = np.abs(d) <= _column(half_width)
+    inside &= (s >= _column(low)) & (s <= _column(high))
     total = inside.sum(axis=1)
-    inside &= framed
-    beyond = 1 - inside.sum(axis=1) / np.maximum(total, 1)
-    return Strips(s, d, value, inside, du, dv, beyond)
+    framed = window.framed(steep, image.shape)
+    if framed is not None:
+        inside &= framed
+    used = inside.sum(axis=1)
+    index, inside = packed(inside, used)
+    a, b = window.relative(index)
+    return Strips(
+        s=s.reshape(-1)[index],
+        d=d.reshape(-1)[index],
+        value=image.reshape(-1).take(window.places(steep, image.shape[1], index), mode="clip").astype("f4"),
+        inside=inside,
+        u=np.where(steep[:, None], b, a),
+        v=np.where(steep[:, None], a, b),
+        beyond=1 - used / np.maximum(total, 1),
+    )
+
+
+def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Where the wanted ones of each row are, side by side.
+
+    Parameters
+    ----------
+    wanted : (E, N) bool array
+    count : (E,) int array
+        Of the wanted ones in each row.
+
+    Returns
+    -------
+    index : (E, M) int array
+        In the flat array; 0 beyond a row's count.
+    inside : (E, M) bool array
+        False beyond a row's count.
+    """
+    most = int(count.max(initial=1))
+    inside = np.arange(most) < count[:, None]
+    index = np.zeros(inside.shape, dtype=np.intp)
+    index[inside] = np.flatnonzero(wanted)
+    return index, inside
+
+
+def _column(x: Array) -> Single:
+    return np.asarray(x[:, None], dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """Parallelograms of pixels: `rows` of them from `top` on in each column.
+
+    Attributes
+    ----------
+    column, top : (E, C) arrays [px]
+    rows : int
+    a, b : (E, C) arrays [px]
+        The same relative to the line's middle.
+    """
+
+    column: Array
+    top: Array
+    rows: int
+    a: Array
+    b: Array
+
+    def seen_along(self, way: Array) -> Single:
+        """(E, C rows) coordinates along directions (E, 2) from the middle."""
+        first = (self.a * way[:, :1] + self.b * way[:, 1:]).astype(np.float32)
+        down = _column(way[:, 1]) * np.arange(self.rows, dtype=np.float32)
+        return (first[:, :, None] + down[:, None]).reshape(len(way), -1)
+
+    def framed(self, steep: NDArray[np.bool_], size: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """(E, C rows) which pixels lie in an image of (height, width); None if all do."""
+        limits = np.where(steep[:, None], [size[0], size[1]], [size[1], size[0]])
+        column, last = self.column, self.top + (self.rows - 1)
+        wide, high = limits[:, :1], limits[:, 1:]
+        if (column >= 0).all() and (self.top >= 0).all() and (column < wide).all() and (last < high).all():
+            return None
+        row = self.top[:, :, None] + np.arange(self.rows)
+        inside = (row >= 0) & (row < high[:, :, None])
+        inside &= ((column >= 0) & (column < wide))[:, :, None]
+        return inside.reshape(len(column), -1)
+
+    def places(self, steep: NDArray[np.bool_], width: int, index: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Places of packed pixels in the flat image of a width; of those that stand for nothing, anywhere."""
+        right, down = (np.where(steep, a, b)[:, None] for a, b in ((width, 1), (1, width)))
+        first = (self.column * right + self.top * down).astype(np.intp)
+        return (first[:, :, None] + (down * np.arange(self.rows))[:, None]).reshape(-1)[index]
+
+    def relative(self, index: NDArray[np.intp]) -> tuple[Single, Single]:
+        """Coordinates of packed pixels relative to the line's middle, along the columns' way and down."""
+        a, b = self.a.astype(np.float32), self.b.astype(np.float32)
+        every = np.repeat(a.reshape(-1), self.rows)
+        down = b[:, :, None] + np.arange(self.rows, dtype=np.float32)
+        return every[index], down.reshape(-1)[index]

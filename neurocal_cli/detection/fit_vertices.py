@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fit_map import SmoothMap
 from neurocal_cli.detection.fit_newton import Fit, Linear, Prior, Shape, gauss_newton
 from neurocal_cli.detection.fit_profile import erf_and_density, profile, response
-from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines
+from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines, packed
 from neurocal_cli.geometry import Array
 
 __all__ = ["FIRST", "SECOND", "VertexData", "fit_vertices", "linearised", "vertex_data", "vertex_lines"]
@@ -108,16 +108,19 @@ def vertex_data(
         np.concatenate([getattr(part, name) for part in parts], axis=1)
         for name in ("u", "v", "value", "inside")
     )
+    (_, d1), (_, d2) = (_coordinates(line, u, v) for line in lines)
+    inside[:, : parts[0].u.shape[1]] &= (np.abs(d1) <= np.abs(d2))[:, : parts[0].u.shape[1]]
+    inside[:, parts[0].u.shape[1] :] &= (np.abs(d1) > np.abs(d2))[:, parts[0].u.shape[1] :]
+    index, inside = packed(inside, inside.sum(axis=1))
+    u, v, value = (x.reshape(-1)[index] for x in (u, v, value))
     (s1, d1), (s2, d2) = (_coordinates(line, u, v) for line in lines)
-    mine = np.abs(d1) <= np.abs(d2)
-    mine[:, parts[0].u.shape[1] :] ^= True
     Q = _faded(lines, (d1, d2), sigma) * light.astype(np.float32)[:, None]
     slope_a, slope_b = (g.astype(np.float32) for g in slopes)
     value = np.asarray(value - u * slope_a[:, :1] - v * slope_a[:, 1:], dtype=np.float32)
     relative = slope_b / contrast.astype(np.float32)[:, None]
     gain = 1 + u * relative[:, :1] + v * relative[:, 1:]
     rho = (lines[0].normal * lines[1].normal).sum(axis=1).astype(np.float32)[:, None]
-    used = (inside & mine).astype(np.float32)
+    used = inside.astype(np.float32)
     beyond = np.maximum(parts[0].beyond, parts[1].beyond)
     return VertexData(s1, d1, s2, d2, value, gain, Q, rho, used, beyond)
 
