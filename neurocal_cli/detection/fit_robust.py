@@ -19,11 +19,14 @@ _STEPS = 25
 _SHIFT_PRIOR = 1e-2  # 1/px^2
 _TINY = 1e-300
 _BELIEF = 20  # rows' worth of belief that variances are what they claim to be
-_SETTLED = 0.1  # of chi2
+_CREEPING = 5e-3  # of chi2; what is gained so slowly is not worth the steps
+_SETTLED = 0.2  # of chi2
 _DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
 _TUKEY = 6.0  # standard deviations beyond which a row counts as an outlier
-# A richer form must lower the chi2 by so much for each of its parameters; chance alone gives 1.
-_PRICE = 3.0
+# A richer form must lower the chi2 by so much for each of its parameters; chance alone gives 1. Residuals far
+# above the noise are those of a board that is uneven by itself: its form is not smooth, and not for a
+# polynomial to follow, so that more is asked.
+_PRICE, _UNEVEN_PRICE = 2.25, 3.0
 _BARREN = 2  # richer forms without gain after which the search ends
 
 
@@ -60,6 +63,12 @@ class Rows:
             np.zeros((2 * n, shifts)),
         )
 
+    @property
+    def telling(self) -> NDArray[np.bool_]:
+        """(N,) rows that tell something about the map; anchors, which may be more than half, do not."""
+        typical = np.sort(self.variance)[len(self.variance) // 4]
+        return np.asarray(self.variance < 100 * typical)
+
     def and_(self, other: Rows) -> Rows:
         """Both together."""
         names = ("grid", "direction", "value", "variance", "shift")
@@ -95,6 +104,11 @@ class MapFit:
     chi2: float
     excess: float
 
+    @property
+    def form(self) -> int:
+        """Index of the map's form."""
+        return FORMS.index((self.map.radial, self.map.degree))
+
 
 def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> MapFit:
     """Levenberg-Marquardt steps with Tukey's weights, from a start that is nearly right.
@@ -115,8 +129,8 @@ def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> 
     rows_there = _Rows.of(start, rows)
     residual, jacobian = rows_there.residual(start, shift, free)
     # Before the first step everything may be off, the shifts above all.
-    precision = 1 / rows.variance
-    weight, damping = precision, _DAMPING
+    precision, telling = 1 / rows.variance, rows.telling
+    weight, damping, least = precision, _DAMPING, 0.0
     for _ in range(steps):
         normal = (jacobian * weight) @ jacobian.T
         gradient = jacobian @ (weight * residual) - prior * values
@@ -128,18 +142,20 @@ def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> 
         before = weight @ residual**2 + prior @ values**2
         after = weight @ ahead**2 + prior @ moved**2
         if not after <= before:
-            damping *= 10
+            # Where parameters can stand in for one another, it would be so again.
+            damping = least = 10 * damping
             continue
         start, values, residual, jacobian = tried, moved, ahead, slopes
-        damping *= 0.1
+        damping = max(0.1 * damping, least)
         z = residual * rows_there.steep
-        weight = _tukey(z / _scale(z)) * precision
-        if before - after < _SETTLED and damping < _DAMPING:
+        scale = _scale(z[telling])
+        weight = _tukey(z / scale) * precision
+        if before - after < max(_SETTLED * scale**2, _CREEPING * after) and damping <= _DAMPING:
             break
-    return _finished(start, rows, values[m:], residual, jacobian)
+    return _finished(start, rows, telling, values[m:], residual, jacobian)
 
 
-def choose_map(start: SmoothMap, rows: Rows, shift: Array, enough: float = 0.0) -> MapFit:
+def choose_map(start: SmoothMap, rows: Rows, shift: Array, enough: float = 0.0, least: int = 0) -> MapFit:
     """The map of the simplest form that the rows do not contradict.
 
     Parameters
@@ -150,21 +166,30 @@ def choose_map(start: SmoothMap, rows: Rows, shift: Array, enough: float = 0.0) 
     shift : (K,) array [px]
     enough : float
         Chi2 per row with which no richer form is tried.
+    least : int
+        Index of the simplest form that is tried.
     """
     best: MapFit | None = None
-    barren, now, worth = 0, start, np.inf
-    for radial, degree in FORMS:
+    barren, now, paid = 0, start, 0
+    telling, precision = rows.telling, 1 / np.sqrt(rows.variance)
+    n_telling = int(telling.sum())
+    for radial, degree in FORMS[least:]:
         now = now.shaped(radial, degree)
-        if best is not None and len(now.free) + len(shift) > 0.5 * len(rows.value):
+        if best is not None and len(now.free) + len(shift) > 0.5 * n_telling:
             break
         fit = fit_map(now, rows, shift)
         now, shift = fit.map, fit.shift
-        cost = _loss(fit.residual / np.sqrt(rows.variance)) + _PRICE * len(now.free)
-        if best is None or cost < worth:
-            best, worth, barren = fit, cost, 0
+        z, count = fit.residual * precision, len(now.free)
+        scale = _scale(z[telling])
+        loss = _loss(z / scale)
+        excess = max(1.0, loss / max(n_telling - count, 1))
+        chance = _PRICE / scale**2
+        price = max(chance, _UNEVEN_PRICE - chance) * excess * (count - paid)
+        if best is None or _loss(best.residual * precision / scale) - loss > price:
+            best, paid, barren = fit, count, 0
         else:
             barren += 1
-        if barren >= _BARREN or cost < enough * len(rows.value):
+        if barren >= _BARREN or loss * scale**2 + _PRICE * count < enough * len(rows.value):
             break
     assert best is not None
     return best
@@ -178,7 +203,7 @@ def median(x: Array) -> float:
 
 def _loss(z: Array) -> float:
     """Chi2 that grows no more beyond what no good row reaches."""
-    return float(np.minimum(z * z, 1e4).sum())
+    return float(np.minimum(z * z, 100.0).sum())
 
 
 def _tukey(z: Array) -> Array:
@@ -222,10 +247,17 @@ def _solved(normal: Array, gradient: Array, damping: float) -> Array:
     return np.asarray(size * np.linalg.solve(scaled, gradient * size))
 
 
-def _finished(now: SmoothMap, rows: Rows, shift: Array, residual: Array, jacobian: Array) -> MapFit:
+def _finished(
+    now: SmoothMap,
+    rows: Rows,
+    telling: NDArray[np.bool_],
+    shift: Array,
+    residual: Array,
+    jacobian: Array,
+) -> MapFit:
     free = now.free
     z = residual / np.sqrt(rows.variance)
-    weight = _tukey(z / _scale(z))
+    weight = _tukey(z / _scale(z[telling]))
     good = weight > 0
     normal = (jacobian * (good / rows.variance)) @ jacobian.T
     normal[np.diag_indices_from(normal)] += np.concatenate(
@@ -233,9 +265,7 @@ def _finished(now: SmoothMap, rows: Rows, shift: Array, residual: Array, jacobia
     )
     size = 1 / np.sqrt(np.maximum(np.diag(normal), _TINY))
     inverse = np.linalg.inv(normal * size[:, None] * size) * size[:, None] * size
-    # Anchors may be more than half of the rows, and tell nothing.
-    typical = float(np.sort(rows.variance)[len(z) // 4])
-    telling = good & (rows.variance < 100 * typical)
+    telling = good & telling
     left = int(telling.sum()) - len(free) - len(shift)
     excess = float((z[telling] ** 2).sum()) / max(left, 0.2 * len(z))
     shrunk = min(1.0, (excess * left + _BELIEF) / (left + _BELIEF)) if left > 0 else 1.0
