@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.fit_box import half_widths
 from neurocal_cli.detection.fit_edges import OFFSET, EdgeData, edge_data, fit_edges, moments, with_weight
 from neurocal_cli.detection.fit_gate import believable, smooth
 from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
@@ -37,6 +38,11 @@ _LEAST_VARIANCE = 1e-12  # px^2
 _NORMAL = 1.4826  # standard deviations in a median of absolute values
 _LEAST_SCALE = 0.1  # of the noise by the final residuals; less cannot be, the rounding being known
 _WIDEST = 12.0  # px, of the strips for moments
+_SHARP = 0.45  # px; blur below which the pixel's box is taken exactly
+_NEAREST_SHARP = 0.75  # px from the crossing lines, beyond which no pixel reaches over them
+_CLEARLY = 0.97  # of chi2, with which another profile than the pixel's box is believed
+_WORSE = 1.2  # of chi2, with which another blur is not
+_COLUMNS = 12  # of pixels along an edge before the last fit
 _BLUR_OFF = 0.1  # relative error of the blur that makes the first fit be done again
 _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations before anything is known
 
@@ -175,7 +181,7 @@ def _by_moments(board: Board, found: MapFit, shading: Shading) -> tuple[MapFit, 
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
     half = np.clip(half, 2.0, _WIDEST)
-    strips = gather(board.image, lines, half, 0.2 * lines.length, 2)
+    strips = gather(board.image, lines, half, 0.2 * lines.length, _stride(lines))
     offset, _, blur = moments(strips, half, *shading.at(lines.middle))
     sigma = float(np.clip(median(blur), 0.33, 0.25 * median(lines.width)))
     rows = board.rows(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
@@ -186,14 +192,14 @@ def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noi
     """Edges fitted with free levels, and the map through them."""
     lines = board.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
-    for _ in range(2):
-        data, fit, shape = _free_fit(board, lines, offset, sigma, shading, noise)
-        good = smooth(fit)
-        found = median(fit.values[good, BLUR]) if good.any() else sigma
-        # The blur decides what the lines that cross do to the pixels.
-        wrong, sigma = abs(found - sigma) > _BLUR_OFF * sigma, found
-        if not wrong:
-            break
+    free = _free_fit(board, lines, offset, sigma, shading, noise)
+    found = free.blur(sigma)
+    # The blur decides what the lines that cross do to the pixels.
+    if abs(found - sigma) > _BLUR_OFF * sigma or (found < _SHARP) != (sigma < _SHARP):
+        again = _free_fit(board, lines, offset, found, shading, noise)
+        free = again if again.rough < _WORSE * free.rough else free
+    data, fit, shape = free.data, free.fit, free.shape
+    good = smooth(fit)
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
     variance = np.where(good, variance, _ANCHOR**2)
@@ -202,22 +208,55 @@ def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noi
     return Fitted(lines, fit, data, chosen, shading, shape, Noise(noise, noise, noise), good)
 
 
+@dataclass(frozen=True, eq=False)
+class _Free:
+    """Fits with free levels."""
+
+    data: EdgeData
+    fit: Fit
+    shape: Shape
+
+    @property
+    def rough(self) -> float:
+        """Typical chi2 per pixel."""
+        return median(self.fit.chi2 / np.maximum(self.fit.count, 1))
+
+    def blur(self, otherwise: float) -> float:
+        """Typical blur [px]."""
+        good = smooth(self.fit)
+        return median(self.fit.values[good, BLUR]) if good.any() else otherwise
+
+
 def _free_fit(
     board: Board, lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
-) -> tuple[EdgeData, Fit, Shape]:
+) -> _Free:
     mean, contrast = shading.at(lines.middle)
     blur = np.full(len(mean), sigma)
-    data = _pixels(board, lines, blur, shading, _REACH * blur + _SLACK, 2)
+    data = _pixels(board, lines, blur, shading, _REACH * blur + _SLACK, _stride(lines))
     data = with_weight(data, np.full_like(data.weight, 1 / noise))
     known = np.stack([mean, contrast, blur], axis=-1)
     spread = known * [0.0, 0.0, _LOOSE_BLUR] + contrast[:, None] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
     prior = Prior(known, (1 / spread**2)[:, :, None] * np.eye(3))
-    tails = box_kurtosis(lines.normal, blur)[:, None] * [1.0, 0.0]
-    shape = Shape(tails, np.zeros(RESPONSE_TERMS))
     start = np.concatenate([offset[:, None], np.zeros((len(mean), 1)), known], axis=1)
-    fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, _STEPS)
-    shape = profile_shape(data, fit, shape, smooth(fit))
-    return data, fit_edges(data, fit.values, prior, 0.5 * lines.length, shape, _STEPS), shape
+    results = []
+    for shape in _blurred(lines, sigma):
+        fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, _STEPS)
+        shape = profile_shape(data, fit, shape, smooth(fit))
+        fit = fit_edges(data, fit.values, prior, 0.5 * lines.length, shape, _STEPS)
+        results.append(_Free(data, fit, shape))
+    # Both say the same where all edges run along the pixels: then it is the pixels' box.
+    return results[0] if results[0].rough < _CLEARLY * results[-1].rough else results[-1]
+
+
+def _blurred(lines: Lines, sigma: float) -> list[Shape]:
+    """Profiles of nothing but blur."""
+    none = np.zeros(RESPONSE_TERMS)
+    tails = box_kurtosis(lines.normal, np.full(len(lines.normal), sigma))
+    shapes = [Shape(tails[:, None] * [1.0, 0.0], none)]
+    if sigma < _SHARP:
+        # Cameras that sharpen their pictures leave edges that are no pixel's box any more.
+        shapes.append(Shape(np.zeros((len(tails), 2)), none, half_widths(lines.normal)))
+    return shapes
 
 
 def _last_fit(board: Board, first: Fitted) -> Fitted:
@@ -243,7 +282,9 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(smooth(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
-    mapped = fit_map(first.map.map, board.rows(lines, fit.values[:, OFFSET], trusted), first.map.shift)
+    rows = board.rows(lines, fit.values[:, OFFSET], trusted)
+    # Better edges may tell of a richer form.
+    mapped = choose_map(first.map.map, rows, first.map.shift, least=first.map.form)
     expected = variance + mapped.map.variance(board.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
     # A board that is uneven by itself, as paper is, departs from its map everywhere: no single edge is
@@ -254,13 +295,19 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     return Fitted(lines, fit, data, mapped, shading, shape, noise, good)
 
 
+def _stride(lines: Lines) -> int:
+    """Only every so manieth column of pixels is taken until the last fit: enough for a start."""
+    return max(2, int(median(lines.length) / _COLUMNS))
+
+
 def _pixels(
     board: Board, lines: Lines, sigma: Array, shading: Shading, reach: Array, stride: int
 ) -> EdgeData:
     half = np.minimum(reach, 0.5 * lines.width)
     strips = gather(board.image, lines, half, np.zeros(len(half)), stride)
     contrast = shading.at(lines.middle)[1]
-    return edge_data(strips, lines, sigma, shading.slopes(lines.middle), contrast, _NEAREST)
+    nearest = np.where(sigma < _SHARP, _NEAREST_SHARP / sigma, _NEAREST)
+    return edge_data(strips, lines, sigma, shading.slopes(lines.middle), contrast, nearest)
 
 
 def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Lines], NDArray[np.bool_]]:
@@ -276,6 +323,8 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     data = vertex_data(board.image, lines, light, sigma, _REACH, slopes, contrast)
     tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
     shape = Shape(tails, fitted.shape.bend)
+    if fitted.shape.half is not None:
+        shape = replace(shape, half=np.stack([half_widths(line.normal) for line in lines], axis=1))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     half = (0.5 * lines[0].length, 0.5 * lines[1].length)

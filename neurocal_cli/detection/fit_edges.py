@@ -12,13 +12,25 @@ sign(z) sign(t) gives erf erf + 4 rho phi phi + ... with rho the cosine between 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Linear, Prior, Shape, gauss_newton
-from neurocal_cli.detection.fit_profile import erf_and_density, profile, response
+from neurocal_cli.detection.fit_box import sharp_profile
+from neurocal_cli.detection.fit_newton import (
+    BLUR,
+    CONTRAST,
+    MEAN,
+    Fit,
+    Linear,
+    Part,
+    Prior,
+    Shape,
+    gauss_newton,
+)
+from neurocal_cli.detection.fit_profile import erf_and_density, response
 from neurocal_cli.detection.fit_strips import Lines, Strips
 from neurocal_cli.geometry import Array
 
@@ -58,6 +70,10 @@ class EdgeData:
     weight: Single
     beyond: Array
 
+    def part(self, which: Part) -> EdgeData:
+        """The pixels of some edges."""
+        return EdgeData(*(getattr(self, field.name)[which] for field in fields(self)))
+
 
 def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:
     """Offset, tilt and blur of edges in closed form, from anywhere in the strip.
@@ -91,7 +107,7 @@ def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> 
 
 
 def edge_data(
-    strips: Strips, lines: Lines, sigma: Array, slopes: tuple[Array, Array], contrast: Array, nearest: float
+    strips: Strips, lines: Lines, sigma: Array, slopes: tuple[Array, Array], contrast: Array, nearest: Array
 ) -> EdgeData:
     """Prepare pixels for fits.
 
@@ -105,7 +121,7 @@ def edge_data(
         Of A and B.
     contrast : (E,) array [DN]
         B where the slopes hold.
-    nearest : float
+    nearest : (E,) array
         Pixels nearer than so many sigma to the crossing lines are left out.
     """
     Q = np.ones_like(strips.s)
@@ -118,7 +134,7 @@ def edge_data(
         start = end * lines.tangent + 0.5 * lines.curvature[:, None] * end**2 * lines.normal
         shift = (start * lines.crossing[:, k]).sum(axis=1).astype(np.float32)
         t = (strips.u * crossing[:, :1] + strips.v * crossing[:, 1:] - shift[:, None]) * per_sigma
-        used &= t > nearest
+        used &= t > nearest.astype(np.float32)[:, None]
         near = t < 4.5
         fade, density = erf_and_density(t[near])
         Q[near] *= fade
@@ -153,10 +169,11 @@ def fit_edges(
     """
     lever = data.s / half_length.astype(np.float32)[:, None]
 
-    def model(values: Array) -> Linear:
-        return linearised(data, lever, values, shape)
+    def model_of(part: Part) -> Callable[[Array], Linear]:
+        pixels, levers, form = data.part(part), lever[part], shape.part(part)
+        return lambda values: linearised(pixels, levers, values, form)
 
-    return gauss_newton(model, start, prior, data.weight, steps)
+    return gauss_newton(model_of, start, prior, data.weight, steps)
 
 
 def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Linear:
@@ -165,24 +182,26 @@ def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Li
     z = data.d - offset
     z -= tilt * lever
     z /= sigma
-    E, slope, density = profile(z, shape.tails)
+    E, slope, widening, density = sharp_profile(z, sigma, shape.tails, shape.half)
+    widening *= data.Q
+    widening += z * z * density * data.R
     x = E * data.Q
     x += density * data.R
     slope *= data.Q
     slope -= z * density * data.R
+    factor = data.gain * (-contrast / sigma)
     if shape.bend.any():
         F, steep = response(x, shape.bend)
-        slope *= steep
+        factor *= steep
     else:
         F = x
-    slope *= data.gain
-    slope *= -contrast / sigma
+    slope *= factor
     jacobian = np.empty((len(z), 5, z.shape[1]), dtype=x.dtype)
     jacobian[:, OFFSET] = slope
     np.multiply(slope, lever, out=jacobian[:, TILT])
     jacobian[:, MEAN] = 1
     np.multiply(F, data.gain, out=jacobian[:, CONTRAST])
-    np.multiply(slope, z, out=jacobian[:, BLUR])
+    np.multiply(widening, -factor, out=jacobian[:, BLUR])
     residual = data.value - mean
     residual -= contrast * jacobian[:, CONTRAST]
     return Linear(jacobian, residual, z, x)

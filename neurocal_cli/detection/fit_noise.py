@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_edges import EdgeData
+from neurocal_cli.detection.fit_edges import OFFSET, EdgeData
 from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
 from neurocal_cli.detection.fit_profile import (
     RESPONSE_TERMS,
@@ -106,8 +106,8 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     tail_terms(z, density, out=tails)
     tails *= steep[:, None]
     response_terms(x, scale, out=bends)
-    np.multiply(density, steep, out=others[:, 0])
-    np.multiply(others[:, 0], z, out=others[:, 1])
+    others[:, 0] = fit.linear.jacobian[:, OFFSET][some]
+    others[:, 1] = fit.linear.jacobian[:, BLUR][some]
     np.multiply(x, scale, out=others[:, 2])
     others[:, 3] = 1
     weighted = columns * data.weight[some][:, None]
@@ -120,7 +120,8 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     right[: len(known)] -= believed * known
     normal[range(len(known)), range(len(known))] += believed
     change = np.linalg.solve(normal, right)
-    return Shape(shape.tails + change[:2], shape.bend + change[2 : 2 + RESPONSE_TERMS])
+    bend = shape.bend + change[2 : 2 + RESPONSE_TERMS]
+    return replace(shape, tails=shape.tails + change[:2], bend=bend)
 
 
 def blur_of(fit: Fit, good: NDArray[np.bool_]) -> tuple[float, float]:

@@ -27,6 +27,7 @@ __all__ = [
     "response",
     "response_terms",
     "tail_terms",
+    "tails_of",
 ]
 
 Real = NDArray[np.floating]
@@ -81,15 +82,22 @@ def profile(z: Real, tails: Real) -> tuple[Real, Real, Real]:
     """
     value, density = erf_and_density(z)
     slope = 2 * density
-    third, fifth = (tails[:, k, None].astype(z.dtype) for k in (0, 1))
-    if third.any() or fifth.any():
-        square = z * z
-        # d/dz phi He_k = -phi He_{k+1}
-        value += density * z * (third * (square - 3) + fifth * (square * (square - 10) + 15))
-        steep = third * (square * (square - 6) + 3)
-        steep += fifth * (square * (square * (square - 15) + 45) - 15)
-        slope -= density * steep
+    if tails.any():
+        more, steeper = tails_of(z, density, tails)
+        value += more
+        slope += steeper
     return value, slope, density
+
+
+def tails_of(z: Real, density: Real, tails: Real) -> tuple[Real, Real]:
+    """What tails (E, 2) add to a profile at z (E, N), and its derivative."""
+    third, fifth = (tails[:, k, None].astype(z.dtype) for k in (0, 1))
+    square = z * z
+    # d/dz phi He_k = -phi He_{k+1}
+    value = density * z * (third * (square - 3) + fifth * (square * (square - 10) + 15))
+    steep = third * (square * (square - 6) + 3)
+    steep += fifth * (square * (square * (square - 15) + 45) - 15)
+    return value, -density * steep
 
 
 def tail_terms(z: Real, density: Real, out: Real) -> None:

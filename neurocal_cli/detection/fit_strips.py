@@ -144,14 +144,14 @@ def gather(
     count = int(np.ceil((2 * reach.max() + 1) / stride))
     first = np.ceil(centre[:, 0] - reach)
     column = first[:, None] + stride * np.arange(count)
-    a = column - middle[:, :1]
+    a: Array = column - middle[:, :1]
     along = a / t[:, :1]
     # The chord's height over the tangent, to the first order: columns are cut straight.
     height = middle[:, 1:] + along * t[:, 1:] + 0.5 * lines.curvature[:, None] * along**2 / n[:, 1:]
     spread = half_width / np.abs(t[:, 0])
     rows = int(np.ceil(2 * spread.max() + 1))
     top = np.ceil(height - spread[:, None])
-    window = _Window(column, top, rows, a, top - middle[:, 1:])
+    window = _Window(np.asarray(column, dtype=float), top, rows, a, top - middle[:, 1:])
     s, d = window.seen_along(t), window.seen_along(n)
     d -= _column(0.5 * lines.curvature) * s * s
     inside = np.abs(d) <= _column(half_width)
@@ -162,14 +162,14 @@ def gather(
         inside &= framed
     used = inside.sum(axis=1)
     index, inside = packed(inside, used)
-    a, b = window.relative(index)
+    along_columns, down = window.relative(index)
     return Strips(
         s=s.reshape(-1)[index],
         d=d.reshape(-1)[index],
         value=image.reshape(-1).take(window.places(steep, image.shape[1], index), mode="clip").astype("f4"),
         inside=inside,
-        u=np.where(steep[:, None], b, a),
-        v=np.where(steep[:, None], a, b),
+        u=np.where(steep[:, None], down, along_columns),
+        v=np.where(steep[:, None], along_columns, down),
         beyond=1 - used / np.maximum(total, 1),
     )
 
@@ -223,7 +223,7 @@ class _Window:
         """(E, C rows) coordinates along directions (E, 2) from the middle."""
         first = (self.a * way[:, :1] + self.b * way[:, 1:]).astype(np.float32)
         down = _column(way[:, 1]) * np.arange(self.rows, dtype=np.float32)
-        return (first[:, :, None] + down[:, None]).reshape(len(way), -1)
+        return np.asarray((first[:, :, None] + down[:, None]).reshape(len(way), -1), dtype=np.float32)
 
     def framed(self, steep: NDArray[np.bool_], size: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """(E, C rows) which pixels lie in an image of (height, width); None if all do."""
@@ -247,5 +247,5 @@ class _Window:
         """Coordinates of packed pixels relative to the line's middle, along the columns' way and down."""
         a, b = self.a.astype(np.float32), self.b.astype(np.float32)
         every = np.repeat(a.reshape(-1), self.rows)
-        down = b[:, :, None] + np.arange(self.rows, dtype=np.float32)
+        down = np.asarray(b[:, :, None] + np.arange(self.rows, dtype=np.float32), dtype=np.float32)
         return every[index], down.reshape(-1)[index]

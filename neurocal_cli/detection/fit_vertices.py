@@ -11,14 +11,16 @@ the two lines, each taking the pixels that are nearer to its own line: all that 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.fit_box import sharp_profile
 from neurocal_cli.detection.fit_map import SmoothMap
-from neurocal_cli.detection.fit_newton import Fit, Linear, Prior, Shape, gauss_newton
-from neurocal_cli.detection.fit_profile import erf_and_density, profile, response
+from neurocal_cli.detection.fit_newton import Fit, Linear, Part, Prior, Shape, gauss_newton
+from neurocal_cli.detection.fit_profile import erf_and_density, response
 from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines, packed
 from neurocal_cli.geometry import Array
 
@@ -62,6 +64,10 @@ class VertexData:
     rho: Single
     weight: Single
     beyond: Array
+
+    def part(self, which: Part) -> VertexData:
+        """The pixels of some vertices."""
+        return VertexData(*(getattr(self, field.name)[which] for field in fields(self)))
 
 
 def vertex_lines(at: SmoothMap, grid: Array) -> tuple[Lines, Lines]:
@@ -165,10 +171,12 @@ def fit_vertices(
         data.s2 / half_length[1].astype(np.float32)[:, None],
     )
 
-    def model(values: Array) -> Linear:
-        return linearised(data, levers, values, shape)
+    def model_of(part: Part) -> Callable[[Array], Linear]:
+        pixels, form = data.part(part), shape.part(part)
+        some = (levers[0][part], levers[1][part])
+        return lambda values: linearised(pixels, some, values, form)
 
-    return gauss_newton(model, start, prior, data.weight, steps)
+    return gauss_newton(model_of, start, prior, data.weight, steps)
 
 
 def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, shape: Shape) -> Linear:
@@ -178,15 +186,17 @@ def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, s
     )
     z1 = (data.d1 - offset1 - tilt1 * levers[0]) / sigma
     z2 = (data.d2 - offset2 - tilt2 * levers[1]) / sigma
-    E1, slope1, density1 = profile(z1, shape.tails)
-    E2, slope2, density2 = profile(z2, shape.tails)
+    halves = (None, None) if shape.half is None else (shape.half[:, 0], shape.half[:, 1])
+    E1, slope1, widening1, density1 = sharp_profile(z1, sigma, shape.tails, halves[0])
+    E2, slope2, widening2, density2 = sharp_profile(z2, sigma, shape.tails, halves[1])
     rho = data.rho
     # The tetrachoric series of two correlated normal variables, to the second order.
     both = 4 * rho * density1 * density2
     series = both * (1 + 0.5 * rho * z1 * z2)
     x = (E1 * E2 + series) * data.Q
-    by_z1 = (slope1 * E2 - z1 * series + 0.5 * both * rho * z2) * data.Q
-    by_z2 = (slope2 * E1 - z2 * series + 0.5 * both * rho * z1) * data.Q
+    bent1, bent2 = 0.5 * both * rho * z2 - z1 * series, 0.5 * both * rho * z1 - z2 * series
+    by_z1, by_z2 = (slope1 * E2 + bent1) * data.Q, (slope2 * E1 + bent2) * data.Q
+    widening = (widening1 * E2 + E1 * widening2 - z1 * bent1 - z2 * bent2) * data.Q
     F, steep = response(x, shape.bend)
     factor = -contrast / sigma * steep * data.gain
     by_z1 *= factor
@@ -196,7 +206,7 @@ def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, s
     jacobian[:, SECOND], jacobian[:, SECOND + 1] = by_z2, by_z2 * levers[1]
     jacobian[:, 4] = 1
     jacobian[:, 5] = F * data.gain
-    jacobian[:, 6] = by_z1 * z1 + by_z2 * z2
+    jacobian[:, 6] = -factor * widening
     residual = data.value - mean - contrast * jacobian[:, 5]
     z = np.where(np.abs(z1) < np.abs(z2), z1, z2)
     return Linear(jacobian, residual, z, x)

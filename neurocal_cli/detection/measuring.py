@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fit_board import Board, Fitted, fit_all_vertices, fit_board
+from neurocal_cli.detection.fit_box import sharp_profile
 from neurocal_cli.detection.fit_edges import OFFSET, TILT
 from neurocal_cli.detection.fit_newton import BLUR
-from neurocal_cli.detection.fit_profile import profile, response
+from neurocal_cli.detection.fit_profile import response
 from neurocal_cli.detection.fit_robust import median
 from neurocal_cli.detection.fit_vertices import FIRST, SECOND
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
@@ -111,11 +112,13 @@ def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
 def _polarity(fitted: Fitted) -> float:
     """How far towards the dark side [px] the middle between the levels lies from the undisturbed edge."""
     z = np.linspace(-_FAR, _FAR, _PLACES)[None]
-    light = response(profile(z, fitted.shape.tails[:1])[0], fitted.shape.bend)[0][0]
+    sigma = median(fitted.fit.values[:, BLUR])
+    half = None if fitted.shape.half is None else fitted.shape.half[:1]
+    edge = sharp_profile(z, np.array([[sigma]]), fitted.shape.tails[:1], half)[0]
+    light = response(edge, fitted.shape.bend)[0][0]
     after = max(int(np.argmax(light > 0)), 1)
     share = light[after] / (light[after] - light[after - 1])
     zero = z[0, after] - share * (z[0, 1] - z[0, 0])
-    sigma = median(fitted.fit.values[:, BLUR])
     return -float(fitted.map.shift[0]) - float(zero) * sigma
 
 
