@@ -203,6 +203,8 @@ RECIPES: dict[str, Recipe] = {
     "noise 0.5": Recipe(noise=0.5),
     "noise 5": Recipe(noise=5),
     "noise 12": Recipe(noise=12),
+    "psf 0.15": Recipe(psf=0.15),
+    "straight, psf 0.15": Recipe(psf=0.15, tilt=0, roll=1),  # edges along the pixels
     "psf 0.5": Recipe(psf=0.5),
     "psf 2": Recipe(psf=2),
     "psf 3": Recipe(psf=3),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Grid
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.rendering import edge_bound
 
-PHOTOS = Path(__file__).resolve().parents[2] / "shared" / "data" / "opencv_stereo"
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+PHOTOS = DATA / "opencv_stereo"
+LARGE = DATA / "line_pattern" / "chessboard.jpg"
 
 # Conditions in which the bound is to be met within a fifth, and those where a factor of two is allowed:
 # blur as wide as the squares, unknown responses, clipped light, hardly any pixels.
@@ -21,6 +24,8 @@ BEST = (
     "noise 0.5",
     "noise 5",
     "noise 12",
+    "psf 0.15",
+    "straight, psf 0.15",
     "psf 0.5",
     "poisson",
     "tilt 0",
@@ -66,6 +71,13 @@ def test_midpoints_reach_the_bound(name: str) -> None:
     assert 0.7 < found_errors.normalised < 1.4  # two pictures: wider than for eight
     assert found_errors.kept == 1
     assert found_errors.rms < 0.0036
+
+
+@pytest.mark.parametrize("points", ["midpoints", pytest.param("vertices", marks=pytest.mark.slow)])
+def test_edges_sharper_than_a_pixel_reach_the_bound(points: Literal["midpoints", "vertices"]) -> None:
+    found_errors = errors("straight, psf 0.15", range(1), points)
+    assert found_errors.ratio < 1.3  # five times as much if the pixel's box is taken for a Gaussian
+    assert found_errors.kept == 1
 
 
 def test_vertices_reach_the_bound() -> None:
@@ -224,6 +236,16 @@ def test_occluders_in_many_pictures() -> None:
     assert found_errors.kept >= 0.99
     assert found_errors.rms < 0.0035
     assert found_errors.hidden_kept <= 8
+
+
+@pytest.mark.skipif(not LARGE.is_file(), reason="needs the photograph")
+def test_edges_of_a_sharp_photograph_settle() -> None:
+    cv2 = pytest.importorskip("cv2")
+    finding = pytest.importorskip("neurocal_cli.detection.finding")
+    image = cv2.imread(str(LARGE), 0)
+    measured = measure(image, finding.find_grids(image)[0])
+    assert len(measured.kind) + measured.rejected == 1739  # of 36 x 25 vertices
+    assert measured.rejected < 0.06 * 1739
 
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason="needs the photographs")
