@@ -46,8 +46,6 @@ MODELS = {
 }
 
 _TINY = 1e-12  # squared radius below which a fisheye is its own tangent
-_NEWTON_STEPS = 50
-_INVERSE_TOLERANCE = 1e-14
 
 
 def coefficient_names(model: str) -> tuple[str, ...]:
@@ -208,7 +206,7 @@ def _bend_fisheye(
 
 
 def undistort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
-    """Straighten bent points, the inverse of `distort`, by damped Newton steps.
+    """Straighten bent points, the inverse of `distort` within the lens's first fold.
 
     Parameters
     ----------
@@ -222,47 +220,9 @@ def undistort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, A
     x, y : arrays of that shape
         ``nan`` where no straight point bends to the given one.
     """
-    x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    sx, sy = x.copy(), y.copy()
-    with np.errstate(all="ignore"):
-        if model == "fisheye":
-            # The start within the hemisphere that the model can see.
-            r = np.hypot(x, y)
-            stretch = np.tan(np.minimum(r, 1.4)) / np.maximum(r, 1e-300)
-            sx, sy = np.where(r > 0, x * stretch, x), np.where(r > 0, y * stretch, y)
-        (bx, by), J, _ = bend(model, k, sx, sy)
-        error = np.hypot(bx - x, by - y)
-        for _ in range(_NEWTON_STEPS):
-            if np.nanmax(error, initial=0.0) < _INVERSE_TOLERANCE:
-                break
-            det = J[0] * J[3] - J[1] * J[2]
-            step_x = (J[3] * (x - bx) - J[1] * (y - by)) / det
-            step_y = (J[0] * (y - by) - J[2] * (x - bx)) / det
-            sx, sy, (bx, by), J, error = _shortened(model, k, (x, y), (sx, sy), (step_x, step_y), error)
-        good = error < 1e-9 * (1 + np.hypot(x, y))
-    return np.where(good, sx, np.nan), np.where(good, sy, np.nan)
+    from neurocal_cli.lens_domain import straightened  # which is made of the models here
 
-
-def _shortened(
-    model: str,
-    k: Coefficients,
-    target: tuple[Array, Array],
-    start: tuple[Array, Array],
-    step: tuple[Array, Array],
-    error: Array,
-) -> tuple[Array, Array, tuple[Array, Array], tuple[Array, Array, Array, Array], Array]:
-    """One step for each point, halved until it lowers the point's error."""
-    length = np.where(np.isfinite(step[0] + step[1]), 1.0, 0.0)
-    whole = np.where(length > 0, step[0], 0.0), np.where(length > 0, step[1], 0.0)
-    for _ in range(6):
-        sx, sy = start[0] + length * whole[0], start[1] + length * whole[1]
-        bent, J, _ = bend(model, k, sx, sy)
-        new = np.hypot(bent[0] - target[0], bent[1] - target[1])
-        worse = ~(new <= error)
-        if not worse.any():
-            break
-        length = np.where(worse, 0.5 * length, length)
-    return sx, sy, bent, J, new
+    return straightened(Lens(model, np.asarray(k, dtype=float)), x, y)
 
 
 def fold_radius(model: str, k: Coefficients, largest: float) -> float:

@@ -63,8 +63,8 @@ def is_seen(lens: Lens, x: Array, y: Array) -> NDArray[np.bool_]:
 def straightened(lens: Lens, x: Array, y: Array) -> tuple[Array, Array]:
     """Take a lens off normalised points, within its first fold.
 
-    Newton's method from where the lens without its tangential terms has the point. Unlike `undistort`
-    it never finds a point beyond the fold, nor loses one before it.
+    Newton's method from where the lens without its tangential terms has the point, so that no point
+    beyond the fold is found, nor one before it lost.
 
     Parameters
     ----------

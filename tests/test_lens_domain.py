@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_lens import LENSES
 
-from neurocal_cli.lens import Lens, bend, distort
+from neurocal_cli.geometry import Array
+from neurocal_cli.lens import Lens, bend, distort, undistort
 from neurocal_cli.lens_domain import first_fold, is_seen, straightened
 
 SPREAD = {
@@ -20,25 +23,28 @@ SPREAD = {
 }
 
 
+def without_tangential(model: str, k: Array) -> Array:
+    """Near a fold, where hardly anything is left of the slope, tangential terms make one of their own."""
+    return k * [1, 1, 0, 0, 1, 1, 1, 1][: len(k)] if model in ("plumb_bob", "rational") else k
+
+
 @given(st.sampled_from(list(SPREAD)), st.integers(0, 2**32 - 1))
 @settings(max_examples=150, deadline=None)
 def test_whatever_a_lens_sees_comes_back(model: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    lens = Lens(model, rng.normal(size=len(SPREAD[model])) * SPREAD[model])
+    lens = Lens(model, without_tangential(model, rng.normal(size=len(SPREAD[model])) * SPREAD[model]))
     r, angle = rng.uniform(0, min(0.95 * first_fold(lens), 2.0), 100), rng.uniform(0, 2 * np.pi, 100)
     x, y = r * np.cos(angle), r * np.sin(angle)
     back = np.array(straightened(lens, *distort(model, lens.coefficients, x, y)))
-    seen = is_seen(lens, x, y)
-    assert back[:, seen] == pytest.approx(np.array([x, y])[:, seen], abs=1e-8)
+    assert is_seen(lens, x, y).all()
+    assert back == pytest.approx(np.array([x, y]), abs=1e-8)
 
 
 @given(st.sampled_from(list(SPREAD)), st.integers(0, 2**32 - 1))
 @settings(max_examples=100, deadline=None)
 def test_the_slope_is_positive_up_to_the_fold_and_not_beyond(model: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
-    k = rng.normal(size=len(SPREAD[model])) * SPREAD[model]
-    if model in ("plumb_bob", "rational"):
-        k[2:4] = 0.0
+    k = without_tangential(model, rng.normal(size=len(SPREAD[model])) * SPREAD[model])
     fold = first_fold(Lens(model, k))
     r = np.linspace(0, min(fold, 50.0), 300)[1:-1]
     with np.errstate(all="ignore"):
@@ -70,7 +76,10 @@ def test_a_pole_of_the_rational_lens_is_a_fold() -> None:
 
 def test_false_points_beyond_the_fold_are_not_found() -> None:
     """With k2 < 0 as well a pixel outside of everything is the image of a point on the other side."""
-    lens = Lens("k1k2", [-0.3, -0.1])
-    x, _ = straightened(lens, np.array([0.3, 4.0]), np.zeros(2))
-    assert np.isfinite(x[0])
-    assert np.isnan(x[1])
+    for inverse in (
+        lambda *p: straightened(Lens("k1k2", [-0.3, -0.1]), *p),
+        partial(undistort, "k1k2", [-0.3, -0.1]),
+    ):
+        x, _ = inverse(np.array([0.3, 4.0]), np.zeros(2))
+        assert np.isfinite(x[0])
+        assert np.isnan(x[1])
