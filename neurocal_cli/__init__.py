@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from neurocal_cli.remapping import undistort_image
     from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
     from neurocal_cli.stereo.fitting import fit_rig
+    from neurocal_cli.stereo.methods import calibrate_stereo
     from neurocal_cli.stereo.rig import Rig
     from neurocal_cli.stereo.triangulation import triangulate
     from neurocal_cli.undistortion import undistort_points
@@ -40,6 +41,7 @@ _HOMES = {
     "Pose": "camera",
     "Rig": "stereo.rig",
     "calibrate": "methods",
+    "calibrate_stereo": "stereo.methods",
     "detect_points": "detection.detect",
     "evaluate_camera": "evaluation",
     "evaluate_rig": "stereo.evaluation",
@@ -67,6 +69,7 @@ __all__ = [
     "Pose",
     "Rig",
     "calibrate",
+    "calibrate_stereo",
     "detect_points",
     "evaluate_camera",
     "evaluate_rig",

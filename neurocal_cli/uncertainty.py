@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.arrowhead import inverse_scaled
 from neurocal_cli.geometry import Array
 from neurocal_cli.pixel_error import POSE, camera_columns
 
 __all__ = ["Covariance", "covariance"]
-
-_ROUNDING = 1e-30  # an eigenvalue this far below the diagonal is not there
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,10 +63,10 @@ def covariance(
     if not free_pose:
         if shared is not None:
             return Covariance(shared, np.zeros((V, 6, 6)), 1.0)
-        inverse, smallest = _inverse(U, U)
+        inverse, smallest = inverse_scaled(U, U)
         return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
     B = normal[:, POSE, POSE]
-    B_inverse, smallest = _inverse(B, B)
+    B_inverse, smallest = inverse_scaled(B, B)
     if not f.size:
         return Covariance(np.zeros((0, 0)), variance * B_inverse, smallest)
     C = normal[:, f, POSE]  # (V, f, 6)
@@ -75,24 +74,6 @@ def covariance(
     if shared is not None:
         return Covariance(shared, variance * B_inverse + np.swapaxes(gain, 1, 2) @ shared @ gain, smallest)
     S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
-    S_inverse, smallest_shared = _inverse(S, U)
+    S_inverse, smallest_shared = inverse_scaled(S, U)
     poses = B_inverse + np.swapaxes(gain, 1, 2) @ S_inverse @ gain
     return Covariance(variance * S_inverse, variance * poses, min(smallest, smallest_shared))
-
-
-def _inverse(H: Array, reference: Array) -> tuple[Array, float]:
-    """Inverse of symmetric matrices, and their smallest eigenvalue relative to `reference`'s diagonal.
-
-    The inverse is nan and the eigenvalue 0 where a matrix is singular.
-    """
-    scale = 1.0 / np.sqrt(np.diagonal(reference, axis1=-2, axis2=-1) + 1e-300)
-    outer = scale[..., :, None] * scale[..., None, :]
-    scaled = H * outer
-    if not np.isfinite(scaled).all():
-        return np.full_like(H, np.nan), 0.0
-    values, vectors = np.linalg.eigh(scaled)
-    smallest = float(values.min(initial=1.0))
-    if smallest < _ROUNDING:
-        return np.full_like(H, np.nan), 0.0
-    inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return inverse * outer, smallest

@@ -58,6 +58,51 @@ def flat_views() -> Correspondences:
     )
 
 
+RIG = Pose.from_euler(0.01, 0.08, -0.005, np.array([-119.0, 1.5, 8.0]))  # X_right = R X_left + t
+STEREO_CAMERAS = Intrinsics(812.0, 809.0, 322.5, 236.0), Intrinsics(818.0, 815.0, 315.0, 243.5)
+
+
+def stereo_views() -> tuple[Correspondences, Correspondences]:
+    """Six pairs of views of a flat board of 9 x 6 vertices, 25 mm squares: 93 mid-points each."""
+    ids, world = Board.single(9, 6, 25.0).planes[0].midpoints()
+    rng = np.random.default_rng(6)
+    centre = world.mean(axis=0)
+    poses = [Pose(p.R, p.t + np.array([25.0, 0.0, 120.0])) for p in tilted_poses(centre, 6, rng)]
+    sides = []
+    for name, camera, rig in zip(("left", "right"), STEREO_CAMERAS, (None, RIG), strict=True):
+        pixels = []
+        for pose in poses:
+            seen_from = pose if rig is None else Pose(rig.R @ pose.R, rig.R @ pose.t + rig.t)
+            pixels.append(seen(camera, seen_from, world, (640, 480), rng))
+        sides.append(
+            Correspondences(
+                np.tile(world, (len(poses), 1)),
+                np.concatenate(pixels),
+                view=np.repeat([f"{name}{k + 1:02d}" for k in range(len(poses))], len(world)),
+                point=np.tile(ids, len(poses)),
+                image_size=(640, 480),
+            )
+        )
+    return sides[0], sides[1]
+
+
+def matches() -> str:
+    """Pixels of five points at known places, the last one with a wrong partner."""
+    X = np.array([[0, 0, 600], [50, -40, 600], [-60, 30, 700], [20, 80, 800], [0, 0, 600]], dtype=float)
+    rng = np.random.default_rng(7)
+    still = Pose(np.eye(3), np.zeros(3))
+    left, right = (
+        seen(camera, pose, X, (640, 480), rng)
+        for camera, pose in zip(STEREO_CAMERAS, (still, RIG), strict=True)
+    )
+    right[-1, 1] += 8.0
+    rows = [
+        f"{name}," + ",".join(f"{x:.4f}" for x in row)
+        for name, row in zip("abcde", np.hstack([left, right]).tolist(), strict=True)
+    ]
+    return "\n".join(["point,uL,vL,uR,vR", *rows, ""])
+
+
 def tilted_poses(centre: np.ndarray, n: int, rng: np.random.Generator) -> Iterator[Pose]:
     """Poses that tilt the board 20-40 degrees to all sides, its centre near the image's."""
     for k in range(n):
@@ -81,3 +126,6 @@ def seen(
 if __name__ == "__main__":
     write_points(corner(), str(HERE / "points.csv"))
     write_points(flat_views(), str(HERE / "flat.csv"))
+    for side, points in zip(("left", "right"), stereo_views(), strict=True):
+        write_points(points, str(HERE / f"stereo_{side}.csv"))
+    (HERE / "matches.csv").write_text(matches())

@@ -120,7 +120,7 @@ def test_ids_that_name_different_places_are_refused() -> None:
 def test_coordinates_in_another_unit_have_nothing_in_common() -> None:
     left, right = two_cameras()
     away = right.select(np.abs(right.world).min(axis=1) >= 0)
-    assert "no point in common, by X, Y, Z" in refusal(left, replace(away, world=away.world + 0.1))
+    assert "have no point in common, by X, Y, Z" in refusal(left, replace(away, world=away.world + 0.1))
 
 
 def test_several_points_at_one_place_are_refused() -> None:

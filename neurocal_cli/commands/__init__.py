@@ -27,6 +27,7 @@ _SUMMARIES = {
     "calibrate": "Calibrate a camera from known points and the pixels where they were seen.",
     "detect": "Find chessboards in images and measure the mid-points of their squares' edges.",
     "evaluate": "Measure how good a result is.",
+    "stereo": "Calibrate two cameras and how the right one stands to the left, X_right = R X_left + t.",
     "triangulate": "Find points in space from their pixels in the left and the right image.",
     "undistort": "Take a lens's distortion off images and points.",
     "man": None,
@@ -132,6 +133,7 @@ def neurocal() -> None:
       neurocal calibrate points.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
       cat points.csv | neurocal calibrate - | neurocal evaluate camera -
-      neurocal triangulate left.yaml right.yaml matches.csv -o xyz.csv
+      neurocal stereo left.csv right.csv -o rig.yaml
+      neurocal triangulate rig.yaml matches.csv -o xyz.csv
       neurocal detect left*.png --cols 9 --rows 6 --square 25 -o points.csv
     """  # noqa: D301 - click's mark of a paragraph not to be wrapped

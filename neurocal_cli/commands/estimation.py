@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
     from neurocal_cli.training.backprop import BackpropOptions
 
-__all__ = ["Estimation", "estimation_options", "given_camera"]
+__all__ = ["Estimation", "estimation_options", "estimation_options_without_files", "given_camera"]
 
 _BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
 
@@ -165,18 +165,45 @@ def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, C
 
 def estimation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of `Estimation` to a command, which gets them as the keyword ``estimation``."""
+    return _collecting(command, [*_OPTIONS[:_BEFORE_GIVEN], *_GIVEN, *_OPTIONS[_BEFORE_GIVEN:]])
+
+
+def estimation_options_without_files(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add all of them but the files of known cameras and poses."""
+    return _collecting(command, _OPTIONS)
+
+
+def _collecting(command: Callable[..., Any], options: list[Any]) -> Callable[..., Any]:
     names = [field.name for field in fields(Estimation)]
 
     @wraps(command)
     def collected(*args: Any, **kwargs: Any) -> Any:
-        estimation = Estimation(**{name: kwargs.pop(name) for name in names})
+        estimation = Estimation(**{name: kwargs.pop(name, None) for name in names})
         return command(*args, estimation=estimation, **kwargs)
 
-    for option in reversed(_OPTIONS):
+    for option in reversed(options):
         collected = option(collected)
     return collected
 
 
+_GIVEN = [
+    click.option(
+        "--intrinsics",
+        type=INPUT,
+        metavar="CAMERA.yaml",
+        show_default="none",
+        help="Type 3: the known camera, a neurocal, ROS or OpenCV file.",
+    ),
+    click.option(
+        "--extrinsics",
+        type=INPUT,
+        metavar="CAMERA.yaml",
+        show_default="none",
+        help="Type 4: a neurocal file with the known poses of the views.",
+    ),
+]
+
+_BEFORE_GIVEN = 2  # options that come first in the help
 _OPTIONS = [
     click.option(
         "--type",
@@ -192,20 +219,6 @@ _OPTIONS = [
         metavar="U V",
         show_default="image_center of POINTS, else the middle of the image",
         help="Type 2: the known image centre in pixels.",
-    ),
-    click.option(
-        "--intrinsics",
-        type=INPUT,
-        metavar="CAMERA.yaml",
-        show_default="none",
-        help="Type 3: the known camera, a neurocal, ROS or OpenCV file.",
-    ),
-    click.option(
-        "--extrinsics",
-        type=INPUT,
-        metavar="CAMERA.yaml",
-        show_default="none",
-        help="Type 4: a neurocal file with the known poses of the views.",
     ),
     click.option(
         "--image-size",

@@ -24,9 +24,18 @@ __all__ = ["FORMAT", "calibration_lines"]
 FORMAT = 1  # of the neurocal block; a change that older readers cannot follow makes it 2
 
 
-def calibration_lines(cal: Calibration) -> Iterator[str]:
-    """Lines of the file, without line ends."""
-    yield from camera_info_lines(cal.camera_name, cal.image_size, cal.K, cal.distortion_model, cal.distortion)
+def calibration_lines(cal: Calibration, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:
+    """Lines of the file, without line ends.
+
+    Parameters
+    ----------
+    cal : Calibration
+    rectified : (3, 3) and (3, 4) arrays, optional
+        Rectification and projection matrix of a camera on a rig, in ROS's meaning.
+    """
+    yield from camera_info_lines(
+        cal.camera_name, cal.image_size, cal.K, cal.distortion_model, cal.distortion, rectified
+    )
     yield "neurocal:"
     for lines in (_record_lines(cal), _parameter_lines(cal), _view_lines(cal), _network_lines(cal.network)):
         yield from (f"  {line}" for line in lines)

@@ -14,7 +14,12 @@ __all__ = ["camera_info_lines", "format_camera_info"]
 
 
 def camera_info_lines(
-    name: str, size: tuple[int, int] | None, A: Array, model: str, coefficients: Array
+    name: str,
+    size: tuple[int, int] | None,
+    A: Array,
+    model: str,
+    coefficients: Array,
+    rectified: tuple[Array, Array] | None = None,
 ) -> Iterator[str]:
     """Lines of the file, without line ends.
 
@@ -27,7 +32,10 @@ def camera_info_lines(
     model : str
         One of `lens.MODELS`.
     coefficients : (K,) array
+    rectified : (3, 3) and (3, 4) arrays, optional
+        Rectification and projection matrix of a camera on a rig; default: of a camera alone.
     """
+    R, P = rectified or (np.eye(3), np.column_stack([A, np.zeros(3)]))
     width, height = size or (0, 0)  # ROS's readers want numbers
     model, coefficients = to_ros(model, coefficients)
     yield f"camera_name: {text(name)}"
@@ -36,8 +44,8 @@ def camera_info_lines(
     yield f"camera_matrix: {_matrix(A)}"
     yield f"distortion_model: {model}"
     yield f"distortion_coefficients: {_matrix(coefficients[None])}"
-    yield f"rectification_matrix: {_matrix(np.eye(3))}"
-    yield f"projection_matrix: {_matrix(np.column_stack([A, np.zeros(3)]))}"
+    yield f"rectification_matrix: {_matrix(R)}"
+    yield f"projection_matrix: {_matrix(P)}"
 
 
 def format_camera_info(name: str, size: tuple[int, int] | None, A: Array) -> str:

@@ -13,36 +13,70 @@ import numpy as np
 
 from neurocal_cli.camera import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.geometry import euler_to_rotation
+from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_text import calibration_lines
 from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.files import write_whole
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import read_yaml
+from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["format_rig", "read_rig", "rig_from_field", "write_rig"]
+__all__ = ["format_rig", "format_ros_pair", "read_rig", "rig_from_field", "write_rig"]
 
 FORMAT = 1  # of the stereo block; a change that older readers cannot follow makes it 2
 _GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
+_METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
 _SAME = 1e-6  # E, F and the baseline follow from R, t and the cameras; more means an edit of one
 
 
-def format_rig(rig: Rig) -> str:
-    """Text of a rig file; the same rig gives the same text."""
-    return "\n".join([*_rig_lines(rig), ""])
+def format_rig(rig: Rig, alpha: float | None = None) -> str:
+    """Text of a rig file; the same rig gives the same text.
+
+    Parameters
+    ----------
+    rig : Rig
+    alpha : float, optional
+        Of the rectification, see `rectify`.
+    """
+    return "\n".join([*_rig_lines(rig, rectify(rig, alpha)), ""])
 
 
-def write_rig(rig: Rig, path: str | Path) -> None:
+def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
     """Write a rig file, whole or not at all; ``-`` is stdout."""
-    write_whole(path, format_rig(rig))
+    write_whole(path, format_rig(rig, alpha))
 
 
-def _rig_lines(rig: Rig) -> Iterator[str]:
-    for name, camera in (("left", rig.left), ("right", rig.right)):
+def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
+    """Texts of two calibration files as ROS's stereo nodes read them, lengths in metres.
+
+    Raises
+    ------
+    InputError
+        A unit that is no length, or images without one known size.
+    """
+    if rig.unit not in _METRES:
+        raise InputError(f"ROS measures in metres, and {rig.unit!r} is none of {', '.join(_METRES)}")
+    rectified = rectify(rig, alpha)
+    if rectified is None:
+        raise InputError(
+            "ROS's files need images of one known size; put image_size into both files of points"
+        )
+    metres = rectified.P2.copy()
+    metres[:, 3] *= _METRES[rig.unit]
+    sides = (rig.left, rectified.R1, rectified.P1), (rig.right, rectified.R2, metres)
+    first, second = ("\n".join([*calibration_lines(camera, (R, P)), ""]) for camera, R, P in sides)
+    return first, second
+
+
+def _rig_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
+    matrices: tuple[tuple[Array, Array] | None, ...] = (None, None)
+    if rectified is not None:
+        matrices = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
+    for name, camera, pair in zip(("left", "right"), (rig.left, rig.right), matrices, strict=True):
         yield f"{name}:"
-        for line in calibration_lines(camera):
+        for line in calibration_lines(camera, pair):
             # A table of rows is one long text.
             yield "\n".join(f"  {part}" for part in line.split("\n"))
     yield "stereo:"
@@ -63,6 +97,10 @@ def _rig_lines(rig: Rig) -> Iterator[str]:
     yield f"  converged: {str(bool(rig.converged)).lower()}"
     yield f"  stop_reason: {text(str.__str__(rig.stop_reason))}"
     yield f"  iterations: {rig.iterations}"
+    if rectified is not None:
+        yield "  rectification:"
+        for key in ("R1", "R2", "P1", "P2", "Q"):
+            yield f"    {key}: {flow(getattr(rectified, key))}"
     yield "  pairs:"
     for left, right in rig.pairs:
         yield f"    - [{quoted(left)}, {quoted(right)}]"

@@ -146,8 +146,10 @@ class _RigAssembly:
         rms = np.sqrt(squares / seen.tiles.counts)
         R, t = self._world_poses(side)
         stds = self._pose_stds(side, R)
+        R.setflags(write=False)
+        t.setflags(write=False)
         views = {
-            name: ViewResult(Pose(R[k], t[k]), dict(zip(POSE_NAMES, stds[k].tolist(), strict=True)),
+            name: ViewResult(Pose.exact(R[k], t[k]), dict(zip(POSE_NAMES, stds[k].tolist(), strict=True)),
                              int(seen.tiles.counts[k]), float(rms[k]))
             for k, name in enumerate(self.problem.names[side])
         }  # fmt: skip

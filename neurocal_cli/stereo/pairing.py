@@ -29,6 +29,7 @@ _SIDES = (
     re.compile(r"(?<![a-z])(?:right|r(?![a-z])|cam(?:era)?[ _-]?1(?![0-9]))(?![a-z])", re.IGNORECASE),
 )
 _SHOWN = 5  # names in a message
+_FEW = 0.1  # share of the points at the same places below which it is chance
 _SAME_PLACE = 1e-6  # of the target's size: how far apart one point's X, Y, Z may be in two files
 
 
@@ -153,11 +154,11 @@ def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs)
     for points, row, key in zip((left, right), rows, keys, strict=True):
         _refuse_repeated(points, row, key, by_id)
     common, first, second = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
-    if not common.size:
-        what = "id" if by_id else "X, Y, Z"
+    if not common.size or (not by_id and len(common) < _FEW * min(map(len, rows))):
+        what, few = "id" if by_id else "X, Y, Z", f"{len(common)} points" if common.size else "no point"
         raise InputError(
-            f"{left.source} and {right.source}: the paired views have no point in common, by {what}; measure "
-            "the same target in both, in the same coordinates"
+            f"{left.source} and {right.source}: the paired views have {few} in common, by {what}; measure "
+            "the same target in both, in the same coordinates and unit"
         )
     pairs = Pairs(
         rows[0][first], rows[1][second], common // n_codes, len(rows[0]) + len(rows[1]) - 2 * len(common)

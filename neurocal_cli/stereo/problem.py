@@ -80,9 +80,14 @@ class RigProblem:
 
 
 def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) which of A's entries and the lens's coefficients were estimated."""
+    """(5 + K,) which of A's entries and the lens's coefficients points may change.
+
+    Not those that were given, and none of a camera whose lens is from straight lines: the two belong
+    together.
+    """
     names = (*_ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
-    return np.array([name not in calibration.fixed for name in names])
+    held = calibration.straight_lines is not None
+    return np.array([not held and name not in calibration.fixed for name in names])
 
 
 def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigProblem:

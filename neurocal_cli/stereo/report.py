@@ -5,11 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from neurocal_cli.report import align
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
+from neurocal_cli.lens import coefficient_names
+from neurocal_cli.report import align, rounded
 from neurocal_cli.stereo.evaluation import SpaceError, StereoEvaluation
+from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["stereo_evaluation_json", "stereo_evaluation_report", "stereo_evaluation_tables"]
+__all__ = ["rig_report", "stereo_evaluation_json", "stereo_evaluation_report", "stereo_evaluation_tables"]
 
+_MOST_VIEWS = 20  # rows of a table that still fit on a screen
 _ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
 
 
@@ -21,8 +26,13 @@ def stereo_evaluation_report(evaluation: StereoEvaluation) -> str:
 def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[str]], ...]:
     """Rows, the heading first, of the tables of all points, of the depths and of the views."""
     unit = evaluation.unit
-    ways = [evaluation.by_view] + ([] if evaluation.rig is None else [evaluation.rig])
-    heads = ["poses of each view", "one rig"][: len(ways)]
+    ways, heads = [evaluation.by_view], ["poses of each view"]
+    if evaluation.rig is not None and math.isclose(
+        evaluation.rig.rmse, evaluation.by_view.rmse, rel_tol=1e-4
+    ):
+        ways, heads = [evaluation.rig], ["one rig"]  # a rig's views, or a single one: both ways are one
+    elif evaluation.rig is not None:
+        ways, heads = [*ways, evaluation.rig], [*heads, "one rig"]
     overall = [[f"[{unit}]", *heads]]
     for label, name in (
         ("X rms", "rmse_x"),
@@ -102,3 +112,90 @@ def _share(value: float) -> str:
 def _shown(name: str) -> str:
     """Show a name on one line, whatever characters a file put in it."""
     return name if name.isprintable() else ascii(name)[1:-1]
+
+
+def rig_report(rig: Rig) -> str:
+    """Summary of a calibrated rig: both cameras, the rig, the fit. Warnings are not in it."""
+    blocks = [[_headline(rig)], align(_camera_rows(rig)), align(_rig_rows(rig)), _view_lines(rig)]
+    blocks.append(_fit_lines(rig))
+    return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def _headline(rig: Rig) -> str:
+    parts = [f"rig: {_counted(len(rig.pairs), 'view')} of both cameras"]
+    for name, camera in (("left", rig.left), ("right", rig.right)):
+        alone = len(camera.views) - len(rig.pairs)
+        parts.append(
+            f"{name} {_counted(len(camera.points), 'point')}" + (f" ({alone} views alone)" * (alone > 0))
+        )
+    return ", ".join(parts)
+
+
+def _counted(count: int, noun: str) -> str:
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def _camera_rows(rig: Rig) -> list[list[str]]:
+    """Both cameras' parameters side by side."""
+    rows = [["parameter", "left", "std", "right", "std"]]
+    lenses = [coefficient_names(camera.distortion_model) for camera in (rig.left, rig.right)]
+    longest = max(lenses, key=len)
+    for name in (*INTRINSIC_NAMES, *longest, *(n for names in lenses for n in names if n not in longest)):
+        unit = {"theta": " [rad]"}.get(name, " [px]" if name in INTRINSIC_NAMES else "")
+        row = [name + unit]
+        for camera, names in zip((rig.left, rig.right), lenses, strict=True):
+            if name in INTRINSIC_NAMES:
+                row += _estimate(float(getattr(camera.intrinsics, name)), name, camera)
+            elif name in names:
+                row += _estimate(float(camera.distortion[names.index(name)]), name, camera)
+            else:
+                row += ["", ""]
+        rows.append(row)
+    return rows
+
+
+def _estimate(value: float, name: str, camera: Calibration) -> list[str]:
+    return [f"{value:.7g}", "given"] if name in camera.fixed else [*rounded(value, camera.std[name])]
+
+
+def _rig_rows(rig: Rig) -> list[list[str]]:
+    rows = [["X_right = R X_left + t", "value", "std"]]
+    for name, value in zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True):
+        unit = "rad" if name.startswith("R") else _shown(rig.unit)
+        rows.append([f"{name} [{unit}]", *rounded(value, rig.std[name])])
+    rows.append([f"baseline [{_shown(rig.unit)}]", *rounded(rig.baseline, rig.std["baseline"])])
+    return rows
+
+
+def _view_lines(rig: Rig) -> list[str]:
+    """Both cameras' error in each pair of views, the worst ones when there are many."""
+    if len(rig.pairs) == 1:
+        return []
+    rows = []
+    for a, b in rig.pairs:
+        left, right = rig.left.views[a], rig.right.views[b]
+        errors = left.rmse_px, right.rmse_px
+        label = _shown(a if a == b else f"{a} / {b}")
+        rows.append((max(errors), [label, str(left.n_points), *map(_figure, errors[:1]),
+                                   str(right.n_points), _figure(errors[1])]))  # fmt: skip
+    hidden = len(rows) - _MOST_VIEWS
+    if hidden > 0:
+        rows = sorted(rows, key=lambda row: -row[0])[:_MOST_VIEWS]
+    lines = align(
+        [["view", "left points", "rms [px]", "right points", "rms [px]"], *(row for _, row in rows)]
+    )
+    return lines + [f"the worst {_MOST_VIEWS} of {len(rig.pairs)} pairs"] * (hidden > 0)
+
+
+def _fit_lines(rig: Rig) -> list[str]:
+    lines = []
+    for name, camera in (("left", rig.left), ("right", rig.right)):
+        record = camera.network
+        if record is not None:
+            lines.append(
+                f"{name}: {_counted(record.starts, 'random start')} for {_counted(len(record.V), 'view')}, "
+                f"at least {record.agreed} agreed in each; rms {_figure(camera.rmse_px)} px"
+            )
+    lines.append(f"both: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
+                 f"{_counted(rig.iterations, 'common step')}")  # fmt: skip
+    return [*lines, rig.stop_reason]

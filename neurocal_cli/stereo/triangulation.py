@@ -31,6 +31,7 @@ METHODS = ("optimal", "linear", "midpoint")
 _AT_ONCE = 4096  # points whose arrays stay in the processor's cache
 _MOST_STEPS = 30
 _SETTLED = 1e-9  # px: a step that moves no image by more is the last
+_SMALL_STEP = 0.02  # of Newton's in the image plane: the next one would be a thousandth
 _RISE, _ROUNDING = 1 + 1e-9, 1e-18  # of a squared error, and px^2: what is no rise but rounding
 _OFF = 5.0  # standard deviations of the epipolar error
 
@@ -151,10 +152,30 @@ class _Camera:
 
     def straight(self, pixels: Array) -> tuple[Array, Array]:
         """Normalised image points without the lens; nan where there are none."""
+        x, y = self._normalised(pixels)
+        return (x, y) if self.model == "none" else undistort(self.model, self.k, x, y)
+
+    def nearly_straight(self, pixels: Array) -> tuple[Array, Array]:
+        """The same to a thousandth or so, in two of Newton's steps, wherever these do."""
+        x, y = self._normalised(pixels)
+        if self.model == "none":
+            return x, y
+        near_x, near_y = x, y
+        for _ in range(2):
+            (bent_x, bent_y), (xx, xy, yx, yy), _ = bend(self.model, self.k, near_x, near_y)
+            det = xx * yy - xy * yx
+            step_x = (yy * (x - bent_x) - xy * (y - bent_y)) / det
+            step_y = (xx * (y - bent_y) - yx * (x - bent_x)) / det
+            near_x, near_y = near_x + step_x, near_y + step_y
+        far = ~((det > 0) & (step_x * step_x + step_y * step_y < _SMALL_STEP**2))
+        if far.any():
+            near_x[far], near_y[far] = undistort(self.model, self.k, x[far], y[far])
+        return near_x, near_y
+
+    def _normalised(self, pixels: Array) -> tuple[Array, Array]:
         a, s, b, u0, v0 = self.entries
         y = (pixels[1] - v0) / b
-        x = (pixels[0] - u0 - s * y) / a
-        return (x, y) if self.model == "none" else undistort(self.model, self.k, x, y)
+        return (pixels[0] - u0 - s * y) / a, y
 
     def seen(self, x: Array, y: Array) -> tuple[Array, Array, tuple[Array | float, ...]]:
         """Pixels of normalised points and their derivatives du/dx, du/dy, dv/dx, dv/dy."""
@@ -202,15 +223,17 @@ class _Batch:
         # Of a rig that all share, plain numbers: quicker than arrays of one.
         entries = rig[..., 0].tolist() if rig.shape[2] == 1 else rig
         self.R, self.t = [row[:3] for row in entries], [row[3] for row in entries]
-        self.rays = cameras[0].straight(left), cameras[1].straight(right)
+
+    def _rays(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        return self.cameras[0].straight(self.pixels[0]), self.cameras[1].straight(self.pixels[1])
 
     def _turned(self, x: Array, y: Array) -> list[Array]:
         """R (x, y, 1): the left ray's direction in the right camera's frame."""
         return [row[0] * x + row[1] * y + row[2] for row in self.R]
 
     def optimal(self) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        x, y = (np.array(values) for values in self.rays[0])
-        w = self._nearest_w(x, y)
+        x, y = (np.array(values) for values in self.cameras[0].nearly_straight(self.pixels[0]))
+        w = self._nearest_w(x, y, *self.cameras[1].nearly_straight(self.pixels[1]))
         left_out = ~np.isfinite(x + w)
         x[left_out], y[left_out], w[left_out] = 0.0, 0.0, 1.0  # so that they do no harm
         N, cost = self._normal(x, y, w)
@@ -252,10 +275,9 @@ class _Batch:
             )
         return x, y, w, N_new, new
 
-    def _nearest_w(self, x: Array, y: Array) -> Array:
+    def _nearest_w(self, x: Array, y: Array, x_r: Array, y_r: Array) -> Array:
         """Inverse depth along the left ray that comes nearest to the right image point; linear."""
         h0, h1, h2 = self._turned(x, y)
-        x_r, y_r = self.rays[1]
         t0, t1, t2 = self.t
         a, b = t0 - x_r * t2, t1 - y_r * t2
         return np.asarray((a * (x_r * h2 - h0) + b * (y_r * h2 - h1)) / (a * a + b * b))
@@ -310,11 +332,11 @@ class _Batch:
 
     def linear(self) -> Array:
         """(n, 3) smallest singular vectors of the image equations."""
-        P = np.moveaxis(self.P, -1, 0)
+        P, rays = np.moveaxis(self.P, -1, 0), self._rays()
         equations = np.zeros((len(self.pixels[0][0]), 4, 4))
         equations[:, 0, 0] = equations[:, 1, 1] = -1.0
-        equations[:, 0, 2], equations[:, 1, 2] = self.rays[0]
-        for row, ray in enumerate(self.rays[1]):
+        equations[:, 0, 2], equations[:, 1, 2] = rays[0]
+        for row, ray in enumerate(rays[1]):
             equations[:, 2 + row] = ray[:, None] * P[:, 2] - P[:, row]
         nowhere = ~np.isfinite(equations).all(axis=(1, 2))
         equations[nowhere] = np.eye(4)
@@ -325,8 +347,8 @@ class _Batch:
 
     def midpoint(self) -> Array:
         """(n, 3) middles of the shortest segments between the rays."""
-        x, y = self.rays[1]
-        left = np.stack([*self.rays[0], np.ones_like(x)])
+        seen, (x, y) = self._rays()
+        left = np.stack([*seen, np.ones_like(x)])
         # The right camera's rays and centre in the left one's frame.
         right = np.stack([self.R[0][k] * x + self.R[1][k] * y + self.R[2][k] for k in range(3)])
         centre = np.stack([-sum(self.R[j][k] * self.t[j] for j in range(3)) + 0.0 * x for k in range(3)])

@@ -1,0 +1,139 @@
+"""Rectification: two virtual cameras, side by side, whose rows (or columns) correspond.
+
+The meaning of R1, R2, P1, P2 and Q, and which of the possible pairs is taken, are those of OpenCV's
+``stereoRectify`` with zero disparity at infinity: each camera is turned by half of the rig's rotation, then
+both together so that the baseline lies along the longer of its axes (Bouguet).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.errors import UsageError
+from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
+from neurocal_cli.lens import undistort
+from neurocal_cli.stereo.rig import Rig
+
+__all__ = ["Rectification", "rectify"]
+
+_GRID = 9  # points along each side of the image at which the rectified image's shape is looked at
+
+
+@dataclass(frozen=True, eq=False)
+class Rectification:
+    """Rectified cameras.
+
+    Attributes
+    ----------
+    R1, R2 : (3, 3) arrays
+        From each camera's frame to its rectified one.
+    P1, P2 : (3, 4) arrays
+        Projections from the left rectified frame into both rectified images.
+    Q : (4, 4) array
+        (u, v, disparity, 1) in the left image to homogeneous points in the left rectified frame.
+    """
+
+    R1: Array
+    R2: Array
+    P1: Array
+    P2: Array
+    Q: Array
+
+
+def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
+    """Rectify a rig.
+
+    Parameters
+    ----------
+    rig : Rig
+    alpha : float, optional
+        0: the rectified images are scaled so that all their pixels have been seen; 1: so that all pixels
+        that were seen are in them; between: between; None: not scaled.
+
+    Returns
+    -------
+    Rectification, or None where the image sizes are unknown or differ.
+
+    Raises
+    ------
+    UsageError
+        alpha is not between 0 and 1.
+    """
+    if alpha is not None and not 0 <= alpha <= 1:
+        raise UsageError(f"alpha must be between 0 and 1, not {alpha:g}")
+    size = rig.left.image_size
+    if size is None or size != rig.right.image_size:
+        return None
+    half = nearest_rotation(rig.R + np.eye(3))  # its square is R
+    t = half.T @ rig.t
+    axis = 0 if abs(t[0]) > abs(t[1]) else 1
+    turn = _shortest_turn(t, np.eye(3)[axis] * (1.0 if t[axis] > 0 else -1.0))
+    rotations = turn @ half, turn @ half.T
+    cameras = rig.left, rig.right
+    along = float((rotations[1] @ rig.t)[axis])
+    f = 0.5 * float(sum(camera.K[1 - axis, 1 - axis] for camera in cameras))
+    centres = [_centre(camera, R, f, size) for camera, R in zip(cameras, rotations, strict=True)]
+    centre = 0.5 * (centres[0] + centres[1])  # one for both: disparity 0 at infinity
+    if alpha is not None:
+        f *= _scale(list(zip(cameras, rotations, strict=True)), f, centre, size, alpha)
+    P1 = np.array([[f, 0.0, centre[0], 0.0], [0.0, f, centre[1], 0.0], [0.0, 0.0, 1.0, 0.0]])
+    P2 = P1.copy()
+    P2[axis, 3] = f * along
+    Q = np.zeros((4, 4))
+    Q[:2, :2], Q[:2, 3], Q[2, 3], Q[3, 2] = np.eye(2), -centre, f, -1.0 / along
+    return Rectification(*rotations, P1, P2, Q)
+
+
+def _shortest_turn(a: Array, b: Array) -> Array:
+    """The rotation about the normal of both that takes the direction of a to the unit vector b."""
+    a = a / np.linalg.norm(a)
+    K = cross_matrix(np.cross(a, b))
+    return np.asarray(np.eye(3) + K + K @ K / (1.0 + a @ b))
+
+
+def _seen(camera: Calibration, R: Array, pixels: Array) -> Array:
+    """Normalised rectified points of pixels, (N, 2); nan where no ray belongs to a pixel."""
+    K = camera.K
+    y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
+    x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
+    x, y = undistort(camera.distortion_model, camera.distortion, x, y)
+    rays = np.column_stack([x, y, np.ones_like(x)]) @ R.T
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)
+
+
+def _centre(camera: Calibration, R: Array, f: float, size: tuple[int, int]) -> Array:
+    """Principal point that puts the image's corners around the middle of the rectified image."""
+    last = np.array(size, dtype=float) - 1
+    corners = _seen(camera, R, np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * last)
+    if not np.isfinite(corners).all():  # a lens that sees no straight line there: the sides' middles do
+        corners = _seen(camera, R, np.array([[0.5, 0], [0.5, 1], [0, 0.5], [1, 0.5]]) * last)
+    middle = corners.mean(axis=0) if np.isfinite(corners).all() else np.zeros(2)
+    return np.asarray(0.5 * last - f * middle)
+
+
+def _scale(
+    cameras: list[tuple[Calibration, Array]], f: float, centre: Array, size: tuple[int, int], alpha: float
+) -> float:
+    """By how much the focal length is to be multiplied."""
+    grid = np.linspace(0.0, 1.0, _GRID)
+    last = np.array(size, dtype=float) - 1
+    room = np.array([centre, last - centre])  # to the left and top, to the right and bottom
+    fill, hold = [], []
+    for camera, R in cameras:
+        u, v = np.meshgrid(grid, grid)
+        seen = f * _seen(camera, R, np.column_stack([u.ravel(), v.ravel()]) * last).reshape(_GRID, _GRID, 2)
+        inner = np.array(
+            [
+                [np.nanmax(seen[:, 0, 0]), np.nanmax(seen[0, :, 1])],
+                [np.nanmin(seen[:, -1, 0]), np.nanmin(seen[-1, :, 1])],
+            ]
+        )
+        outer = np.array([np.nanmin(seen, axis=(0, 1)), np.nanmax(seen, axis=(0, 1))])
+        signs = np.array([[-1.0], [1.0]])
+        fill.append((room / (signs * inner)).max())
+        hold.append((room / (signs * outer)).min())
+    return float((1 - alpha) * max(fill) + alpha * min(hold))

@@ -1,0 +1,111 @@
+"""Rectification: rows correspond, and OpenCV says the same."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rigs import random_rig
+from test_stereo import sides
+
+from neurocal_cli import Pose, Rig
+from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.rig_yaml import format_ros_pair
+from neurocal_cli.io.yaml_tree import parse_yaml
+from neurocal_cli.stereo.methods import calibrate_stereo
+from neurocal_cli.stereo.rectification import rectify
+
+POSES = {
+    "side by side": Pose.from_euler(0.02, 0.05, -0.01, np.array([-80.0, 3.0, 5.0])),
+    "verging": Pose.from_euler(0.1, 0.3, 0.05, np.array([-300.0, 20.0, 60.0])),
+    "the other side": Pose.from_euler(0.02, -0.1, 0.01, np.array([90.0, 5.0, -5.0])),
+    "above each other": Pose.from_euler(0.2, 0.02, 0.05, np.array([5.0, -80.0, 10.0])),
+}
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return calibrate_stereo(*sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1), skew=False)
+
+
+def bent(rig: Rig) -> Rig:
+    cameras = [
+        replace(c, distortion_model="plumb_bob", distortion=np.array(k))
+        for c, k in ((rig.left, [-0.2, 0.05, 1e-3, -5e-4, 0]), (rig.right, [-0.15, 0.02, 0, 1e-3, 0]))
+    ]
+    return replace(rig, left=cameras[0], right=cameras[1])
+
+
+@pytest.mark.parametrize("alpha", [None, 0.0, 0.3, 1.0])
+@pytest.mark.parametrize("name", POSES)
+def test_opencv_says_the_same(name: str, alpha: float | None, rig: Rig) -> None:
+    cv2 = pytest.importorskip("cv2")
+    for one, tolerance in (
+        (replace(rig, pose=POSES[name]), 1e-4),
+        (replace(bent(rig), pose=POSES[name]), 3.0),
+    ):
+        found = rectify(one, alpha)
+        assert found is not None
+        # OpenCV takes the lens off the corners in five rounds, some pixels short where it bends much.
+        k = [np.concatenate([c.distortion, np.zeros(5)])[:5] for c in (one.left, one.right)]
+        expected = cv2.stereoRectify(
+            one.left.K, k[0], one.right.K, k[1], one.left.image_size, one.R, one.t.reshape(3, 1),
+            alpha=-1 if alpha is None else alpha,
+        )  # fmt: skip
+        ours = found.R1, found.R2, found.P1, found.P2, found.Q
+        for a, b in zip(ours[:2], expected, strict=False):
+            assert a == pytest.approx(b, abs=1e-12)
+        for a, b in zip((found.P1[:, :3], found.P2[:, :3]), expected[2:4], strict=True):
+            assert a == pytest.approx(b[:, :3], abs=tolerance)
+        assert found.P2[:, 3] == pytest.approx(expected[3][:, 3], rel=1e-5 if tolerance < 1 else 0.01)
+        assert pytest.approx(expected[4], abs=tolerance) == found.Q
+
+
+@pytest.mark.parametrize("name", POSES)
+def test_points_fall_on_one_row_and_q_brings_them_back(name: str, rig: Rig) -> None:
+    one = replace(rig, pose=POSES[name])
+    found = rectify(one, 0.5)
+    assert found is not None
+    rng = np.random.default_rng(2)
+    X = rng.uniform(-1, 1, (50, 3)) * [200, 150, 100] + [0, 0, 900]
+
+    def image(R: Array, P: Array, points: Array) -> Array:
+        rectified = points @ R.T
+        m = np.column_stack([rectified, np.ones(50)]) @ P.T
+        return np.asarray(m[:, :2] / m[:, 2:])
+
+    left = image(found.R1, found.P1, X)
+    # P2 is for points in the left rectified frame: the baseline is in it.
+    right = image(found.R1, found.P2, X)
+    seen = image(found.R2, np.column_stack([found.P2[:, :3], np.zeros(3)]), X @ one.R.T + one.t)
+    assert right == pytest.approx(seen, abs=1e-9)
+    across = 0 if name == "above each other" else 1
+    assert left[:, across] == pytest.approx(right[:, across], abs=1e-9)
+    disparity = (left - right)[:, 1 - across]
+    back = np.column_stack([left, disparity, np.ones(50)]) @ found.Q.T
+    assert back[:, :3] / back[:, 3:] == pytest.approx(X @ found.R1.T, rel=1e-9)
+
+
+def test_without_one_image_size_there_is_none(rig: Rig) -> None:
+    nothing = replace(rig.left, points=replace(rig.left.points, image_size=None))
+    assert rectify(replace(rig, left=nothing)) is None
+    with pytest.raises(InputError, match="images of one known size"):
+        format_ros_pair(replace(rig, left=nothing))
+    with pytest.raises(UsageError, match="between 0 and 1"):
+        rectify(rig, 2.0)
+
+
+def test_ros_files_are_in_metres(rig: Rig) -> None:
+    found = rectify(rig)
+    assert found is not None
+    left, right = (parse_yaml(text, "f") for text in format_ros_pair(rig))
+    assert np.array(left["rectification_matrix"]["data"]) == pytest.approx(found.R1.ravel())
+    assert np.array(right["rectification_matrix"]["data"]) == pytest.approx(found.R2.ravel())
+    P2 = np.array(right["projection_matrix"]["data"]).reshape(3, 4)
+    assert P2[0, 3] == pytest.approx(found.P2[0, 3] / 1000)
+    assert -P2[0, 3] / P2[0, 0] == pytest.approx(rig.baseline / 1000)
+    points = replace(rig.left.points, unit="squares")
+    with pytest.raises(InputError, match="'squares' is none of m, dm, cm, mm"):
+        format_ros_pair(replace(rig, left=replace(rig.left, points=points)))
