@@ -180,7 +180,8 @@ def test_the_corner_rig_from_its_photographs(tmp_path: Path) -> None:
     write_board(Board(planes), tmp_path / "board.yaml")
     for side in ("left", "right"):
         image = DATA / "ortho3" / f"{side}_calib.jpg"
-        found = run("detect", image, "--board", tmp_path / "board.yaml", "-o", tmp_path / f"{side}.csv")
+        words = ["--board", tmp_path / "board.yaml", "--points", "vertices", "-o", tmp_path / f"{side}.csv"]
+        found = run("detect", image, *words)
         assert found.exit_code == 0, found.stderr
         camera = run(
             "calibrate", tmp_path / f"{side}.csv", "--distortion", "none", "--outliers", "keep",
@@ -190,9 +191,9 @@ def test_the_corner_rig_from_its_photographs(tmp_path: Path) -> None:
     values = json.loads(
         run("evaluate", "stereo", tmp_path / "left.yaml", tmp_path / "right.yaml", "--json").stdout
     )
-    assert values["n_points"] > 200
+    assert values["n_points"] > 120
     assert values["baseline"] == pytest.approx(230.9, abs=3)
-    assert values["rmse"] == pytest.approx(1.1, abs=0.1)
+    assert values["rmse"] == pytest.approx(1.03, abs=0.08)
     assert values["rmse_x"] < 0.7 > values["rmse_y"]
     assert values["nsce"] == pytest.approx(4.05, abs=0.2)
 
