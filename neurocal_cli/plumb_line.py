@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import StraightLines
-from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import Lens
 from neurocal_cli.lens_domain import straightened
@@ -81,7 +81,7 @@ class PlumbLine:
 
         Raises
         ------
-        InputError
+        DegenerateGeometryError
             A pixel that the lens cannot see.
         """
         x, y = ((points.pixels - self.centre) / self.scale).T
@@ -89,7 +89,7 @@ class PlumbLine:
         lost = ~np.isfinite(straight[:, 0])
         if lost.any():
             row = int(np.argmax(lost))
-            raise InputError(
+            raise DegenerateGeometryError(
                 f"{points.place(row)}: the lens that the straight lines show cannot have seen anything at "
                 f"({points.pixels[row, 0]:g}, {points.pixels[row, 1]:g}); check this point, or use another "
                 "--distortion"

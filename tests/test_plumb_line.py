@@ -19,7 +19,7 @@ from test_real_data import zhang
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
 from neurocal_cli.board import Board
 from neurocal_cli.camera import Intrinsics
-from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
+from neurocal_cli.errors import DegenerateGeometryError, NeurocalError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import write_calibration
 from neurocal_cli.io.points_csv import write_points
@@ -372,7 +372,9 @@ def test_a_point_that_the_lens_cannot_have_seen_is_named() -> None:
     points = lens_scene([-0.3, -0.1]).points()
     lens = fit_plumb_line(points)
     far = replace(points, pixels=np.where(np.arange(len(points))[:, None] == 3, 4000.0, points.pixels))
-    with pytest.raises(InputError, match=r"points, row 4: .* cannot have seen anything at \(4000, 4000\)"):
+    with pytest.raises(
+        DegenerateGeometryError, match=r"points, row 4: .* cannot have seen anything at \(4000, 4000\)"
+    ):
         lens.corrected(far)
 
 
