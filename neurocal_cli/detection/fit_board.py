@@ -12,7 +12,7 @@ from neurocal_cli.detection.fit_edges import OFFSET, EdgeData, edge_data, fit_ed
 from neurocal_cli.detection.fit_gate import believable, smooth
 from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
-from neurocal_cli.detection.fit_noise import Noise, blur_of, level_prior, profile_shape
+from neurocal_cli.detection.fit_noise import BoardBlur, Noise, level_prior, profile_shape
 from neurocal_cli.detection.fit_profile import RESPONSE_TERMS, box_kurtosis
 from neurocal_cli.detection.fit_robust import MapFit, Rows, choose_map, fit_map, median
 from neurocal_cli.detection.fit_shading import Levels, Shading, fit_shading, square_levels
@@ -263,13 +263,13 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     """Edges fitted with what all of them share, and the map through them."""
     fit, good, n = first.fit, first.good, len(first.good)
     shading = _shading(first)
-    usual, spread = blur_of(fit, good)
-    sigma = np.full(n, usual)
     lines = board.lines(first.map.map)
+    blur = BoardBlur.of(fit, lines.normal, good)
+    sigma = blur.along(lines.normal)
     reach = _REACH * sigma
     data = _pixels(board, lines, sigma, shading, reach, 1)
     data = with_weight(data, np.full_like(data.weight, 1 / first.noise.edge))
-    prior = level_prior(shading, lines.middle, sigma, spread, first.noise.edge)
+    prior = level_prior(shading, lines.middle, sigma, blur.spread, first.noise.edge)
     offset = first.map.residual[:n] + first.map.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     half_length = 0.5 * lines.length
@@ -316,8 +316,8 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + board.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
-    usual, spread = blur_of(fitted.fit, fitted.good)
-    sigma = np.full(len(grid), usual)
+    blur = BoardBlur.of(fitted.fit, fitted.lines.normal, fitted.good)
+    sigma = 0.5 * (blur.along(lines[0].normal) + blur.along(lines[1].normal))
     contrast = fitted.shading.at(place)[1]
     slopes = fitted.shading.slopes(place)
     data = vertex_data(board.image, lines, light, sigma, _REACH, slopes, contrast)
@@ -325,7 +325,7 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     shape = Shape(tails, fitted.shape.bend)
     if fitted.shape.half is not None:
         shape = replace(shape, half=np.stack([half_widths(line.normal) for line in lines], axis=1))
-    prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
+    prior = level_prior(fitted.shading, place, sigma, blur.spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     half = (0.5 * lines[0].length, 0.5 * lines[1].length)
     unit = replace(data, weight=data.weight / np.float32(fitted.noise.edge))

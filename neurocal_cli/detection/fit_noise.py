@@ -20,13 +20,15 @@ from neurocal_cli.detection.fit_robust import median
 from neurocal_cli.detection.fit_shading import Shading
 from neurocal_cli.geometry import Array
 
-__all__ = ["Noise", "blur_of", "level_prior", "profile_shape"]
+__all__ = ["BoardBlur", "Noise", "level_prior", "profile_shape"]
 
 Single = NDArray[np.float32]
 
 _FLAT = 0.95  # light, of -1 to 1, beyond which the levels are reached but for little
 # Noise that seems smaller than this share of the largest, as that of clipped pixels does, is not believed.
 _LEAST_SHARE = 0.3
+_LEAST_BLUR = 0.2905  # px
+_ROUND, _ROUND_ROWS = 0.5, 1.0  # relative, of the blur's square; rows' worth of belief that it is round
 _BLUR_SPREAD = 0.03  # relative, of single edges' blur around the board's at least
 _ENOUGH = 10000  # pixels to learn the profile's shape from
 _TAILS, _BENDS = 0.05, 0.3  # standard deviations of the coefficients before anything is known
@@ -124,14 +126,43 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     return replace(shape, tails=shape.tails + change[:2], bend=bend)
 
 
-def blur_of(fit: Fit, good: NDArray[np.bool_]) -> tuple[float, float]:
-    """Blur [px] of a board and the variance [px^2] of its edges' blur, beyond that of the fits."""
-    if not good.any():
-        good = np.ones_like(good)
-    sigma = fit.values[good, BLUR]
-    usual = median(sigma)
-    scatter = median((sigma - usual) ** 2) / 0.455
-    return usual, max(scatter - 2 * median(fit.covariance[good, BLUR, BLUR]), 0.0)
+@dataclass(frozen=True, eq=False)
+class BoardBlur:
+    """Blur of a board's edges: ``sigma^2 = n^T S n`` for an edge with the normal n.
+
+    Attributes
+    ----------
+    matrix : (2, 2) array [px^2]
+        S: round but for motion, and for lenses that see edges one way sharper than the other.
+    spread : float [px^2]
+        Variance of single edges' blur around that, beyond that of the fits.
+    """
+
+    matrix: Array
+    spread: float
+
+    @classmethod
+    def of(cls, fit: Fit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
+        """From the good ones of fits of edges with normals (E, 2)."""
+        if not good.any():
+            good = np.ones_like(good)
+        sigma, (n_u, n_v) = fit.values[good, BLUR], normal[good].T
+        usual = median(sigma)
+        terms = np.stack([n_u * n_u, 2 * n_u * n_v, n_v * n_v])
+        # Held to be round unless many edges say otherwise; single ones may be wrong.
+        rest = sigma**2 - usual**2
+        weight = 1 / (1 + (rest / (_ROUND * usual**2)) ** 2)
+        normal_matrix = (terms * weight) @ terms.T + np.eye(3) * _ROUND_ROWS
+        uu, uv, vv = np.linalg.solve(normal_matrix, terms @ (weight * rest))
+        matrix = usual**2 * np.eye(2) + np.array([[uu, uv], [uv, vv]])
+        blur = cls(matrix, 0.0)
+        scatter = median((sigma - blur.along(normal[good])) ** 2) / 0.455
+        return cls(matrix, max(scatter - 2 * median(fit.covariance[good, BLUR, BLUR]), 0.0))
+
+    def along(self, normal: Array) -> Array:
+        """(E,) blur [px] of edges with normals (E, 2)."""
+        square = ((normal @ self.matrix) * normal).sum(axis=1)
+        return np.sqrt(np.maximum(square, _LEAST_BLUR**2))
 
 
 def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: float, noise: float) -> Prior:
