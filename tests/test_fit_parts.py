@@ -71,7 +71,7 @@ def straight(angle: float, size: float = 20.0) -> SmoothMap:
 def test_strips_hold_every_pixel_once(angle: float) -> None:
     image = np.arange(90 * 100, dtype=np.uint16).reshape(90, 100)
     lines = grid_lines(straight(angle), np.array([[0.5, 0.0]]), np.array([False]), np.ones(1))
-    strips = gather(image, lines, np.array([4.0]), np.array([1.5]))
+    strips = gather(image, lines, np.array([4.0]), np.array([[1.5, 1.5]]))
     v, u = np.mgrid[0:90, 0:100]
     du, dv = u - lines.middle[0, 0], v - lines.middle[0, 1]
     s = du * lines.tangent[0, 0] + dv * lines.tangent[0, 1]
@@ -84,7 +84,7 @@ def test_strips_hold_every_pixel_once(angle: float) -> None:
 def test_strips_know_what_lies_outside_the_image() -> None:
     image = np.zeros((90, 100), dtype=np.uint8)
     lines = grid_lines(straight(0.0), np.array([[0.5, 2.3]]), np.array([False]), np.ones(1))
-    strips = gather(image, lines, np.array([6.0]), np.zeros(1))
+    strips = gather(image, lines, np.array([6.0]), np.zeros((1, 2)))
     assert 0 < strips.beyond[0] < 1
     assert strips.inside.sum() > 0
 

@@ -181,7 +181,7 @@ def _by_moments(board: Board, found: MapFit, shading: Shading) -> tuple[MapFit, 
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
     half = np.clip(half, 2.0, _WIDEST)
-    strips = gather(board.image, lines, half, 0.2 * lines.length, _stride(lines))
+    strips = gather(board.image, lines, half, 0.2 * lines.length[:, None], _stride(lines))
     offset, _, blur = moments(strips, half, *shading.at(lines.middle))
     sigma = float(np.clip(median(blur), 0.33, 0.25 * median(lines.width)))
     rows = board.rows(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
@@ -304,7 +304,7 @@ def _pixels(
     board: Board, lines: Lines, sigma: Array, shading: Shading, reach: Array, stride: int
 ) -> EdgeData:
     half = np.minimum(reach, 0.5 * lines.width)
-    strips = gather(board.image, lines, half, np.zeros(len(half)), stride)
+    strips = gather(board.image, lines, half, np.zeros((len(half), 1)), stride)
     contrast = shading.at(lines.middle)[1]
     nearest = np.where(sigma < _SHARP, _NEAREST_SHARP / sigma, _NEAREST)
     return edge_data(strips, lines, sigma, shading.slopes(lines.middle), contrast, nearest)
@@ -320,7 +320,7 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     sigma = 0.5 * (blur.along(lines[0].normal) + blur.along(lines[1].normal))
     contrast = fitted.shading.at(place)[1]
     slopes = fitted.shading.slopes(place)
-    data = vertex_data(board.image, lines, light, sigma, _REACH, slopes, contrast)
+    data = vertex_data(board.image, lines, light, sigma, _REACH, slopes, contrast, _ends(board.grid.seen))
     tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
     shape = Shape(tails, fitted.shape.bend)
     if fitted.shape.half is not None:
@@ -339,6 +339,14 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
         variance *= fitted.map.excess
         departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
     return fit, lines, believable(fit, departure, data.beyond)
+
+
+def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(V, 2, 2) which lines of seen vertices, along c and along r, end where no vertex follows, either way."""
+    beyond = ~np.pad(seen, 1)
+    along_c = np.stack([beyond[1:-1, :-2], beyond[1:-1, 2:]], axis=-1)
+    along_r = np.stack([beyond[:-2, 1:-1], beyond[2:, 1:-1]], axis=-1)
+    return np.asarray(np.stack([along_c[seen], along_r[seen]], axis=1))
 
 
 def _shading(first: Fitted) -> Shading:

@@ -128,8 +128,8 @@ def gather(
     image : (H, W) array
     lines : Lines
     half_width : (E,) array [px]
-    trim : (E,) array [px]
-        What is left out at both ends.
+    trim : (E, 2) array [px]
+        What is left out at the two ends.
     stride : int
         Only every so manieth column.
     """
@@ -138,7 +138,7 @@ def gather(
     t = np.take_along_axis(lines.tangent, order, axis=1)
     n = np.take_along_axis(lines.normal, order, axis=1)
     middle = np.take_along_axis(lines.middle, order, axis=1)
-    low, high = lines.ends[:, 0] + trim, lines.ends[:, 1] - trim
+    low, high = (lines.ends + trim * [1, -1]).T
     reach = 0.5 * (high - low) * np.abs(t[:, 0]) + half_width * np.abs(t[:, 1])
     centre = middle + (0.5 * (low + high))[:, None] * t
     count = int(np.ceil((2 * reach.max() + 1) / stride))

@@ -31,6 +31,7 @@ Single = NDArray[np.float32]
 # Values of a vertex's fit: offset [px] and tilt [px over the half length] of the line along c and of that
 # along r, then those of `Fit`.
 FIRST, SECOND = 0, 2
+_LAST, _MOST_LAST = 1.5, 0.08  # sigma left out at the board's end, and at most, as a share of the line
 _ALONE = 9.0  # sigma to the next parallel line, beyond which it cannot be noticed
 
 
@@ -88,6 +89,7 @@ def vertex_data(
     reach: float,
     slopes: tuple[Array, Array],
     contrast: Array,
+    last: NDArray[np.bool_],
 ) -> VertexData:
     """Gather pixels for fits.
 
@@ -105,11 +107,14 @@ def vertex_data(
         Of A and B.
     contrast : (V,) array [DN]
         B where the slopes hold.
+    last : (V, 2, 2) bool array
+        Which ends of the two lines are the board's: at a fold, what blur brings there is another plane's.
     """
     parts = []
     for k in (0, 1):
         half = np.minimum(reach * sigma, 0.5 * lines[k].width)
-        parts.append(gather(image, lines[k], half, np.zeros(len(half))))
+        trim = np.minimum(_LAST * sigma, _MOST_LAST * lines[k].length)[:, None] * last[:, k]
+        parts.append(gather(image, lines[k], half, trim))
     u, v, value, inside = (
         np.concatenate([getattr(part, name) for part in parts], axis=1)
         for name in ("u", "v", "value", "inside")
