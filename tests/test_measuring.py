@@ -208,21 +208,8 @@ def test_midpoints_in_every_condition(name: str) -> None:
     assert found_errors.kept >= KEPT.get(name, 0.99)
 
 
-# What vertices do not reach yet; mid-points do.
-SHORT = {
-    "tilt 75": "98.6 % are kept: windows of slanted vertices reach into their neighbours",
-    "three planes across": "variances are half what they should be beside a fold that the pattern crosses",
-}
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(name, marks=pytest.mark.xfail(reason=SHORT[name])) if name in SHORT else name
-        for name in BEST + GOOD
-    ],
-)
+@pytest.mark.parametrize("name", BEST + GOOD)
 def test_vertices_in_every_condition(name: str) -> None:
     found_errors = errors(name, range(8), "vertices")
     assert found_errors.ratio < (1.2 if name in BEST else 2.0)

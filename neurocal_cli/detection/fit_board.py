@@ -342,7 +342,7 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
 
 
 def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(V, 2, 2) which lines of seen vertices, along c and along r, end where no vertex follows, either way."""
+    """(V, 2, 2) where no vertex follows a seen one: back and forth, along c and along r."""
     beyond = ~np.pad(seen, 1)
     along_c = np.stack([beyond[1:-1, :-2], beyond[1:-1, 2:]], axis=-1)
     along_r = np.stack([beyond[:-2, 1:-1], beyond[2:, 1:-1]], axis=-1)

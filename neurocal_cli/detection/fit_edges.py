@@ -144,10 +144,10 @@ def edge_data(
     value = strips.value - strips.u * slope_a[:, :1] - strips.v * slope_a[:, 1:]
     relative = slope_b / contrast.astype(np.float32)[:, None]
     gain = 1 + strips.u * relative[:, :1] + strips.v * relative[:, 1:]
-    for side, width in ((-1, lines.width), (1, lines.width)):
-        close = width < _ALONE * sigma
+    for k, side in ((0, 1), (1, -1)):
+        close = lines.apart[:, k] < _ALONE * sigma
         if close.any():
-            t = (width[close, None].astype(np.float32) + side * strips.d[close]) * per_sigma[close]
+            t = (lines.apart[close, k, None].astype(np.float32) + side * strips.d[close]) * per_sigma[close]
             Q[close] *= erf_and_density(t)[0]
     return EdgeData(strips.s, strips.d, value, gain, Q, R, used.astype(np.float32), strips.beyond)
 

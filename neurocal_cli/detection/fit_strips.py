@@ -15,7 +15,8 @@ __all__ = ["Lines", "Strips", "gather", "grid_lines"]
 Single = NDArray[np.float32]
 
 _AROUND = np.array([[0, 0], [-0.5, 0], [0.5, 0], [-0.5, -0.2], [-0.5, 0.2], [0.5, -0.2], [0.5, 0.2]])
-_NEIGHBOURS = np.array([[0.0, -0.5], [0.0, 0.5]])
+_CLOSEST = 0.5  # px
+_NEIGHBOURS = np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +35,8 @@ class Lines:
         Tangential coordinates of the two ends.
     crossing : (E, 2, 2) array
         Unit normals of the lines that cross at the two ends, pointing into the piece.
-    width : (E,) array [px]
-        Distance to the next parallel lines, the smaller one.
+    apart : (E, 2) array [px]
+        Distance to the next parallel lines, against the normal and along it.
     """
 
     middle: Array
@@ -44,7 +45,12 @@ class Lines:
     curvature: Array
     ends: Array
     crossing: Array
-    width: Array
+    apart: Array
+
+    @property
+    def width(self) -> Array:
+        """(E,) distance to the nearer parallel line [px]."""
+        return np.asarray(self.apart.min(axis=1))
 
     @property
     def length(self) -> Array:
@@ -66,7 +72,7 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
         +1 where the light side is that of growing r (of growing c for vertical ones), else -1.
     """
     swap = vertical[:, None, None]
-    offsets = np.concatenate([_AROUND, 2 * _NEIGHBOURS])
+    offsets = np.concatenate([_AROUND, _NEIGHBOURS])
     offsets = np.where(swap, offsets[:, ::-1], offsets)
     points = at.at(centre[:, None] + offsets)
     middle, first, last = points[:, 0], points[:, 1], points[:, 2]
@@ -86,7 +92,8 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
     inward = np.einsum("eki,ei->ek", crossing, tangent) * [1.0, -1.0]
     crossing *= np.sign(inward)[..., None]
     apart = np.einsum("eki,ei->ek", points[:, 7:9] - middle[:, None], normal)
-    return Lines(middle, tangent, normal, curvature, ends, crossing, np.abs(apart).min(axis=1))
+    apart = np.stack([-apart.min(axis=1), apart.max(axis=1)], axis=-1)
+    return Lines(middle, tangent, normal, curvature, ends, crossing, np.maximum(apart, _CLOSEST))
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fit_box import sharp_profile
 from neurocal_cli.detection.fit_map import SmoothMap
 from neurocal_cli.detection.fit_newton import Fit, Linear, Part, Prior, Shape, gauss_newton
-from neurocal_cli.detection.fit_profile import erf_and_density, response
+from neurocal_cli.detection.fit_profile import Real, erf_and_density, response
 from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines, packed
 from neurocal_cli.geometry import Array
 
@@ -32,6 +32,8 @@ Single = NDArray[np.float32]
 # along r, then those of `Fit`.
 FIRST, SECOND = 0, 2
 _LAST, _MOST_LAST = 1.5, 0.08  # sigma left out at the board's end, and at most, as a share of the line
+# Terms of the series for oblique crossings up to a cosine, and for all others.
+_TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
 _ALONE = 9.0  # sigma to the next parallel line, beyond which it cannot be noticed
 
 
@@ -140,9 +142,9 @@ def _faded(lines: tuple[Lines, Lines], distances: tuple[Single, Single], sigma: 
     """What the parallel lines on both sides leave of the edges, where they are near."""
     Q = np.ones_like(distances[0])
     for line, d in zip(lines, distances, strict=True):
-        close = line.width < _ALONE * sigma
-        for side in (-1, 1):
-            t = (line.width[close, None] + side * d[close]) / sigma[close, None]
+        for k, side in ((0, 1), (1, -1)):
+            close = line.apart[:, k] < _ALONE * sigma
+            t = (line.apart[close, k, None] + side * d[close]) / sigma[close, None]
             Q[close] *= erf_and_density(t.astype(np.float32))[0]
     return Q
 
@@ -195,18 +197,15 @@ def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, s
     E1, slope1, widening1, density1 = sharp_profile(z1, sigma, shape.tails, halves[0])
     E2, slope2, widening2, density2 = sharp_profile(z2, sigma, shape.tails, halves[1])
     rho = data.rho
-    # The tetrachoric series of two correlated normal variables, to the second order.
-    both = 4 * rho * density1 * density2
-    series = both * (1 + 0.5 * rho * z1 * z2)
-    x = (E1 * E2 + series) * data.Q
-    bent1, bent2 = 0.5 * both * rho * z2 - z1 * series, 0.5 * both * rho * z1 - z2 * series
+    series, bent1, bent2 = _crossed(z1, z2, rho, density1 * density2)
+    x = np.asarray((E1 * E2 + series) * data.Q, dtype=data.value.dtype)
     by_z1, by_z2 = (slope1 * E2 + bent1) * data.Q, (slope2 * E1 + bent2) * data.Q
     widening = (widening1 * E2 + E1 * widening2 - z1 * bent1 - z2 * bent2) * data.Q
     F, steep = response(x, shape.bend)
     factor = -contrast / sigma * steep * data.gain
     by_z1 *= factor
     by_z2 *= factor
-    jacobian = np.empty((len(x), 7, x.shape[1]), dtype=x.dtype)
+    jacobian = np.empty((len(x), 7, x.shape[1]), dtype=data.value.dtype)
     jacobian[:, FIRST], jacobian[:, FIRST + 1] = by_z1, by_z1 * levers[0]
     jacobian[:, SECOND], jacobian[:, SECOND + 1] = by_z2, by_z2 * levers[1]
     jacobian[:, 4] = 1
@@ -215,3 +214,25 @@ def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, s
     residual = data.value - mean - contrast * jacobian[:, 5]
     z = np.where(np.abs(z1) < np.abs(z2), z1, z2)
     return Linear(jacobian, residual, z, x)
+
+
+def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, Real]:
+    """What the angle between two lines adds to E(z1) E(z2), and its derivatives by z1 and z2.
+
+    The tetrachoric series of two correlated normal variables, 4 phi phi sum_n rho^n / n! He_{n-1} He_{n-1},
+    the longer the more oblique the lines are.
+    """
+    most = float(np.abs(rho).max(initial=0.0))
+    terms = next((n for n, limit in _TERMS if most < limit), _MOST_TERMS)
+    power: Real = 4 * rho * density
+    # He_{n-1} and He_n of both.
+    last1, now1, last2, now2 = np.ones_like(z1), z1, np.ones_like(z2), z2
+    series, by_z1, by_z2 = power.copy(), -power * z1, -power * z2
+    for n in range(2, terms + 1):
+        power = power * rho / n
+        last1, now1 = now1, z1 * now1 - (n - 1) * last1
+        last2, now2 = now2, z2 * now2 - (n - 1) * last2
+        series += power * last1 * last2
+        by_z1 -= power * now1 * last2
+        by_z2 -= power * last1 * now2
+    return series, by_z1, by_z2
