@@ -8,7 +8,6 @@ true one lies within the first fold.
 from __future__ import annotations
 
 import numpy as np
-from numpy.polynomial import polynomial
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
@@ -37,8 +36,7 @@ def first_fold(lens: Lens) -> float:
     k1, k2, _, _, k3, k4, k5, k6 = np.r_[lens.coefficients, np.zeros(8 - len(lens.coefficients))]
     top, bottom = np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
     # With s = r^2: d/dr (r top / bottom) is 0 where (top + 2 s top') bottom = 2 s top bottom'.
-    growth = polynomial.polymul(polynomial.polyadd(top, _twice_s_slope(top)), bottom)
-    slope = polynomial.polysub(growth, polynomial.polymul(top, _twice_s_slope(bottom)))
+    slope = np.convolve(top + _twice_s_slope(top), bottom) - np.convolve(top, _twice_s_slope(bottom))
     return float(np.sqrt(min(_first_root(slope), _first_root(bottom))))
 
 
@@ -48,7 +46,7 @@ def _twice_s_slope(p: Array) -> Array:
 
 def _first_root(coefficients: Array) -> float:
     """Smallest positive real root of a polynomial, infinity if there is none; lowest order first."""
-    roots = polynomial.polyroots(np.trim_zeros(coefficients, "b"))
+    roots = np.roots(coefficients[::-1])
     real = roots.real[(np.abs(roots.imag) <= _REAL * np.abs(roots.real)) & (roots.real > 0)]
     return float(real.min(initial=np.inf))
 
