@@ -327,6 +327,15 @@ def test_photographs_are_nearly_as_good_as_with_a_joint_fit(
     check_beside_joint(points if weighted else replace(points, covariance=None), 1.15)
 
 
+@pytest.mark.slow
+def test_a_photograph_of_one_large_board_becomes_straight() -> None:
+    if not DATA.is_dir():
+        pytest.skip("the real data is not beside the project")
+    found = fit_plumb_line(detected("line_pattern/chessboard.jpg", 36, 25, 1.0))
+    assert found.rms_before > 1.5
+    assert found.rms < 0.42
+
+
 _DETECTED: dict[str, Correspondences] = {}
 
 
