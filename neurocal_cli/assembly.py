@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
+from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.fitting import Fit
 from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
-from neurocal_cli.job import Job, Solution
+from neurocal_cli.job import Solution
 from neurocal_cli.lens import Lens, coefficient_names
-from neurocal_cli.observability import check_determined
-from neurocal_cli.pixel_error import residuals
+from neurocal_cli.observability import refuse_undetermined
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, intrinsic_matrix
 from neurocal_cli.uncertainty import Covariance, covariance
+from neurocal_cli.user_units import translations
 from neurocal_cli.views import Views
+from neurocal_cli.whiteness import of_points
 
 __all__ = ["assemble"]
 
@@ -25,20 +27,44 @@ __all__ = ["assemble"]
 _POOR = 0.05
 _POOR_THETA = 0.02  # rad
 _TOLD_APART = 2.0  # standard deviations
-_MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor a lens
+_NAMED = 5  # wrong points that the warning names
 
 
-def assemble(
-    job: Job, points: Correspondences, solution: Solution, *, method: str, trainer: str, seed: int, name: str
-) -> Calibration:
-    """Put the result of `neuro.solve` into the user's units.
+def assemble(fit: Fit, rejected: Rejected, *, method: str, trainer: str, seed: int, name: str) -> Calibration:
+    """Put a fit into the user's units.
 
     Raises
     ------
     DegenerateGeometryError
         The points leave the answer open.
     """
-    return _Assembly(points, job.views, job.known, solution).calibration(method, trainer, seed, name)
+    job = fit.job
+    found = _Assembly(fit.points, job.views, job.known, fit.solution).calibration(method, trainer, seed, name)
+    return replace(
+        found,
+        rejected=rejected,
+        lens_choice=fit.lens_choice or {},
+        straight_lines=fit.straight_lines,
+        warnings=(*found.warnings, *_rejection_warnings(rejected, len(fit.points))),
+    )
+
+
+def _rejection_warnings(rejected: Rejected, kept: int) -> tuple[str, ...]:
+    """Name wrong views, and the first of the wrong points by their line and id."""
+    lines = [f"view {name!r} is left out: {reason}" for name, reason in rejected.views.items()]
+    points = rejected.points
+    if points is None:
+        return tuple(lines)
+    single = np.flatnonzero([points.view_names[v] not in rejected.views for v in points.view_index])
+    if single.size:
+        places = []
+        for row in single[:_NAMED]:
+            label = "" if points.point is None else f" ({points.point[row]})"
+            places.append(f"{points.place(int(row))}{label}")
+        more = f" and {single.size - _NAMED} more, listed in the calibration" if single.size > _NAMED else ""
+        share = f"{single.size} of {kept + len(rejected)} points"
+        lines.append(f"{share} contradict the others and are left out: {', '.join(places)}{more}")
+    return tuple(lines)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +82,7 @@ class _Assembly:
         cov = covariance(
             refined.normal, known.free_camera, known.free_poses, 2 * len(views.index), solution.shared
         )
-        self._check(cov)
+        refuse_undetermined(views, known, refined.state, cov)
         A = known.matrix(refined.state.entries[0], views)
         intrinsics = known.intrinsics or Intrinsics.from_matrix(A)
         if known.type != 3 and not known.free[1]:
@@ -90,33 +116,10 @@ class _Assembly:
             network=self._network(rmse),
             camera_name=name,
             warnings=(
-                *self._misfit(rmse),
                 *_warnings(intrinsics, std),
                 *_noise_coefficients(Lens(known.lens.model, refined.state.k), std),
             ),
         )
-
-    def _misfit(self, rmse: float) -> tuple[str, ...]:
-        """A camera that does not fit its points at all."""
-        spread = self.views.pixel_scale * float(np.sqrt((self.views.pixels**2).sum(axis=1).mean()))
-        if rmse < _MISFIT * spread:
-            return ()
-        given = {3: ", and the intrinsics", 4: ", and the poses"}.get(self.known.type, "")
-        return (
-            f"the camera fits its points only to {rmse:.3g} px; check that each pixel belongs to its point, "
-            f"the order and the signs of X,Y,Z and u,v{given}",
-        )
-
-    def _check(self, cov: Covariance) -> None:
-        entries = self.solution.refined.state.entries[0]
-        free = np.flatnonzero(self.known.free)
-        relative = np.zeros(2)
-        for slot, entry in enumerate((0, 2)):
-            if entry in free:
-                place = int(np.flatnonzero(free == entry)[0])
-                relative[slot] = np.sqrt(cov.entries[place, place]) / entries[entry]
-        normals = (self.solution.refined.state.R @ self.views.basis)[:, :, 2]
-        check_determined(self.views, self.known, relative, cov.smallest, normals)
 
     def _camera_covariance(self, intrinsics: Intrinsics, cov: Covariance) -> tuple[Array, dict[str, float]]:
         """Covariance of the intrinsic parameters and the lens's coefficients, and their std; 0 if given."""
@@ -136,10 +139,9 @@ class _Assembly:
     def _views(self, cov: Covariance) -> tuple[dict[str, ViewResult], float, float]:
         """Poses in world units with their std, and the pixel error (3), unweighted."""
         views, known = self.views, self.known
-        R, t = self.solution.refined.state.R, self.solution.refined.state.t
+        R = self.solution.refined.state.R
         centre = (R @ views.centre[..., None])[..., 0]
-        scale = views.scale[:, None]
-        t_world = t * scale - centre
+        t_world = translations(views, self.solution.refined.state)
         if known.poses is not None:
             R = np.stack([known.poses[name].R for name in views.names])
             t_world = np.stack([known.poses[name].t for name in views.names])
@@ -170,11 +172,8 @@ class _Assembly:
 
     def _squared_errors(self) -> Array:
         """Squared pixel error of each point, sorted by view; (N,)."""
-        tiles = self.views.tiles
-        errors = (residuals(tiles, self.solution.refined.state) ** 2).sum(axis=1)
-        rank = np.arange(len(self.views.index)) - np.repeat(self.views.first, self.views.counts)
-        slot = np.repeat(tiles.first * tiles.local.shape[2], self.views.counts) + rank
-        return np.asarray(errors.reshape(-1)[slot] * self.views.pixel_scale**2)
+        errors = of_points(self.views, self.solution.refined.state)
+        return np.asarray((errors**2).sum(axis=1) * self.views.pixel_scale**2)
 
     def _network(self, rmse: float) -> NetworkRecord:
         views, tally = self.views, self.solution.tally

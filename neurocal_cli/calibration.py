@@ -12,7 +12,7 @@ from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Calibration", "NetworkRecord", "StopReason", "StraightLines", "ViewResult"]
+__all__ = ["Calibration", "NetworkRecord", "Rejected", "StopReason", "StraightLines", "ViewResult"]
 
 
 class StopReason(str, Enum):
@@ -109,6 +109,29 @@ class ViewResult:
 
 
 @dataclass(frozen=True, eq=False)
+class Rejected:
+    """Points that were set aside because they contradict the others.
+
+    Attributes
+    ----------
+    points : Correspondences or None
+        With their lines in the file; None when there are none.
+    error_px : (M,) array [px]
+        How far each is from where the camera sees it; nan where it does not, and in views that were set
+        aside whole.
+    views : dict of str by view name
+        Views that were set aside whole, each with the reason.
+    """
+
+    points: Correspondences | None = None
+    error_px: Array = field(default_factory=lambda: np.zeros(0))
+    views: Mapping[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.error_px)
+
+
+@dataclass(frozen=True, eq=False)
 class Calibration:
     """A calibrated camera.
 
@@ -121,7 +144,10 @@ class Calibration:
         Names of the intrinsic parameters that were given.
     views : dict of ViewResult by view name
     points : Correspondences
-        What it was calibrated from.
+        What it was calibrated from, without what was rejected.
+    rejected : Rejected
+    lens_choice : dict of float by lens model [px]
+        The models that ``distortion="auto"`` chose from and their rms error on data left out.
     covariance : (n, n) array
         Of the free intrinsic parameters, in the order of `covariance_names`; per-view blocks are
         in `views`.
@@ -142,7 +168,6 @@ class Calibration:
     stop_reason: str
     rmse_px: float
     max_px: float
-    n_rejected: int = 0
     distortion_model: str = "none"
     distortion: Array = field(default_factory=lambda: np.zeros(0))
     covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
@@ -151,6 +176,13 @@ class Calibration:
     straight_lines: StraightLines | None = None
     camera_name: str = "camera"
     warnings: tuple[str, ...] = ()
+    rejected: Rejected = field(default_factory=Rejected)
+    lens_choice: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def n_rejected(self) -> int:
+        """Points that were set aside."""
+        return len(self.rejected)
 
     @property
     def K(self) -> Array:

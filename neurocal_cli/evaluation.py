@@ -17,9 +17,10 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import distort
+from neurocal_cli.lens import Lens
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import KnownCamera
+from neurocal_cli.user_units import see
 
 __all__ = ["CameraEvaluation", "ViewEvaluation", "evaluate_camera"]
 
@@ -153,9 +154,9 @@ def _fit_poses(
     camera: KnownCamera | Intrinsics, points: Correspondences, seed: int
 ) -> tuple[dict[str, Pose], list[str]]:
     """Type 3: poses of views that the calibration does not know, and what to warn of."""
-    from neurocal_cli.methods import calibrate  # the trainers: only when there is something to train
+    from neurocal_cli.methods import fit_poses  # the trainers: only when there is something to train
 
-    fit = calibrate(points, type=3, intrinsics=camera, seed=seed)
+    fit = fit_poses(points, camera, seed)
     poses = {name: view.pose for name, view in fit.views.items()}
     warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
     if not fit.converged:
@@ -170,14 +171,9 @@ def _predict(
     R = np.stack([pose.R for pose in poses])[points.view_index]
     t = np.stack([pose.t for pose in poses])[points.view_index]
     camera = np.einsum("nij,nj->ni", R, points.world) + t
-    depth = camera[:, 2]
-    in_front = depth > 0
-    image = camera[:, :2] / np.where(in_front, depth, np.nan)[:, None]
-    A = known.A if isinstance(known, Intrinsics) else known.intrinsics.A
-    if not isinstance(known, Intrinsics) and known.distortion_model != "none":
-        bent = distort(known.distortion_model, known.distortion, image[:, 0], image[:, 1])
-        image = np.column_stack(bent)
-    return image @ A[:2, :2].T + A[:2, 2], in_front
+    if isinstance(known, Intrinsics):
+        return see(known.A, Lens(), camera)
+    return see(known.intrinsics.A, Lens(known.distortion_model, known.distortion), camera)
 
 
 def _measure(

@@ -19,9 +19,10 @@ from neurocal_cli.pixel_error import ENTRIES
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, intrinsic_matrix
 
-__all__ = ["check_lens", "straighten"]
+__all__ = ["check_lens", "folds_back", "straighten"]
 
 _BORDER = 33  # points along each side of the image at which the lens is checked
+_FARTHEST = 500  # points looked at
 
 
 def straighten(points: Correspondences, known: Known) -> Correspondences:
@@ -71,7 +72,12 @@ def check_lens(job: Job, solution: Solution, points: Correspondences) -> tuple[J
         state = replace(solution.refined.state, lens=lens.model, k=lens.coefficients)
         solution = Solution(job.refine(state), job.tally)
     state = solution.refined.state
-    _refuse_fold(Lens(lens.model, state.k), known.matrix(state.entries[0], job.views), points)
+    where = folds_back(Lens(lens.model, state.k), known.matrix(state.entries[0], job.views), points)
+    if where is not None:
+        raise DegenerateGeometryError(
+            f"the distortion {lens.model} folds back inside the {where}; choose a simpler model, or "
+            "give points nearer to the image's corners"
+        )
     return job, solution
 
 
@@ -84,9 +90,16 @@ def _straight_pixels(lens: Lens, A: Array, pixels: Array) -> Array:
     return np.column_stack([a * x + s * y + u0, b * y + v0])
 
 
-def _refuse_fold(lens: Lens, A: Array, points: Correspondences) -> None:
-    """Check the lens over the points, and over the image's border where its size is known."""
-    places = [points.pixels]
+def folds_back(lens: Lens, A: Array, points: Correspondences) -> str | None:
+    """Where a lens folds back: within the points, within the rest of the image, or nowhere.
+
+    The image is looked at along its border, where its size is known.
+    """
+    if lens.model == "none":
+        return None
+    # The farthest points say it all.
+    away = np.hypot(points.pixels[:, 0] - A[0, 2], points.pixels[:, 1] - A[1, 2])
+    places = [points.pixels[np.argsort(-away, kind="stable")[:_FARTHEST]]]
     if points.image_size is not None:
         width, height = points.image_size
         along, ends = np.linspace(0, 1, _BORDER), np.zeros(_BORDER)
@@ -98,7 +111,5 @@ def _refuse_fold(lens: Lens, A: Array, points: Correspondences) -> None:
         radius = np.hypot((straight[:, 0] - A[0, 2]) / A[0, 0], (straight[:, 1] - A[1, 2]) / A[1, 1])
         largest = float(np.nanmax(radius, initial=0.0))
         if not reached or fold_radius(lens.model, lens.coefficients, largest) <= largest:
-            raise DegenerateGeometryError(
-                f"the distortion {lens.model} folds back inside the {what}; choose a simpler model, or "
-                "give points nearer to the image's corners"
-            )
+            return what
+    return None

@@ -11,6 +11,7 @@ from neurocal_cli.network import Patterns
 from neurocal_cli.pixel_error import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.problems import intrinsic_matrix
 from neurocal_cli.starts import FixedWeights, learn
+from neurocal_cli.user_units import translations_normalised
 from neurocal_cli.views import Views
 
 __all__ = ["solve_given_poses"]
@@ -73,4 +74,4 @@ def _normalised_poses(job: Job) -> tuple[Array, Array]:
     assert poses is not None  # type 4
     R = np.stack([poses[name].R for name in views.names])
     t = np.stack([poses[name].t for name in views.names])
-    return R, ((R @ views.centre[..., None])[..., 0] + t) / views.scale[:, None]
+    return R, translations_normalised(views, R, t)

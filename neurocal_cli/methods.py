@@ -9,34 +9,32 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurocal_cli.assembly import assemble
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration import Calibration, Rejected
 from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
+from neurocal_cli.fitting import Fitter
 from neurocal_cli.geometry import Array
-from neurocal_cli.given_lens import check_lens, straighten
-from neurocal_cli.job import Job, Strategy
+from neurocal_cli.job import Strategy
 from neurocal_cli.lens import MODELS, Lens, coefficient_names
-from neurocal_cli.neuro import solve
-from neurocal_cli.observability import check_points
-from neurocal_cli.plumb_camera import lens_and_camera
-from neurocal_cli.plumb_line import PlumbLine, fit_plumb_line
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, KnownCamera, known_for
-from neurocal_cli.reweighting import reweighted
+from neurocal_cli.rejection import fit_robustly
 from neurocal_cli.starts import Agreement
 from neurocal_cli.training import Task, Trained
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
-from neurocal_cli.views import arrange
 
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions
 
-__all__ = ["DISTORTIONS", "METHODS", "OUTLIERS", "TRAINERS", "calibrate"]
+__all__ = ["DISTORTIONS", "METHODS", "OUTLIERS", "TRAINERS", "calibrate", "fit_poses"]
 
 METHODS = ("neuro",)
 TRAINERS = ("lm", "backprop")
-DISTORTIONS = (*MODELS, "plumb-line")
-OUTLIERS = ("keep",)
+DISTORTIONS = ("auto", *MODELS, "plumb-line")
+OUTLIERS = ("reject", "keep")
+
+_STARTS = 20
+_MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor a lens
 
 Progress = Callable[[str, float], None]
 
@@ -49,12 +47,12 @@ def calibrate(
     extrinsics: Mapping[str, Pose] | None = None,
     method: str = "neuro",
     trainer: str = "lm",
-    distortion: str = "none",
+    distortion: str = "auto",
     skew: bool = True,
-    outliers: str = "keep",
+    outliers: str = "reject",
     seed: int = 0,
     *,
-    starts: int = 20,
+    starts: int = _STARTS,
     backprop: BackpropOptions | None = None,
     camera_name: str = "camera",
     progress: Progress | None = None,
@@ -76,13 +74,14 @@ def calibrate(
         Type 4.
     method : {"neuro"}
     trainer : {"lm", "backprop"}
-    distortion : {"none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"}
-        The lens model whose coefficients are estimated with everything else; or, the paper's way,
-        k1, k2, p1 and p2 from the images of straight lines alone, then the pinhole camera. Type 3 takes
-        the lens of the given camera instead.
+    distortion : {"auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"}
+        The lens model whose coefficients are estimated with everything else; auto: the simplest that
+        the points support (`lens_choice`); plumb-line, the paper's way: k1, k2, p1 and p2 from the images
+        of straight lines alone, then the pinhole camera. Type 3 takes the lens of the given camera instead.
     skew : bool
         False: theta is pi/2.
-    outliers : {"keep"}
+    outliers : {"reject", "keep"}
+        Whether points, and whole views, that contradict the others are set aside (`rejection`).
     seed : int
         Of the random weights; the same seed gives the same result.
     starts : int
@@ -108,29 +107,49 @@ def calibrate(
     _check_options(method, trainer, distortion, outliers, starts, seed)
     camera, lens = _given_camera(intrinsics)
     known = known_for(points, type, image_center, camera, extrinsics, skew)
-    plumb: PlumbLine | None = None
-    known = _with_lens(known, distortion, lens)
-    ideal = straighten(points, known)
+    known, choice = _with_lens(known, distortion, lens)
     report = progress or (lambda stage, share: None)
     try:
-        if distortion == "plumb-line":
-            plumb = fit_plumb_line(points, known.given_centre)
-            ideal = plumb.corrected(points)
-        views = arrange(ideal)
-        check_points(views, known)
-        strategy = _strategy(trainer, starts, backprop, report)
-        job = Job(views, known, strategy, np.random.default_rng(seed), report)
-        job, solution = reweighted(job, solve(job), points)
-        if plumb is not None:
-            job, solution = lens_and_camera(job, solution, plumb, points)
-        job, solution = check_lens(job, solution, points)
-        found = assemble(job, points, solution, trainer=trainer, method=method, seed=seed, name=camera_name)
-        return found if plumb is None else replace(found, straight_lines=plumb.record)
+        fitter = Fitter(known, choice, _strategy(trainer, starts, backprop, report), seed, report)
+        if outliers == "reject":
+            fit, rejected = fit_robustly(points, fitter)
+        else:
+            fit, rejected = fitter.fit(points), Rejected()
+        found = assemble(fit, rejected, trainer=trainer, method=method, seed=seed, name=camera_name)
+        _refuse_misfit(found)
+        return found
     except DegenerateGeometryError as error:
         # Views and normal matrices do not know the file that the user should look at.
         if points.lines is None or str(error).startswith(points.source):
             raise
         raise DegenerateGeometryError(f"{points.source}: {error}") from error
+
+
+def fit_poses(points: Correspondences, camera: Intrinsics | KnownCamera, seed: int) -> Calibration:
+    """Poses of the views of a given camera from all their points, however badly they fit (type 3).
+
+    Raises
+    ------
+    InputError, DegenerateGeometryError
+        Points that do not determine the poses.
+    """
+    intrinsics, lens = _given_camera(camera)
+    known, _ = _with_lens(known_for(points, 3, None, intrinsics, None, True), "none", lens)
+    quiet: Progress = lambda stage, share: None  # noqa: E731
+    fit = Fitter(known, "", _strategy("lm", _STARTS, None, quiet), seed, quiet).fit(points)
+    return assemble(fit, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
+
+
+def _refuse_misfit(calibration: Calibration) -> None:
+    """A camera that does not fit its points at all is no answer."""
+    spread = np.sqrt(calibration.points.pixels.var(axis=0).sum())
+    if calibration.rmse_px < _MISFIT * spread:
+        return
+    given = {3: ", and the intrinsics", 4: ", and the poses"}.get(calibration.type, "")
+    raise DegenerateGeometryError(
+        f"no camera sees the points where they were seen: the best one errs by {calibration.rmse_px:.3g} px; "
+        f"check that each pixel belongs to its point, the order and the signs of X,Y,Z and u,v{given}"
+    )
 
 
 def _given_camera(given: Intrinsics | KnownCamera | Array | None) -> tuple[Intrinsics | None, Lens]:
@@ -143,15 +162,17 @@ def _given_camera(given: Intrinsics | KnownCamera | Array | None) -> tuple[Intri
     return given.intrinsics, Lens(given.distortion_model, given.distortion)
 
 
-def _with_lens(known: Known, distortion: str, given: Lens) -> Known:
+def _with_lens(known: Known, distortion: str, given: Lens) -> tuple[Known, str]:
+    """What is known of the lens, and how it is found otherwise: "auto", "plumb-line" or neither."""
     if known.type != 3:
-        model = "none" if distortion == "plumb-line" else distortion  # its lens comes later
-        return replace(known, lens=Lens(model), free_lens=model != "none")
-    if distortion not in ("none", given.model):
+        if distortion in ("auto", "plumb-line"):
+            return known, distortion
+        return replace(known, lens=Lens(distortion), free_lens=distortion != "none"), ""
+    if distortion not in ("auto", "none", given.model):
         raise UsageError(
             f"type 3 takes the lens of the given camera ({given.model}), not distortion {distortion}"
         )
-    return replace(known, lens=given, fixed=known.fixed | set(coefficient_names(given.model)))
+    return replace(known, lens=given, fixed=known.fixed | set(coefficient_names(given.model))), ""
 
 
 def _check_options(method: str, trainer: str, distortion: str, outliers: str, starts: int, seed: int) -> None:

@@ -7,10 +7,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
+from neurocal_cli.pixel_error import CameraState
 from neurocal_cli.problems import Known
+from neurocal_cli.uncertainty import Covariance
 from neurocal_cli.views import Views
 
-__all__ = ["check_determined", "check_points", "parameter_count"]
+__all__ = ["check_determined", "check_points", "parameter_count", "refuse_undetermined"]
 
 _COLLINEAR = 1e-6  # second extent as a share of the first
 _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which rounding rules
@@ -108,6 +110,31 @@ def _check_helpers(views: Views, known: Known) -> None:
         f"one plane cannot tell the camera without it; give it at least 6 points, or {needed} views of the "
         "board from different angles"
     )
+
+
+def refuse_undetermined(views: Views, known: Known, state: CameraState, cov: Covariance) -> None:
+    """Refuse an answer that the points leave open.
+
+    Parameters
+    ----------
+    views : Views
+    known : Known
+    state : CameraState
+        At the minimum.
+    cov : Covariance
+
+    Raises
+    ------
+    DegenerateGeometryError
+        A singular normal matrix, or a focal length that is hardly known.
+    """
+    free = np.flatnonzero(known.free)
+    relative = np.zeros(2)
+    for slot, entry in enumerate((0, 2)):
+        if entry in free:
+            place = int(np.flatnonzero(free == entry)[0])
+            relative[slot] = np.sqrt(cov.entries[place, place]) / state.entries[0, entry]
+    check_determined(views, known, relative, cov.smallest, (state.R @ views.basis)[:, :, 2])
 
 
 def check_determined(

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import Lens
+from neurocal_cli.lens import Lens, coefficient_names
 from neurocal_cli.pixel_error import ENTRIES
 from neurocal_cli.points import Correspondences
 from neurocal_cli.views import Views
@@ -59,13 +59,13 @@ class Known:
         Entries to estimate.
     poses : dict of Pose by view, or None
     fixed : frozenset of str
-        Names of the given intrinsic parameters.
+        Names of the given intrinsic parameters, and of coefficients of the lens that stay as they are.
     intrinsics : Intrinsics or None
         All of them, for type 3: returned as they are.
     lens : Lens
         The model to end with; its coefficients where they are given.
     free_lens : bool
-        Whether the coefficients are estimated.
+        Whether the other coefficients are estimated.
     """
 
     type: int
@@ -80,7 +80,10 @@ class Known:
     @property
     def free_camera(self) -> NDArray[np.bool_]:
         """(5 + K,) which of A's entries and of the lens's coefficients are estimated."""
-        return np.concatenate([self.free, np.full(len(self.lens.coefficients), self.free_lens)])
+        coefficients = [
+            self.free_lens and name not in self.fixed for name in coefficient_names(self.lens.model)
+        ]
+        return np.concatenate([self.free, np.array(coefficients, dtype=bool)])
 
     @property
     def given_centre(self) -> Array | None:

@@ -209,7 +209,20 @@ def _training_lines(calibration: Calibration) -> list[str]:
     training = [] if calibration.network is None else _network_lines(calibration.network)
     if calibration.straight_lines is not None:
         training.insert(0, _lens_line(calibration.straight_lines))
-    return [fit, *training, calibration.stop_reason]
+    return [fit, *training, *_lens_lines(calibration), calibration.stop_reason]
+
+
+def _lens_lines(calibration: Calibration) -> list[str]:
+    """What the lens model was chosen from, best first."""
+    choice = calibration.lens_choice
+    if not choice:
+        return []
+    errors = [f"{name} {_pixels(choice[name])}" for name in sorted(choice, key=lambda name: choice[name])]
+    chosen = calibration.distortion_model
+    return [
+        f"lens: {chosen}, the simplest that predicts data left out as well as any:",
+        f"  {', '.join(errors)} px",
+    ]
 
 
 def _lens_line(found: StraightLines) -> str:

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
-from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.noise import common_share, measured, with_common_share
-from neurocal_cli.pixel_error import residuals
 from neurocal_cli.points import Correspondences
 from neurocal_cli.views import noise_model
+from neurocal_cli.whiteness import of_points
 
 __all__ = ["reweighted"]
 
@@ -19,7 +16,7 @@ _PASSES = 10
 _SETTLED = 0.005  # change of the share that no result depends on
 
 
-def reweighted(job: Job, solution: Solution, points: Correspondences) -> tuple[Job, Solution]:
+def reweighted(job: Job, solution: Solution, points: Correspondences) -> tuple[Job, Solution, float]:
     """Refine again with the share of the noise that is the same for all points; see `noise`.
 
     Parameters
@@ -28,24 +25,21 @@ def reweighted(job: Job, solution: Solution, points: Correspondences) -> tuple[J
         Refined by the stated covariances alone.
     points : Correspondences
         What the job's views are of.
+
+    Returns
+    -------
+    job, solution
+    share : float
     """
     if points.covariance is None or not measured(points.covariance):
-        return job, solution
+        return job, solution, 0.0
     stated = points.covariance if job.views.order is None else points.covariance[job.views.order]
     share = 0.0
     for _ in range(_PASSES):
-        last, share = share, common_share(stated, _errors(job, solution))
+        last, share = share, common_share(stated, of_points(job.views, solution.refined.state))
         if abs(share - last) < _SETTLED:
             break
         whitening = noise_model(with_common_share(stated, share))[1]
         job = replace(job, views=replace(job.views, whitening=whitening), tally=job.tally)
         solution = Solution(job.refine(solution.refined.state), job.tally)
-    return job, solution
-
-
-def _errors(job: Job, solution: Solution) -> Array:
-    """Residual of each point, in the views' order; (N, 2)."""
-    views, tiles = job.views, job.views.tiles
-    errors = np.swapaxes(residuals(tiles, solution.refined.state), 1, 2).reshape(-1, 2)
-    rank = np.arange(len(views.index)) - np.repeat(views.first, views.counts)
-    return np.asarray(errors[np.repeat(tiles.first * tiles.local.shape[2], views.counts) + rank])
+    return job, solution, share

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_calibration import made_calibration
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, ViewResult
+from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, ViewResult
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
@@ -81,9 +81,22 @@ def same(a, b):
     if isinstance(a, Correspondences):
         names = [f.name for f in fields(a) if f.name not in ("source", "lines", "sources", "view")]
         return all(same(getattr(a, name), getattr(b, name)) for name in names)
-    if isinstance(a, (Calibration, ViewResult, NetworkRecord, Pose)):
+    if isinstance(a, (Calibration, Rejected, ViewResult, NetworkRecord, Pose)):
         return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a))
     return a == b
+
+
+@st.composite
+def rejections(draw, points):
+    views = draw(st.dictionaries(NAMES, NAMES, max_size=2))
+    if draw(st.booleans()):
+        return Rejected(views=views)
+    lines = np.arange(7, 7 + len(points)) if draw(st.booleans()) else None
+    return Rejected(
+        replace(points, covariance=None, image_size=None, image_center=None, lines=lines),
+        np.where(np.arange(len(points)) % 2, np.nan, 3.5),
+        views,
+    )
 
 
 @st.composite
@@ -144,7 +157,8 @@ def calibrations(draw):
         stop_reason="converged: the pixel error cannot be lowered further",
         rmse_px=draw(UNKNOWN),
         max_px=0.3,
-        n_rejected=draw(st.integers(0, 9)),
+        rejected=draw(rejections(points)),
+        lens_choice=draw(st.just({}) | st.just({"none": 1.25, "k1": float("nan")})),
         distortion_model=model,
         distortion=np.array([draw(st.floats(0.1, 1)) for _ in range(size)]),
         covariance=np.array([[1e-5, -0.0], [float("nan"), 0.1]]),

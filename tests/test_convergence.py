@@ -4,9 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from scenes import Scene, random_flat_set, random_solid, reference
-
-from neurocal_cli import calibrate
+from scenes import Scene, pinhole, random_flat_set, random_solid, reference
 
 SIGMA = 0.3  # px
 # Scenes whose Cramer-Rao bound leaves the focal length open by more than this are drawn again:
@@ -20,7 +18,7 @@ def outcomes(scene: Scene, type: int, skew: bool, rng: np.random.Generator, seed
     best = reference(scene, points, type, skew, SIGMA)
     if best.alpha_share > LARGEST_SHARE:
         return Counter(redrawn=1)
-    results = [calibrate(points, skew=skew, seed=seed, **scene.given(type)) for seed in range(seeds)]
+    results = [pinhole(points, skew=skew, seed=seed, **scene.given(type)) for seed in range(seeds)]
     # With hardly a spare equation the fit from the truth may itself be a local minimum.
     lowest = min(best.rmse_px, *(result.rmse_px for result in results))
     count: Counter[str] = Counter()

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import FEWEST, Scene, random_flat_set, random_solid, table_1
+from scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid, table_1
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from test_uncertainty import noisy, whitener
 
-from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
+from neurocal_cli import Correspondences, Intrinsics, Pose
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import INTRINSIC_NAMES, project
 from neurocal_cli.geometry import Array
@@ -89,7 +89,7 @@ def whitened_cost(cal: Calibration) -> float:
 
 
 def assert_minimum(scene: Scene, points: Correspondences, type: int, skew: bool) -> None:
-    cal = calibrate(points, skew=skew, **scene.given(type))
+    cal = pinhole(points, skew=skew, **scene.given(type))
     entries, rotations, cost = scipy_minimum(scene, points, type, skew)
     assert cal.converged
     assert whitened_cost(cal) == pytest.approx(cost, rel=1e-8)
@@ -143,15 +143,15 @@ BOTH = pytest.mark.parametrize("points", [SOLID, FLAT], ids=["solid", "flat"])
 
 @BOTH
 def test_the_order_of_the_rows_and_of_the_views_does_not_matter(points: Correspondences) -> None:
-    plain = calibrate(points)
+    plain = pinhole(points)
     for seed in range(3):
         mixed = points.select(np.random.default_rng(seed).permutation(len(points)))
-        assert_same(plain, calibrate(mixed))
+        assert_same(plain, pinhole(mixed))
 
 
 @BOTH
 def test_each_seed_gives_the_same_camera_and_one_seed_the_same_bytes(points: Correspondences) -> None:
-    plain, again = calibrate(points), calibrate(points)
+    plain, again = pinhole(points), pinhole(points)
     assert plain.intrinsics == again.intrinsics
     assert plain.std == again.std
     for name in plain.views:
@@ -161,15 +161,15 @@ def test_each_seed_gives_the_same_camera_and_one_seed_the_same_bytes(points: Cor
     assert again.network is not None
     assert plain.network.curve == again.network.curve
     for seed in range(1, 6):
-        assert_same(plain, calibrate(points, seed=seed))
+        assert_same(plain, pinhole(points, seed=seed))
 
 
 @BOTH
 def test_a_world_turned_moved_and_in_other_units_gives_the_same_camera(points: Correspondences) -> None:
-    plain = calibrate(points)
+    plain = pinhole(points)
     R, c = Rotation.from_euler("xyz", [0.4, -1.0, 2.0]).as_matrix(), np.array([300.0, -500.0, 40.0])
     for unit in (1e-3, 1.0, 1e6):
-        cal = calibrate(replace(points, world=unit * (points.world @ R.T + c)))
+        cal = pinhole(replace(points, world=unit * (points.world @ R.T + c)))
         moved = {name: plain.rotations[name] @ R.T for name in plain.views}
         for name in INTRINSIC_NAMES:
             a, b = getattr(plain.intrinsics, name), getattr(cal.intrinsics, name)
@@ -183,9 +183,9 @@ def test_a_world_turned_moved_and_in_other_units_gives_the_same_camera(points: C
 
 @BOTH
 def test_pixels_moved_and_scaled_move_and_scale_the_camera(points: Correspondences) -> None:
-    plain = calibrate(points)
+    plain = pinhole(points)
     s, move = 3.7, np.array([1000.0, -250.0])
-    cal = calibrate(replace(points, pixels=s * points.pixels + move))
+    cal = pinhole(replace(points, pixels=s * points.pixels + move))
     expected = plain.intrinsics.values() * [s, s, s, s, 1.0] + [0.0, 0.0, *move, 0.0]
     std = np.array([plain.std[name] for name in INTRINSIC_NAMES]) * [s, s, s, s, 1.0]
     assert (np.abs(cal.intrinsics.values() - expected) <= 1e-9 * np.abs(expected) + 1e-5 * std).all()
@@ -196,8 +196,8 @@ def test_pixels_moved_and_scaled_move_and_scale_the_camera(points: Correspondenc
 
 @BOTH
 def test_rows_given_twice_do_not_move_the_camera(points: Correspondences) -> None:
-    plain = calibrate(points)
-    twice = calibrate(points.select(np.repeat(np.arange(len(points)), 2)))
+    plain = pinhole(points)
+    twice = pinhole(points.select(np.repeat(np.arange(len(points)), 2)))
     for name in INTRINSIC_NAMES:
         a, b = getattr(plain.intrinsics, name), getattr(twice.intrinsics, name)
         assert abs(a - b) <= 1e-9 * abs(a) + 1e-5 * plain.std[name]
@@ -210,7 +210,7 @@ def test_a_row_of_twice_the_weight_is_a_row_given_twice(points: Correspondences)
     variance = np.where(heavy, 0.5, 1.0)
     weighted = replace(points, covariance=np.column_stack([variance, 0 * variance, variance]))
     doubled = points.select(np.sort(np.concatenate([np.arange(len(points)), np.flatnonzero(heavy)])))
-    one, two = calibrate(weighted), calibrate(doubled)
+    one, two = pinhole(weighted), pinhole(doubled)
     for name in INTRINSIC_NAMES:
         a, b = getattr(one.intrinsics, name), getattr(two.intrinsics, name)
         assert abs(a - b) <= 1e-9 * abs(a) + 1e-5 * one.std[name]
@@ -222,16 +222,16 @@ def test_only_ratios_of_the_noise_matter(points: Correspondences) -> None:
     s = rng.uniform(0.1, 2.0, (len(points), 2))
     covariance = np.column_stack([s[:, 0] ** 2, 0.3 * s[:, 0] * s[:, 1], s[:, 1] ** 2])
     points = replace(points, pixels=points.pixels + s * rng.normal(size=s.shape))  # as stated, nearly
-    one = calibrate(replace(points, covariance=covariance))
+    one = pinhole(replace(points, covariance=covariance))
     for factor in (7.0, 1e-6, 1e6):
-        assert_same(one, calibrate(replace(points, covariance=factor**2 * covariance)))
-    assert abs(one.intrinsics.alpha_u - calibrate(points).intrinsics.alpha_u) > 1e-3
+        assert_same(one, pinhole(replace(points, covariance=factor**2 * covariance)))
+    assert abs(one.intrinsics.alpha_u - pinhole(points).intrinsics.alpha_u) > 1e-3
 
 
 def test_equal_weights_are_no_weights() -> None:
     for points in (SOLID, FLAT):
         weighted = replace(points, covariance=np.tile([0.09, 0.0, 0.09], (len(points), 1)))
-        assert_same(calibrate(points), calibrate(weighted))
+        assert_same(pinhole(points), pinhole(weighted))
 
 
 def close(cal: Calibration, scene: Scene, types_std: float = 6.0) -> None:
@@ -250,7 +250,7 @@ def test_one_heavy_view_among_small_ones(seed: int) -> None:
     rng = np.random.default_rng(seed)
     many = np.column_stack([rng.uniform(0, 240, 20_000), rng.uniform(0, 150, 20_000), np.zeros(20_000)])
     scene = several([BOARD[:12], many, BOARD[20:30], BOARD, BOARD[5:25], BOARD[30:]], 0.2, seed)
-    close(calibrate(scene.points(), seed=seed), scene)
+    close(pinhole(scene.points(), seed=seed), scene)
 
 
 @pytest.mark.parametrize("skew", [True, False])
@@ -259,14 +259,14 @@ def test_views_of_all_sizes(seed: int, skew: bool) -> None:
     rng = np.random.default_rng(seed)
     sizes = [4, 5, 54, 9, 30, 6, 17, 54, 4]
     scene = several([BOARD[np.sort(rng.permutation(54)[:n])] for n in sizes], 0.1, seed)
-    close(calibrate(scene.points(), skew=skew, seed=seed), scene)
+    close(pinhole(scene.points(), skew=skew, seed=seed), scene)
 
 
 @pytest.mark.parametrize("type", [1, 2])
 @pytest.mark.parametrize("seed", range(3))
 def test_flat_and_folded_views_together(seed: int, type: int) -> None:
     scene = several([BOARD, FOLDED, BOARD, FOLDED[::3]], 0.2, seed)
-    close(calibrate(scene.points(), seed=seed, **scene.given(type)), scene)
+    close(pinhole(scene.points(), seed=seed, **scene.given(type)), scene)
 
 
 @pytest.mark.parametrize("bow", [1e-5, 1e-3, 0.5, 2.0, 6.0])
@@ -275,7 +275,7 @@ def test_boards_that_are_nearly_flat(bow: float, type: int) -> None:
     bowed = BOARD.copy()
     bowed[:, 2] = bow * (((BOARD[:, 0] - 120) / 120) ** 2 + 0.5 * ((BOARD[:, 1] - 75) / 75) ** 2)
     scene = several([bowed] * 5, 0.05)
-    cal = calibrate(scene.points(), **scene.given(type))
+    cal = pinhole(scene.points(), **scene.given(type))
     close(cal, scene)
     # Every coordinate counts in the end: the fit is as good as the noise.
     assert cal.rmse_px < 0.05 * 1.5 * np.sqrt(2)
@@ -287,7 +287,7 @@ def test_views_with_too_few_points_of_their_own_are_helped_by_others(few: int, s
     rng = np.random.default_rng(seed)
     corner = FOLDED[rng.permutation(len(FOLDED))[:few]]
     scene = several([FOLDED, corner, FOLDED[::2]], 0.05, seed)
-    close(calibrate(scene.points(), seed=seed), scene)
+    close(pinhole(scene.points(), seed=seed), scene)
 
 
 def spread_out(rng: np.random.Generator, n: int, flat: bool) -> Array:
@@ -304,7 +304,7 @@ def test_a_pose_from_four_points(flat: bool) -> None:
     for seed in range(20):
         world = spread_out(np.random.default_rng(seed), 4, flat)
         scene = several([world], 0.0, seed)
-        cal = calibrate(scene.points(), seed=seed, **scene.given(3))
+        cal = pinhole(scene.points(), seed=seed, **scene.given(3))
         # Four points in space may be seen alike from two places; then both fit to rounding.
         assert cal.rmse_px < 1e-6
         if flat:
@@ -317,7 +317,7 @@ def test_all_points_but_one_in_a_plane(type: int, skew: bool) -> None:
     world = np.concatenate([BOARD, [[100.0, 90.0, -150.0]]])
     for seed in range(3):
         scene = several([world], 0.0, seed)
-        cal = calibrate(scene.points(), skew=skew, seed=seed, **scene.given(type))
+        cal = pinhole(scene.points(), skew=skew, seed=seed, **scene.given(type))
         np.testing.assert_allclose(cal.K, CAMERA.A, rtol=1e-6, atol=1e-4)
         np.testing.assert_allclose(cal.rotations["v0"], scene.poses["v0"].R, atol=1e-7)
 
@@ -327,14 +327,14 @@ def test_the_fewest_points_fit_to_rounding() -> None:
         for seed in range(5):
             rng = np.random.default_rng(seed)
             scene = several([spread_out(rng, n, flat=n == 3)], 0.0, seed)
-            cal = calibrate(scene.points(), skew=False, seed=seed, **scene.given(kind))
+            cal = pinhole(scene.points(), skew=False, seed=seed, **scene.given(kind))
             assert cal.rmse_px < 1e-5, (kind, seed)
 
 
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
 def test_without_noise_every_parameter_is_exact(type: int) -> None:
     for scene in (table_1(), several([BOARD] * 4, 0.0), several([FOLDED, BOARD], 0.0)):
-        cal = calibrate(scene.points(), **scene.given(type))
+        cal = pinhole(scene.points(), **scene.given(type))
         np.testing.assert_allclose(cal.intrinsics.values(), scene.intrinsics.values(), rtol=1e-7)
         for name, pose in scene.poses.items():
             np.testing.assert_allclose(cal.rotations[name], pose.R, atol=1e-8)
@@ -343,25 +343,25 @@ def test_without_noise_every_parameter_is_exact(type: int) -> None:
 
 def test_labels_may_be_anything_that_sorts() -> None:
     scene = several([BOARD] * 3, 0.1)
-    by_name = calibrate(scene.points(), skew=False)
+    by_name = pinhole(scene.points(), skew=False)
     numbers = replace(scene.points(), view=np.repeat([30, 10, 20], 54))
-    by_number = calibrate(numbers, skew=False)
+    by_number = pinhole(numbers, skew=False)
     assert list(by_number.views) == ["30", "10", "20"]
     assert by_number.intrinsics == by_name.intrinsics
 
 
 def test_progress_is_told_in_order_and_changes_nothing() -> None:
     told: list[tuple[str, float]] = []
-    cal = calibrate(SOLID, progress=lambda stage, share: told.append((stage, share)))
+    cal = pinhole(SOLID, progress=lambda stage, share: told.append((stage, share)))
     assert told[0] == ("training the networks", 0.0)
     assert told[-1] == ("refining", 1.0)
     assert all(0 <= share <= 1 for _, share in told)
-    assert cal.intrinsics == calibrate(SOLID).intrinsics
+    assert cal.intrinsics == pinhole(SOLID).intrinsics
 
 
 def test_the_record_of_the_network_is_the_camera() -> None:
     for points in (SOLID, FLAT):
-        cal = calibrate(points)
+        cal = pinhole(points)
         net = cal.network
         assert net is not None
         np.testing.assert_allclose(net.S1 @ net.W, cal.K, rtol=1e-12, atol=1e-10)
@@ -372,7 +372,7 @@ def test_the_record_of_the_network_is_the_camera() -> None:
 
 
 def test_errors_are_those_of_the_points() -> None:
-    cal = calibrate(FLAT)
+    cal = pinhole(FLAT)
     squared = []
     for k, (name, view) in enumerate(cal.views.items()):
         mine = FLAT.view_index == k
@@ -393,6 +393,6 @@ def test_every_seed_of_many_scenes_gives_one_camera(kind: str) -> None:
         if len(scene.view) < 12:
             continue
         points = scene.points(0.1, rng)
-        cals = [calibrate(points, skew=False, seed=seed, **scene.given(2)) for seed in range(5)]
+        cals = [pinhole(points, skew=False, seed=seed, **scene.given(2)) for seed in range(5)]
         for cal in cals[1:]:
             assert_same(cals[0], cal)

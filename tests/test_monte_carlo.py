@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from scenes import Scene, table_1
+from scenes import Scene, pinhole, table_1
 
-from neurocal_cli import Calibration, calibrate
+from neurocal_cli import Calibration
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array
 from neurocal_cli.pixel_error import normal_blocks
@@ -27,7 +27,7 @@ def reported_std(calibration: Calibration) -> Array:
 def bound(scene: Scene, type: int) -> Array:
     """Cramer-Rao std for 1 px of noise: the reported std of nearly noise-free data, scaled."""
     points = scene.points(1e-6, np.random.default_rng(0))
-    calibration = calibrate(points, **scene.given(type))
+    calibration = pinhole(points, **scene.given(type))
     n = 2 * len(points)
     sigma = calibration.rmse_px * np.sqrt(len(points) / (n - UNKNOWNS[type]))
     return reported_std(calibration) / sigma
@@ -39,7 +39,7 @@ def run(type: int, sigma: float, trials: int) -> tuple[Array, Array]:
     truth = np.concatenate([scene.intrinsics.values(), scene.poses["view"].euler, scene.poses["view"].t])
     errors, stds = [], []
     for trial in range(trials):
-        calibration = calibrate(scene.points(sigma, rng), seed=trial, **scene.given(type))
+        calibration = pinhole(scene.points(sigma, rng), seed=trial, **scene.given(type))
         assert calibration.converged
         errors.append(parameters(calibration) - truth)
         stds.append(reported_std(calibration))

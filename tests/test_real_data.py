@@ -4,8 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scenes import pinhole
 
-from neurocal_cli import Correspondences, calibrate
+from neurocal_cli import Correspondences
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "zhang_planar"
 # Published with the data, without distortion.
@@ -24,7 +25,7 @@ def zhang() -> Correspondences:
 
 @pytest.mark.parametrize("seed", range(20))
 def test_zhangs_views_give_the_published_camera_without_distortion(seed: int) -> None:
-    calibration = calibrate(zhang(), distortion="none", seed=seed)
+    calibration = pinhole(zhang(), seed=seed)
     K = calibration.intrinsics
     assert calibration.converged
     found = K.alpha_u, K.A[1, 1], K.u0, K.v0
@@ -34,6 +35,6 @@ def test_zhangs_views_give_the_published_camera_without_distortion(seed: int) ->
 
 def test_a_single_one_of_zhangs_views_gives_its_pose_when_the_camera_is_known() -> None:
     points = zhang()
-    camera = calibrate(points)
-    one = calibrate(points.select(points.view_index == 2), type=3, intrinsics=camera.intrinsics)
+    camera = pinhole(points)
+    one = pinhole(points.select(points.view_index == 2), type=3, intrinsics=camera.intrinsics)
     assert pytest.approx(camera.views["im3"].pose.R, abs=1e-3) == one.views["im3"].pose.R

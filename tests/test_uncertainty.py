@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import Scene, random_flat_set, random_solid
+from scenes import Scene, pinhole, random_flat_set, random_solid
 
-from neurocal_cli import Correspondences, calibrate
+from neurocal_cli import Correspondences
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
 from neurocal_cli.geometry import Array
@@ -101,7 +101,7 @@ def test_std_and_covariance_of_a_solid_target(type: int, skew: bool, weights: st
     rng = np.random.default_rng(type)
     scene = random_solid(np.random.default_rng(5), 1, skew)
     assert len(scene.view) > 20
-    assert_std(calibrate(noisy(scene, weights, rng), skew=skew, **scene.given(type)), type)
+    assert_std(pinhole(noisy(scene, weights, rng), skew=skew, **scene.given(type)), type)
 
 
 @pytest.mark.parametrize("weights", ["none", "suu,suv,svv"])
@@ -110,7 +110,7 @@ def test_std_and_covariance_of_a_solid_target(type: int, skew: bool, weights: st
 def test_std_and_covariance_of_flat_boards(type: int, skew: bool, weights: str) -> None:
     rng = np.random.default_rng(type)
     scene = random_flat_set(np.random.default_rng(3), 4, skew, cols=9, rows=6)
-    assert_std(calibrate(noisy(scene, weights, rng), skew=skew, **scene.given(type)), type)
+    assert_std(pinhole(noisy(scene, weights, rng), skew=skew, **scene.given(type)), type)
 
 
 def test_std_of_theta_and_alpha_v_with_axes_that_are_far_from_perpendicular() -> None:
@@ -119,7 +119,7 @@ def test_std_of_theta_and_alpha_v_with_axes_that_are_far_from_perpendicular() ->
     camera = Intrinsics(scene.intrinsics.alpha_u, scene.intrinsics.alpha_v, 500.0, 400.0, 1.2)
     pixels = project(camera.A, scene.poses["view"], scene.world)[0]
     points = Correspondences(scene.world, pixels + 0.2 * rng.normal(size=pixels.shape))
-    assert_std(calibrate(points), 1)
+    assert_std(pinhole(points), 1)
 
 
 @pytest.mark.parametrize("type", [1, 3])
@@ -130,7 +130,7 @@ def test_std_of_a_pose_whose_world_origin_is_300_target_sizes_away(type: int) ->
     shift = np.array([300.0, -200.0, 100.0]) * size
     points = replace(scene.points(0.3, rng), world=scene.world - scene.world.mean(axis=0) + shift)
     # Differences of numbers 300 times larger than the target leave 1e-4 of the answer open.
-    assert_std(calibrate(points, skew=False, **scene.given(type)), type, 1e-4)
+    assert_std(pinhole(points, skew=False, **scene.given(type)), type, 1e-4)
 
 
 @pytest.mark.parametrize("free", [[1, 1, 1, 1, 1], [1, 0, 1, 0, 0], [0, 0, 0, 0, 0]])
@@ -178,7 +178,7 @@ def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
 def test_the_std_is_the_spread_over_many_noises() -> None:
     rng = np.random.default_rng(0)
     scene = random_flat_set(np.random.default_rng(3), 5, True, cols=9, rows=6)
-    results = [calibrate(noisy(scene, "suu,suv,svv", rng)) for _ in range(400)]
+    results = [pinhole(noisy(scene, "suu,suv,svv", rng)) for _ in range(400)]
     values = np.array([parameters(cal) for cal in results])
     std = np.array(
         [

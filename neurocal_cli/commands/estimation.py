@@ -68,7 +68,7 @@ class Estimation:
             raise UsageError("--type 4 needs the known poses; give --extrinsics CAMERA.yaml")
         if self.type == "3" and self.no_skew:
             raise UsageError("--no-skew cannot change the given camera of --type 3; leave it out")
-        if self.type == "3" and self.distortion != "none":
+        if self.type == "3" and self.distortion not in ("auto", "none"):
             raise UsageError("--type 3 takes the lens of the given camera; leave out --distortion")
         for name, option in _BACKPROP_ONLY.items():
             if getattr(self, name) is not None and self.trainer != "backprop":
@@ -278,11 +278,12 @@ _OPTIONS = [
     click.option(
         "--distortion",
         type=click.Choice(
-            ["none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"]
+            ["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"]
         ),
-        default="none",
-        help="Lens model, estimated with everything else, coefficients as in OpenCV; none is the pinhole; "
-        "plumb-line takes k1, k2, p1 and p2 from the images of straight lines alone.",
+        default="auto",
+        help="Lens model, estimated with everything else, coefficients as in OpenCV; none is the pinhole, "
+        "auto the simplest model that predicts data left out as well as any; plumb-line takes k1, k2, p1 and "
+        "p2 from the images of straight lines alone.",
     ),
     click.option(
         "--no-skew",
@@ -291,8 +292,9 @@ _OPTIONS = [
     ),
     click.option(
         "--outliers",
-        type=click.Choice(["keep"]),
-        default="keep",
-        help="What to do with points that do not fit: keep uses all of them.",
+        type=click.Choice(["reject", "keep"]),
+        default="reject",
+        help="What to do with points, and whole views, that contradict the others: reject names them and "
+        "leaves them out, keep uses all of them.",
     ),
 ]

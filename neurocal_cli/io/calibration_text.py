@@ -15,6 +15,7 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
 from neurocal_cli.io.camera_info import camera_info_lines
+from neurocal_cli.io.rejected_yaml import rejected_lines
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.lens import coefficient_names
 from neurocal_cli.points import Correspondences
@@ -37,7 +38,13 @@ def calibration_lines(cal: Calibration, rectified: tuple[Array, Array] | None = 
         cal.camera_name, cal.image_size, cal.K, cal.distortion_model, cal.distortion, rectified
     )
     yield "neurocal:"
-    for lines in (_record_lines(cal), _parameter_lines(cal), _view_lines(cal), _network_lines(cal.network)):
+    for lines in (
+        _record_lines(cal),
+        _parameter_lines(cal),
+        _view_lines(cal),
+        _network_lines(cal.network),
+        rejected_lines(cal.rejected),
+    ):
         yield from (f"  {line}" for line in lines)
     if cal.straight_lines is not None:
         yield f"  straight_lines: {_straight_lines(cal.straight_lines)}"
@@ -55,6 +62,8 @@ def _record_lines(cal: Calibration) -> Iterator[str]:
     yield f"stop_reason: {text(str.__str__(cal.stop_reason))}"
     yield f"unit: {text(cal.unit)}"
     yield f"distortion: {text(cal.distortion_model)}"
+    if cal.lens_choice:  # rms error on data left out [px]
+        yield f"lens_choice: {mapping(**{name: number(error) for name, error in cal.lens_choice.items()})}"
     if cal.points.image_center is not None:
         yield f"image_center: {flow(np.array(cal.points.image_center))}"
 

@@ -12,6 +12,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_text import FORMAT
 from neurocal_cli.io.distortion_names import own_length
+from neurocal_cli.io.rejected_yaml import read_rejected
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.points import Correspondences
 
@@ -53,6 +54,9 @@ def calibration_from_field(root: Field) -> Calibration:
             "file is incomplete; calibrate again",
             root.source,
         )
+    rejected = read_rejected(block.get("rejected"), points.unit)
+    if fit["n_rejected"].integer() != len(rejected):
+        fit["n_rejected"].fail(f"{len(rejected)}, the number of rows of rejected")
     names, covariance = _covariance(block)
     model, coefficients = distortion_from_field(root)
     intrinsics, std, fixed = intrinsics_from_field(root)
@@ -70,7 +74,6 @@ def calibration_from_field(root: Field) -> Calibration:
         stop_reason=block["stop_reason"].text(),
         rmse_px=fit["rmse_px"].number_or_nan(),
         max_px=fit["max_px"].number_or_nan(),
-        n_rejected=fit["n_rejected"].integer(),
         distortion_model=model,
         distortion=coefficients,
         covariance=covariance,
@@ -79,6 +82,8 @@ def calibration_from_field(root: Field) -> Calibration:
         straight_lines=_straight_lines(block.get("straight_lines")),
         camera_name=root["camera_name"].text() if "camera_name" in root else "camera",
         warnings=tuple(entry.text() for entry in block["warnings"].items()) if "warnings" in block else (),
+        rejected=rejected,
+        lens_choice=_lens_choice(block.get("lens_choice")),
     )
 
 
@@ -199,6 +204,10 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
     if len(coefficients) < length:
         root["distortion_coefficients"]["data"].fail(f"{length} numbers or more")
     return model, coefficients[:length]
+
+
+def _lens_choice(field: Field | None) -> dict[str, float]:
+    return {} if field is None else {name: field[name].number_or_nan() for name in field.keys()}  # noqa: SIM118
 
 
 def _network(field: Field | None) -> NetworkRecord | None:

@@ -1,0 +1,202 @@
+"""Every lens model fitted to the same points, each from the one before it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array
+from neurocal_cli.given_lens import folds_back
+from neurocal_cli.job import Job
+from neurocal_cli.leave_out import held_out_points, held_out_views
+from neurocal_cli.lens import Lens, bend, coefficient_names, pinhole_coefficients
+from neurocal_cli.observability import parameter_count, refuse_undetermined
+from neurocal_cli.pixel_error import CameraState
+from neurocal_cli.points import Correspondences
+from neurocal_cli.problems import Known
+from neurocal_cli.refine import Refined, refine
+from neurocal_cli.uncertainty import Covariance, covariance
+from neurocal_cli.views import Views
+
+__all__ = ["Candidate", "fit_candidates", "supported"]
+
+_MODELS = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye")
+_FISHEYE_TAIL = frozenset({"k3", "k4"})  # of use only when the view is wide and the points many
+# What each model has more than a simpler one.
+_NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
+_PAYS = 0.99  # of the squared error that more coefficients must be below
+_STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
+_SPARE = 1.3  # equations for each unknown
+_WIDE = 0.5  # radius from which on a lens can be a fisheye's: 27 degrees off the axis
+_TOLD_APART = 4.0  # squared standard deviations, for each coefficient
+_LARGEST_TERM = 3.0  # of one coefficient at the farthest point; all terms together are about 1
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A lens model fitted to the points.
+
+    Attributes
+    ----------
+    known : Known
+        With the model to be estimated.
+    refined : Refined
+    lost : array
+        Squared error of each part of the data when it is left out.
+    noise : bool
+        Whether its coefficients are noise.
+    folds : str or None
+        Where it folds back, within the points or within the image.
+    determined : bool
+        Whether the points leave no parameter open.
+    """
+
+    known: Known
+    refined: Refined
+    lost: Array
+    noise: bool
+    folds: str | None
+    determined: bool
+
+    @property
+    def sound(self) -> bool:
+        """Whether it may be chosen."""
+        return not self.noise and self.folds is None and self.determined
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared residuals."""
+        return float(self.refined.cost.sum())
+
+
+def supported(known: Known, model: str, views: Views) -> Known | None:
+    """What is known with this model to be estimated; None when there are too few points for it."""
+    with_lens = replace(known, lens=Lens(model), free_lens=model != "none")
+    equations = 2 * int(views.distinct.sum())
+    if model != "none" and equations < _SPARE * parameter_count(with_lens, views.n_views) + 4:
+        return None
+    return with_lens
+
+
+def fit_candidates(
+    job: Job, state: CameraState, points: Correspondences, by_views: bool
+) -> dict[str, Candidate]:
+    """Fit every model, beginning with a state of any of them.
+
+    Parameters
+    ----------
+    job : Job
+    state : CameraState
+    points : Correspondences
+        With the image's size, for `folds`.
+    by_views : bool
+        Whether views are left out, or points.
+    """
+    fitted: dict[str, Candidate] = {}
+    reach = _reach(job.views, state)
+    for model in _MODELS:
+        known = supported(job.known, model, job.views)
+        if known is None or (model == "fisheye" and reach < _WIDE):
+            continue
+        start = replace(state, lens=model, k=_coefficients(state, model, reach))
+        candidate = _fit(job, known, start, points, by_views, reach)
+        if model == "fisheye":
+            shorter = replace(known, fixed=known.fixed | _FISHEYE_TAIL)
+            start = replace(start, k=_coefficients(state, model, reach, 2))
+            candidate = _simpler(_fit(job, shorter, start, points, by_views, reach), candidate)
+        if candidate is None:
+            continue
+        fitted[model] = candidate
+        if model != "none" and candidate.folds is None:
+            state = candidate.refined.state
+    return fitted
+
+
+def _simpler(short: Candidate | None, whole: Candidate | None) -> Candidate | None:
+    """The one with fewer coefficients, unless the other is sound and predicts better."""
+    if short is None or whole is None:
+        return short or whole
+    return whole if whole.sound and whole.lost.sum() < _PAYS * short.lost.sum() else short
+
+
+def _fit(
+    job: Job, known: Known, start: CameraState, points: Correspondences, by_views: bool, reach: float
+) -> Candidate | None:
+    """None when it did not settle, or too little is left for it without a part of the data."""
+    views = job.views
+    steps = _RATIONAL_STEPS if start.lens == "rational" else _STEPS
+    refined = refine(views.tiles, start, known.free_camera, known.free_poses, steps)
+    state = refined.state
+    if not refined.converged and state.lens != "none":
+        return None
+    if by_views:
+        lost = held_out_views(refined.normal, known.free_camera, known.free_poses)
+    else:
+        lost = held_out_points(views, state, known.free_camera, known.free_poses)
+    if not np.isfinite(lost).all():
+        if state.lens != "none":
+            return None
+        lost = np.full_like(lost, np.inf)
+    cov = covariance(refined.normal, known.free_camera, known.free_poses, 2 * len(views.index))
+    noise = _noise(known, state, reach, cov.entries)
+    folds = folds_back(Lens(state.lens, state.k), known.matrix(state.entries[0], views), points)
+    return Candidate(known, refined, lost, noise, folds, _determined(views, known, state, cov))
+
+
+def _determined(views: Views, known: Known, state: CameraState, cov: Covariance) -> bool:
+    try:
+        refuse_undetermined(views, known, state, cov)
+    except DegenerateGeometryError:
+        return False
+    return True
+
+
+def _noise(known: Known, state: CameraState, reach: float, cov: Array) -> bool:
+    """Whether coefficients are noise: large ones that cancel each other, or new ones not told from 0.
+
+    New ones are those that a simpler model does not have, taken together; a fisheye's may be 0.
+    """
+    k, model = state.k, known.lens.model
+    if (np.abs(_terms(model, reach) * k) > _LARGEST_TERM).any():
+        return True
+    new = _NEW.get(model, 0)
+    if not new:
+        return False
+    if not np.isfinite(cov).all():
+        return True
+    inverse = np.linalg.pinv(cov[-new:, -new:], hermitian=True)
+    return bool(k[-new:] @ inverse @ k[-new:] < _TOLD_APART * new)
+
+
+def _terms(model: str, reach: float) -> Array:
+    """Size of each coefficient's term at the farthest point, per coefficient."""
+    if model == "fisheye":
+        return np.asarray(np.arctan(reach) ** np.array([2.0, 4.0, 6.0, 8.0]))
+    powers = np.array([2.0, 4.0, 1.0, 1.0, 6.0, 2.0, 4.0, 6.0])
+    return np.asarray(reach ** powers[: len(coefficient_names(model))])
+
+
+def _reach(views: Views, state: CameraState) -> float:
+    """Radius of the farthest point in normalised image coordinates, before the lens bends it."""
+    seen = (state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]
+    return float((np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]).max())
+
+
+def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -> Array:
+    """Those of another model that bend nearly as this state's lens does, of a fisheye the first `most`."""
+    names = coefficient_names(model)
+    if "fisheye" not in (model, state.lens):
+        old = dict(zip(coefficient_names(state.lens), state.k.tolist(), strict=True))
+        return np.array([old.get(name, 0.0) for name in names])
+    if model != "fisheye":
+        return np.zeros(len(names))
+    # As far out as the points reach: theta (1 + k1 theta^2 + ...) = r R(r), by least squares.
+    r = np.linspace(0.05, 1, 60) * reach
+    bent = bend(state.lens, state.k, r, np.zeros_like(r))[0][0]
+    theta = np.arctan(r)
+    k = np.zeros(4)
+    powers = theta[:, None] ** np.array([3, 5, 7, 9][:most])
+    k[:most] = np.linalg.lstsq(powers, bent - theta, rcond=1e-6)[0]
+    return k if np.isfinite(k).all() else pinhole_coefficients(model)

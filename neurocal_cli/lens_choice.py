@@ -1,0 +1,152 @@
+"""``auto``: the simplest lens model that the data supports.
+
+Every model is fitted, each from the one before it. A model's held-out error decides: five folds of
+the views, or of the points of a single view. Models whose held-out rms error is within 0.5 % of the
+lowest, or within what chance does to their difference, are as good as each other; among them the
+Bayesian information criterion (Schwarz 1978) chooses, n log E + p log n, n being what the number of
+residuals is worth when neighbours are alike. Models that fold the image back, that did not settle
+or that there are too few points for do not take part, and models whose coefficients are noise only
+where their error is 5 % below that of the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.job import Job, Solution
+from neurocal_cli.leave_out import held_out_views
+from neurocal_cli.lens_candidates import Candidate, fit_candidates
+from neurocal_cli.odd_views import free_networks
+from neurocal_cli.pixel_error import CameraState
+from neurocal_cli.points import Correspondences
+from neurocal_cli.views import Views
+from neurocal_cli.whiteness import correlation, effective_number, of_points
+
+__all__ = ["LensChoice", "choose_lens"]
+
+_TIE = 0.005  # of the rms error
+_FAR_WORSE = 2.0  # times the rms error of a model that folds back
+_WORTH = 1.05  # times the rms error: what coefficients that cancel each other must be better by
+_LEAST_PENALTY = 6.6  # chi-squared of one superfluous coefficient in a hundred
+_SHORT = 1.4  # times the rms error of free networks: the camera may be a wrong one
+
+
+@dataclass(frozen=True)
+class LensChoice:
+    """What `auto` chose, and from what.
+
+    Attributes
+    ----------
+    job : Job
+        With the model that was chosen.
+    solution : Solution
+    held_out_px : dict of float by model [px]
+        Rms error on data left out; of the models that could be fitted.
+    """
+
+    job: Job
+    solution: Solution
+    held_out_px: dict[str, float]
+
+
+def choose_lens(
+    job: Job,
+    solution: Solution,
+    points: Correspondences,
+    more_starts: Callable[[], Iterable[CameraState]] = tuple,
+) -> LensChoice:
+    """Fit all models, from a solution with any of them, and choose.
+
+    Parameters
+    ----------
+    job : Job
+    solution : Solution
+    points : Correspondences
+    more_starts : callable
+        Other states to begin with, where the first leads to nothing that explains the points.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The lens bends strongly, and what fits folds back inside the image.
+    """
+    views, by_views = job.views, _views_can_spare_any(job, solution)
+    fitted = fit_candidates(job, solution.refined.state, points, by_views)
+    if not fitted or _falls_short(views, fitted):
+        for start in more_starts():
+            for model, candidate in fit_candidates(job, start, points, by_views).items():
+                if model not in fitted or candidate.cost < fitted[model].cost:
+                    fitted[model] = candidate
+    if not fitted:  # not even the pinhole settled: as it is
+        return LensChoice(job, solution, {})
+    if "none" in fitted and not fitted["none"].determined and not _falls_short(views, {"": fitted["none"]}):
+        fitted = {"none": fitted["none"]}  # a lens would only hide that the points leave the camera open
+    chosen = fitted[_best(fitted, views)]
+    _refuse_fold(fitted, chosen)
+    job.tally.refinements += chosen.refined.iterations
+    n, px = len(views.index), views.pixel_scale
+    table = {name: float(np.sqrt(c.lost.sum() / n)) * px for name, c in fitted.items()}
+    return LensChoice(replace(job, known=chosen.known), Solution(chosen.refined, job.tally), table)
+
+
+def _views_can_spare_any(job: Job, solution: Solution) -> bool:
+    known, refined = job.known, solution.refined
+    if job.views.n_views == 1 or not known.free_camera.any():
+        return False
+    free = known.free_camera if refined.state.lens == known.lens.model else known.free
+    return bool(np.isfinite(held_out_views(refined.normal, free, known.free_poses)).all())
+
+
+def _falls_short(views: Views, fitted: dict[str, Candidate]) -> bool:
+    """Whether every view by itself fits far better than the best of the common cameras."""
+    best = min(fitted.values(), key=lambda c: c.cost)
+    return best.cost > _SHORT**2 * float(free_networks(views, best.refined.state).sum()) + 1e-20
+
+
+def _best(fitted: dict[str, Candidate], views: Views) -> str:
+    """Of the models whose held-out error is as low as any, the one with the lowest criterion."""
+    sound = _eligible(fitted)
+    best = min(sound.values(), key=lambda c: float(c.lost.sum()))
+    n = 2 * effective_number(len(views.index), correlation(views, of_points(views, best.refined.state)))
+    tied = {}
+    for name, candidate in sound.items():
+        if not np.isfinite(candidate.lost).all():
+            continue
+        excess = candidate.lost - best.lost
+        # Standard error of the sum of the parts' differences.
+        chance = np.sqrt(len(excess)) * excess.std()
+        if excess.sum() <= max(2 * _TIE * best.lost.sum(), chance):
+            tied[name] = _criterion(candidate, n)
+    if not tied:
+        return next(iter(sound))  # the simplest: nothing can be left out
+    return min(tied, key=lambda name: tied[name])
+
+
+def _eligible(fitted: dict[str, Candidate]) -> dict[str, Candidate]:
+    """Sound models; the others too when they alone predict."""
+    unfolded = {name: c for name, c in fitted.items() if c.folds is None} or fitted
+    sound = {name: c for name, c in unfolded.items() if c.sound}
+    if not sound:
+        return unfolded
+    lowest = [min(float(c.lost.sum()) for c in some.values()) for some in (sound, unfolded)]
+    return sound if lowest[0] < _WORTH**2 * lowest[1] else unfolded
+
+
+def _criterion(candidate: Candidate, n: float) -> float:
+    penalty = max(np.log(n), _LEAST_PENALTY) * len(candidate.refined.state.k)
+    return float(n * np.log(max(candidate.cost, 1e-300)) + penalty)
+
+
+def _refuse_fold(fitted: dict[str, Candidate], chosen: Candidate) -> None:
+    """Refuse to take a simpler model where only one that folds back fits."""
+    for model, candidate in fitted.items():
+        folds = candidate.folds is not None and not candidate.noise
+        if folds and chosen.lost.sum() > _FAR_WORSE**2 * candidate.lost.sum():
+            raise DegenerateGeometryError(
+                f"the lens bends strongly, and the distortion {model} that fits the points folds back inside "
+                f"the {candidate.folds}; give points nearer to the image's corners, or choose a --distortion"
+            )

@@ -1,0 +1,220 @@
+"""Wrong points and wrong views: found, set aside and named, so that they change nothing.
+
+Points that fit their camera as normal noise would are left alone, to the last bit: a calibration of
+good data is the same with and without this. Otherwise
+
+1. each view's network is trained again so that wrong points do not draw it away (`consensus`); what
+   is far from it is set aside, and views whose points agree on nothing;
+2. the rest is calibrated, and views that their own network explains but the common camera does not
+   are set aside (`odd_views`);
+3. every point is judged by the camera; the ones beyond what the largest of so many normal errors
+   would be are set aside and the others, also those set aside before, calibrated together, until
+   nothing changes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration import Rejected
+from neurocal_cli.consensus import find_consensus
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.fitting import Fit, Fitter
+from neurocal_cli.geometry import Array
+from neurocal_cli.noise import with_common_share
+from neurocal_cli.odd_views import find_odd_view, seen_from_behind
+from neurocal_cli.points import Correspondences
+from neurocal_cli.views import arrange
+
+__all__ = ["fit_robustly"]
+
+_CHANCE = 0.01  # of calling any point of a good data set wrong
+_FLOOR = 1e-7  # of the image's spread: rounding, not noise
+_ROUGH = 0.005  # an rms error of this share of the image's spread may hide anything
+_WORST_VIEW = 3.0  # standard deviations of a view, in those of all: more does not excuse its points
+_ENOUGH = 12  # points of a view that tell its standard deviation
+_PASSES = 12
+_MAJORITY = 0.5  # share of the points that must be left
+_LENGTH = 1.1774  # median length of two normal errors
+
+
+def fit_robustly(points: Correspondences, fitter: Fitter) -> tuple[Fit, Rejected]:
+    """Calibrate, with wrong points set aside.
+
+    Parameters
+    ----------
+    points : Correspondences
+    fitter : Fitter
+
+    Raises
+    ------
+    DegenerateGeometryError
+        Points that cannot give an answer, with the reason; more than half of them contradict the rest.
+    """
+    failure: DegenerateGeometryError | None = None
+    first: Fit | None = None
+    try:
+        first = fitter.fit(points)
+        if not _suspicious(first):
+            return first, Rejected()
+    except DegenerateGeometryError as error:
+        failure = error
+    search = _Search(points, fitter)
+    search.agree(first, failure)
+    search.without_odd_views()
+    search.judge_all_points()
+    return search.fit, search.rejected()
+
+
+class _Search:
+    """What is kept so far, and the calibration of it."""
+
+    fit: Fit
+
+    def __init__(self, points: Correspondences, fitter: Fitter) -> None:
+        self.points, self.fitter = points, fitter
+        self.kept = np.ones(len(points), dtype=bool)
+        self.wrong_views: dict[str, str] = {}
+
+    def agree(self, first: Fit | None, failure: DegenerateGeometryError | None) -> None:
+        """Points that each view's network agrees on."""
+        views = arrange(self.points)
+        consensus = find_consensus(views, views.nearly_flat, np.random.default_rng(self.fitter.seed))
+        order = slice(None) if views.order is None else views.order
+        self.kept[order] = consensus.kept
+        for view in np.flatnonzero(consensus.hopeless):
+            self._drop(views.names[view], "its points and pixels do not belong together")
+        if self.kept.all():
+            if first is None:
+                assert failure is not None
+                raise failure
+            self.fit = first
+            return
+        self._enough(failure)
+        try:
+            self.fit = self.fitter.fit(self.points.select(self.kept))
+        except DegenerateGeometryError:
+            if failure is not None:
+                raise failure from None
+            raise
+
+    def _drop(self, name: str, reason: str) -> None:
+        self.wrong_views[name] = reason
+        self.kept &= self.points.view_index != self.points.view_names.index(name)
+
+    def _enough(self, failure: DegenerateGeometryError | None = None) -> None:
+        share = self.kept.mean()
+        if share > _MAJORITY:
+            return
+        if failure is not None:
+            raise failure
+        raise DegenerateGeometryError(
+            f"{100 * (1 - share):.0f} % of the points contradict the others"
+            + (f" ({', '.join(map(repr, self.wrong_views))} as whole views)" if self.wrong_views else "")
+            + "; check that each pixel belongs to its point, and that all views are of one camera"
+        )
+
+    def without_odd_views(self) -> None:
+        """Set aside views that are of another camera, or of another target than their points say."""
+        most = (self.points.n_views - 1) // 3
+        for name in seen_from_behind(self.fit.job, self.fit.solution)[:most]:
+            self._drop(name, "it shows the target from the other side than the other views, as if mirrored")
+        if self.wrong_views:
+            self._enough()
+            self.fit = self.fitter.fit(self.points.select(self.kept))
+        while len(self.wrong_views) < most:
+            odd = find_odd_view(self.fit.job, self.fit.solution)
+            if odd is None:
+                return
+            self._drop(odd, "it contradicts the camera of the other views")
+            self.fit = self.fitter.fit(self.points.select(self.kept))
+
+    def judge_all_points(self) -> None:
+        """Keep what the camera explains, of all points of the views that are kept."""
+        known = {tuple(np.packbits(self.kept))}
+        for _ in range(_PASSES):
+            kept = self._explained()
+            if (kept == self.kept).all():
+                return
+            self.kept = kept
+            self._enough()
+            state = tuple(np.packbits(kept))
+            self.fit = self.fitter.again(self.fit, self.points.select(kept))
+            if state in known:  # a point on the border that comes and goes
+                return
+            known.add(state)
+
+    def _explained(self) -> NDArray[np.bool_]:
+        error, index = self._errors(), self.points.view_index
+        near = error < _limits(error, self.kept, self.points)[index]
+        share = np.bincount(index, near, self.points.n_views) / np.bincount(index)
+        for view in np.flatnonzero(share <= _MAJORITY):
+            name = self.points.view_names[view]
+            self.wrong_views.setdefault(name, "most of its points contradict the camera")
+        return np.asarray(near & (share > _MAJORITY)[index])
+
+    def _errors(self) -> Array:
+        """(N,) length of each point's error [px], weighted; infinite in views that are set aside."""
+        seen, names = self.fit.seen, self.fit.job.views.names
+        place = {name: k for k, name in enumerate(names)}
+        view = np.array([place.get(name, -1) for name in self.points.view_names])[self.points.view_index]
+        predicted, in_front = seen.predict(self.points.world, np.maximum(view, 0))
+        error = _lengths(predicted - self.points.pixels, self.points, self.fit.share)
+        return np.where(in_front & (view >= 0) & np.isfinite(error), error, np.inf)
+
+    def rejected(self) -> Rejected:
+        """What was set aside."""
+        error = self._errors()
+        rows = np.flatnonzero(~self.kept)
+        if not rows.size:
+            return Rejected(views=dict(self.wrong_views))
+        known = np.where(np.isfinite(error), error, np.nan)[rows]
+        return Rejected(self.points.select(rows), known, dict(self.wrong_views))
+
+
+def _lengths(residuals: Array, points: Correspondences, share: float) -> Array:
+    """Lengths of residuals (N, 2) [px], whitened where the points have covariances, on average unchanged."""
+    if points.covariance is None:
+        return np.hypot(residuals[:, 0], residuals[:, 1])
+    suu, suv, svv = with_common_share(points.covariance, share).T
+    du, dv = residuals.T
+    squared = (svv * du * du - 2 * suv * du * dv + suu * dv * dv) / (suu * svv - suv * suv)
+    information = 0.5 * (suu + svv) / (suu * svv - suv * suv)
+    return np.sqrt(squared / information.mean())
+
+
+def _limits(error: Array, kept: NDArray[np.bool_], points: Correspondences) -> Array:
+    """(V,) length of error that no point of so many normal ones should exceed.
+
+    A view that is blurred has larger errors than others throughout, which is no fault of its points.
+    """
+    spread = np.sqrt(points.pixels.var(axis=0).sum())
+    overall = float(np.median(error[kept])) / _LENGTH
+    by_view = np.full(points.n_views, overall)
+    index = points.view_index[kept]
+    counts = np.bincount(index, minlength=points.n_views)
+    pieces = np.split(error[kept][np.argsort(index, kind="stable")], np.cumsum(counts)[:-1])
+    for view, piece in enumerate(pieces):
+        if len(piece) >= _ENOUGH:
+            by_view[view] = np.median(piece) / _LENGTH
+    sigma = np.clip(by_view, overall, _WORST_VIEW * overall) + _FLOOR * spread
+    return np.asarray(sigma * np.sqrt(2 * np.log(len(error) / _CHANCE)))
+
+
+def _suspicious(fit: Fit) -> bool:
+    """Whether anything in a calibration is not as normal noise would have it."""
+    points, seen = fit.points, fit.seen
+    place = {name: k for k, name in enumerate(fit.job.views.names)}
+    view = np.array([place[name] for name in points.view_names])[points.view_index]
+    predicted, in_front = seen.predict(points.world, view)
+    error = _lengths(predicted - points.pixels, points, fit.share)
+    if not in_front.all() or not np.isfinite(error).all():
+        return True
+    everything = np.ones(len(points), dtype=bool)
+    if (error >= _limits(error, everything, points)[points.view_index]).any():
+        return True
+    spread = np.sqrt(points.pixels.var(axis=0).sum())
+    if np.sqrt((error**2).mean()) > _ROUGH * spread:
+        return True
+    return bool(seen_from_behind(fit.job, fit.solution)) or find_odd_view(fit.job, fit.solution) is not None

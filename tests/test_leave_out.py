@@ -1,0 +1,88 @@
+"""What the quadratics say of a calibration without some of its data, against calibrating without it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import Scene, pinhole, random_flat_set, random_solid
+
+from neurocal_cli.evaluation import evaluate_camera
+from neurocal_cli.leave_out import (
+    disagreement,
+    held_out,
+    held_out_points,
+    inverse,
+    moves_without_each,
+    reduced,
+    without_each,
+)
+from neurocal_cli.points import Correspondences
+from neurocal_cli.refine import Refined, refine
+from neurocal_cli.views import Views, arrange
+
+FREE = np.array([True, False, True, True, True])
+
+
+def solved(scene: Scene, points: Correspondences) -> tuple[Views, Refined]:
+    views = arrange(points)
+    return views, refine(views.tiles, scene.true_state(views), FREE)
+
+
+def flat(seed: int, n_views: int) -> tuple[Scene, Correspondences]:
+    rng = np.random.default_rng(seed)
+    scene = random_flat_set(rng, n_views, False)
+    return scene, scene.points(0.3, rng)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_error_on_views_left_out_is_that_of_calibrating_without_them(seed: int) -> None:
+    scene, points = flat(seed, 10)
+    views, refined = solved(scene, points)
+    lost = held_out(views, refined.state, refined.normal, FREE, True)
+    fold = np.arange(10) % 5
+    squared = 0.0
+    for k in range(5):
+        inside = np.isin(points.view_index, np.flatnonzero(fold != k))
+        rest = pinhole(points.select(inside), skew=False)
+        other = points.select(~inside)
+        squared += evaluate_camera(rest, other).rmse_px ** 2 * len(other)
+    assert lost.sum() * views.pixel_scale**2 == pytest.approx(squared, rel=0.01)
+
+
+def test_views_left_out_one_by_one() -> None:
+    scene, points = flat(7, 6)
+    views, refined = solved(scene, points)
+    q = reduced(refined.normal, FREE, True)
+    moves = moves_without_each(q)
+    for k in range(6):
+        rest = views.subset(np.delete(np.arange(6), k))
+        start = refined.state
+        keep = np.delete(np.arange(6), k)
+        again = refine(rest.tiles, type(start)(start.entries, start.R[keep], start.t[keep]), FREE, True)
+        assert without_each(q)[k] == pytest.approx(again.cost.sum(), rel=0.01)
+        std = np.sqrt(np.diagonal(inverse(q.S.sum(axis=0))) * refined.cost.sum() / (2 * len(points)))
+        moved = (again.state.entries - start.entries)[0, FREE]
+        assert np.abs(moves[k] - moved).max() < 0.2 * max(np.abs(moved).max(), std.max())
+
+
+def test_points_left_out_of_a_single_view_cost_more_than_those_kept() -> None:
+    rng = np.random.default_rng(2)
+    scene = random_solid(rng, 1, False)
+    while len(scene.world) < 100:
+        scene = random_solid(rng, 1, False)
+    views, refined = solved(scene, scene.points(0.3, rng))
+    lost = held_out_points(views, refined.state, FREE, True)
+    assert refined.cost.sum() < lost.sum() < 2 * refined.cost.sum()
+
+
+def test_halves_disagree_by_what_their_noise_explains() -> None:
+    """Normalised by its covariance, the squared difference is chi-squared with 4 degrees of freedom."""
+    scene, _ = flat(3, 8)
+    values = []
+    for trial in range(150):
+        points = scene.points(0.3, np.random.default_rng(trial))
+        views, refined = solved(scene, points)
+        difference, covariance = disagreement(views, refined.state, refined.normal, FREE, True)
+        variance = refined.cost.sum() / (2 * len(points) - 4 - 48)
+        values.append(difference @ np.linalg.inv(covariance) @ difference / variance)
+    assert np.mean(values) == pytest.approx(4.0, abs=4 * np.sqrt(8 / 150))

@@ -1,0 +1,80 @@
+"""`auto` takes the simplest lens that the data supports."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bent import BENT, SIGMA, bent_set
+from scenes import Scene, random_solid, table_1
+
+from neurocal_cli import Calibration, calibrate
+from neurocal_cli.lens import MODELS
+
+
+def chosen(scene: Scene, seed: int, **more: object) -> Calibration:
+    points = scene.points(SIGMA, np.random.default_rng([seed, 1]))
+    return calibrate(points, skew=False, **more)
+
+
+def is_right(model: str, seed: int) -> bool:
+    """Whether the choice has no more than two coefficients too many, and predicts as well as the best."""
+    scene, _ = bent_set(model, seed)
+    found = chosen(scene, seed)
+    best = min(found.lens_choice.values())
+    assert found.lens_choice[found.distortion_model] < 1.01 * best, (model, seed, found.lens_choice)
+    if found.distortion_model != "fisheye" or model == "fisheye":
+        assert len(MODELS[found.distortion_model]) <= len(MODELS[model]) + 2, (model, seed)
+    assert found.rmse_px < 1.15 * np.sqrt(2) * SIGMA
+    return found.distortion_model == model
+
+
+@pytest.mark.parametrize("model", BENT)
+def test_the_choice_predicts_as_well_as_any_model(model: str) -> None:
+    assert sum(is_right(model, 7000 + seed) for seed in range(4)) >= 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", BENT)
+def test_the_choice_is_right_for_200_lenses(model: str) -> None:
+    share = sum(is_right(model, seed) for seed in range(200)) / 200
+    assert share > (0.95 if model == "none" else 0.85)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_lens_is_found_where_there_is_none_in_one_view(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = random_solid(rng, 1, False)
+    while len(scene.world) < 40:
+        scene = random_solid(rng, 1, False)
+    assert chosen(scene, seed).distortion_model == "none"
+
+
+def test_the_alternatives_are_told() -> None:
+    scene, _ = bent_set("k1k2", 3)
+    choice = chosen(scene, 3).lens_choice
+    assert {"none", "k1", "k1k2", "k1k2p1p2", "plumb_bob"} <= set(choice)
+    assert choice["none"] > 2 * choice["k1k2"]
+
+
+def test_too_few_points_for_a_lens_leave_none() -> None:
+    scene = table_1()
+    few = scene.points(0.1, np.random.default_rng(0)).select(np.arange(0, 440, 55))
+    assert calibrate(few, skew=False).distortion_model == "none"
+
+
+def test_a_given_lens_is_not_chosen_again() -> None:
+    scene, k = bent_set("k1k2", 5)
+    points = scene.points(SIGMA, np.random.default_rng(0))
+    camera = calibrate(points, distortion="k1k2", skew=False)
+    found = calibrate(points, type=3, intrinsics=camera)
+    assert found.distortion_model == "k1k2"
+    assert np.array_equal(found.distortion, camera.distortion)
+    assert not found.lens_choice
+    assert k != camera.distortion.tolist()
+
+
+@pytest.mark.parametrize("type", [2, 4])
+def test_a_lens_is_chosen_whatever_else_is_given(type: int) -> None:
+    scene, _ = bent_set("k1k2", 11)
+    given = dict(scene.given(type))
+    assert chosen(scene, 11, **given).distortion_model == "k1k2"
