@@ -39,6 +39,8 @@ __all__ = [
 FOLDS = 5
 _REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal
 _GOLDEN = 0.6180339887498949
+# What nothing determines is infinite or nan, and told so by the results.
+_quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +59,7 @@ class Quadratics:
     cost: Array
 
 
+@_quietly
 def reduced(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Quadratics:
     """Eliminate the poses.
 
@@ -72,10 +75,9 @@ def reduced(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Quadrat
     if free_poses:
         solved = _poses_by_camera(normal, shared)
         C, h = normal[..., shared, POSE], normal[..., POSE, -1]
-        with np.errstate(over="ignore", invalid="ignore"):  # a pose that nothing holds
-            S = S - C @ solved[..., :-1]
-            g = g - (C @ solved[..., -1:])[..., 0]
-            cost = cost - (h * solved[..., -1]).sum(axis=-1)
+        S = S - C @ solved[..., :-1]
+        g = g - (C @ solved[..., -1:])[..., 0]
+        cost = cost - (h * solved[..., -1]).sum(axis=-1)
     return Quadratics(S, g, cost)
 
 
@@ -85,10 +87,10 @@ def _poses_by_camera(normal: Array, shared: NDArray[np.intp]) -> Array:
     B = normal[..., POSE, POSE]
     scale = 1.0 / np.sqrt(np.diagonal(B, axis1=-2, axis2=-1) + 1e-300)
     scaled = B * scale[..., :, None] * scale[..., None, :] + 1e-13 * np.eye(6)
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.asarray(scale[..., None] * np.linalg.solve(scaled, scale[..., None] * right))
+    return np.asarray(scale[..., None] * np.linalg.solve(scaled, scale[..., None] * right))
 
 
+@_quietly
 def held_out(
     views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], free_poses: bool
 ) -> Array:
@@ -118,6 +120,7 @@ def held_out(
     return held_out_points(views, state, free, free_poses)
 
 
+@_quietly
 def held_out_views(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Array:
     """Squared error of each view when it is left out; (V,), nan where the others cannot do without it."""
     q = reduced(normal, free, free_poses)
@@ -128,6 +131,7 @@ def held_out_views(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> 
     return np.asarray(q.cost - 2 * (q.g * step).sum(-1) + (step * (q.S @ step[..., None])[..., 0]).sum(-1))
 
 
+@_quietly
 def held_out_points(views: Views, state: CameraState, free: NDArray[np.bool_], free_poses: bool) -> Array:
     """Squared error of the folds of each view's points when they are left out; (V * folds,).
 
@@ -189,17 +193,20 @@ def _whole_steps(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Ar
     return step
 
 
+@_quietly
 def without_each(q: Quadratics) -> Array:
     """Squared error of all the others when one view is left out and they are fitted again; (G,)."""
     step = moves_without_each(q)
     return np.asarray(q.cost.sum() - q.cost - ((q.g.sum(axis=0) - q.g) * step).sum(axis=-1))
 
 
+@_quietly
 def moves_without_each(q: Quadratics) -> Array:
     """How far the shared parameters move when one view is left out; (G, f)."""
     return _solved(q.S.sum(axis=0) - q.S, q.g.sum(axis=0) - q.g)
 
 
+@_quietly
 def disagreement(
     views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], free_poses: bool
 ) -> tuple[Array, Array]:
@@ -235,6 +242,7 @@ def _steps(q: Quadratics, member: Array) -> Array:
     return _solved(np.einsum("fg,gij->fij", member, q.S), member @ q.g)
 
 
+@_quietly
 def inverse(S: Array) -> Array:
     """S^-1 of symmetric matrices; nan where they are singular."""
     return _solved(
@@ -245,8 +253,7 @@ def inverse(S: Array) -> Array:
 def _solved(S: Array, g: Array) -> Array:
     """S^-1 g of a stack; nan where S is singular."""
     scale = 1.0 / np.sqrt(np.abs(np.diagonal(S, axis1=-2, axis2=-1)) + 1e-300)
-    with np.errstate(over="ignore", invalid="ignore"):
-        scaled = S * scale[..., :, None] * scale[..., None, :]
+    scaled = S * scale[..., :, None] * scale[..., None, :]
     usable = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
     step = np.full(g.shape, np.nan)
     if g.shape[-1] == 0:

@@ -117,8 +117,8 @@ def _best(fitted: dict[str, Candidate], views: Views) -> str:
         if not np.isfinite(candidate.lost).all():
             continue
         excess = candidate.lost - best.lost
-        # Standard error of the sum of the parts' differences.
-        chance = np.sqrt(len(excess)) * excess.std()
+        # Two standard errors of the sum of the parts' differences.
+        chance = 2 * np.sqrt(len(excess)) * excess.std()
         if excess.sum() <= max(2 * _TIE * best.lost.sum(), chance):
             tied[name] = _criterion(candidate, n)
     if not tied:

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import table_1
+from scenes import pinhole, table_1
 
-from neurocal_cli import Correspondences, calibrate
+from neurocal_cli import Correspondences
 from neurocal_cli.geometry import Array
 from neurocal_cli.noise import common_share, with_common_share
 
@@ -66,7 +66,7 @@ def errors(share: float, weighed: bool, trials: int = 40) -> float:
     found = []
     for seed in range(trials):
         points = scene_points(share, seed)
-        found.append(calibrate(points if weighed else replace(points, covariance=None)).intrinsics.alpha_u)
+        found.append(pinhole(points if weighed else replace(points, covariance=None)).intrinsics.alpha_u)
     return float(np.sqrt(np.mean((np.array(found) - 556.0) ** 2)))
 
 
@@ -78,6 +78,6 @@ def test_true_covariances_help_and_wrong_ones_do_no_harm() -> None:
 def test_the_reported_deviations_hold_in_a_mixture() -> None:
     ratios = []
     for seed in range(60):
-        camera = calibrate(scene_points(0.5, seed))
+        camera = pinhole(scene_points(0.5, seed))
         ratios.append((camera.intrinsics.alpha_u - 556.0) / camera.std["alpha_u"])
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.25)
