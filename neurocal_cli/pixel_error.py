@@ -16,7 +16,7 @@ from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.lens import bend, coefficient_names
 from neurocal_cli.tiles import Tiles
 
-__all__ = ["ENTRIES", "POSE", "CameraState", "camera_columns", "normal_blocks", "residuals"]
+__all__ = ["ENTRIES", "POSE", "CameraState", "camera_columns", "derivatives", "normal_blocks", "residuals"]
 
 # Rows and columns of A's free entries, in the order of every vector of intrinsics here:
 # A11, A12, A22, A13, A23.
@@ -83,7 +83,7 @@ def normal_blocks(tiles: Tiles, state: CameraState) -> tuple[Array, NDArray[np.b
         count = len(tiles.view[chunk])
         if buffer is None or len(buffer) != count:
             buffer = np.zeros((count, width, 2, n))
-        sensible[chunk] = _derivatives(tiles, chunk, state, buffer)
+        sensible[chunk] = derivatives(tiles, chunk, state, buffer)
         J = buffer.reshape(count, width, 2 * n)
         np.matmul(J, np.swapaxes(J, 1, 2), out=by_tile[chunk])
     if n_tiles == tiles.n_views:
@@ -106,7 +106,7 @@ def residuals(tiles: Tiles, state: CameraState) -> Array:
     return out
 
 
-def _derivatives(tiles: Tiles, chunk: slice, state: CameraState, out: Array) -> NDArray[np.bool_]:
+def derivatives(tiles: Tiles, chunk: slice, state: CameraState, out: Array) -> NDArray[np.bool_]:
     """Fill out (T, 12 + K, 2, n) with the derivatives of the pixels and the residuals.
 
     Around the centroid, Xc = exp(omega) R M + t + tau: with Y = R M,

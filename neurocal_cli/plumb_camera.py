@@ -1,20 +1,26 @@
 """A lens from straight lines, and a camera with poses from everything else: the last step of plumb-line.
 
 Once the network has found the camera from corrected points, the lens is written in the camera's own
-terms, coefficients k of `MODEL` in coordinates that A normalises, and both are made to agree. Two sets of
-equations hold together at the end, on the pixels as they were seen:
+terms, coefficients k of `MODEL` in coordinates that A normalises, and both are made to agree on the
+pixels as they were seen:
 
-    lines   sum r dr/dk = 0               the lens, given A: no pose and no shape of the target enters
-    points  dE/dA = 0, dE/d(poses) = 0    the pixel error (3), given the lens: as with a given lens
+    lines   sum r dr/dk = 0      the lens, given A: no pose and no shape of the target enters
+    points  sum e . J = 0        camera and poses through a fixed lens: e are the errors of the pixels, J
+                                 the derivatives of the pixels by the poses and by the A that moves the
+                                 corrected points, while the lens stays where it is in the image
 
-with r and its derivatives from `straightness`. They are solved by Newton's method, the poses eliminated.
+with r and its derivatives from `straightness`. Newton's method, with both sets of equations by A and k as
+they are meant, A moving its lens along, and the poses eliminated.
 
-Covariance, to first order and in whitened pixels of noise e: the lines' equations have the variance
-M = sum_i G_i^T G_i of G_i = sum nu dr/dk over the lines through a point i; the points' equations, reduced
-to A, have S_AA; straight lines stay straight when poses change, so the first do not depend on what the
-poses take up, and on A's by H_kA = sum dr/dk dr/dA. With the matrix B of both sets of equations,
-cov(A, k) = B^-1 [[S_AA, H_Ak], [H_kA, M]] B^-T; the poses' follows as in `uncertainty`. The noise is that
-of each set's own residuals.
+Covariance, to first order and in whitened pixels of noise. The lines' equations H_kk dk + H_kA dA = s
+have the variance M = sum_i G_i^T G_i, with G_i = sum nu dr/dk over the lines through a point i. The points'
+equations, reduced to A, are Q_AA dA + Q_Ak dk = g, and g has the variance S = J^T J, reduced. What A and
+the poses move through a fixed lens leaves straight lines straight, so s and g are independent, and with
+B = [[Q_AA, Q_Ak], [H_kA, H_kk]],
+
+    cov(A, k) = B^-1 [[S, 0], [0, M]] B^-T.
+
+The poses' follows as in `uncertainty`. The noise is that of each set's own residuals.
 """
 
 from __future__ import annotations
@@ -27,10 +33,10 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.lens import Lens, bend, coefficient_names
-from neurocal_cli.pixel_error import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.pixel_error import POSE, CameraState, camera_columns, derivatives, normal_blocks
 from neurocal_cli.plumb_line import PlumbLine, lines_in_pixels
 from neurocal_cli.points import Correspondences
-from neurocal_cli.refine import Refined, refine
+from neurocal_cli.refine import Refined
 from neurocal_cli.straightness import CAMERA, Curves, bent_lines
 
 __all__ = ["MODEL", "lens_and_camera"]
@@ -41,6 +47,8 @@ _ITERATIONS = 50
 _TOLERANCE = 1e-10  # step in normalised units that is none any more
 _HALVINGS = 8
 _SINGULAR = 1e-13
+_K = len(coefficient_names(MODEL))
+_BY_K = CAMERA + np.arange(_K)  # columns of the lines' derivatives
 
 
 def lens_and_camera(
@@ -68,57 +76,59 @@ def lens_and_camera(
     """
     views = job.views
     order = slice(None) if views.order is None else views.order
-    seen = (points.pixels[order] - views.pixel_centre) / views.pixel_scale
-    state = solution.refined.state
-    k = _same_lens(state.entries[0], seen, views.pixels)
-    known = replace(job.known, lens=Lens(MODEL, k), free_lens=True)
-    job = replace(job, views=replace(views, pixels=seen), known=known, tally=job.tally)
-    held = np.concatenate([known.free, np.zeros(len(k), dtype=bool)])
-    start = refine(job.views.tiles, replace(state, lens=MODEL, k=k), held, known.free_poses)
-    job.tally.refinements += start.iterations
+    seen = replace(views, pixels=(points.pixels[order] - views.pixel_centre) / views.pixel_scale)
     whitening = views.whitening
     if whitening is not None and views.order is not None:
         whitening = np.empty_like(whitening)
         whitening[views.order] = views.whitening
     lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
-    together = _Together(job, bent_lines(lines, start.state.entries[0], Lens(MODEL, start.state.k)))
+    start = solution.refined.state
+    start = replace(start, lens=MODEL, k=_same_lens(start.entries[0], seen.pixels, views.pixels))
+    known = replace(job.known, lens=Lens(MODEL, start.k), free_lens=True)
+    job = replace(job, views=seen, known=known, tally=job.tally)
+    together = _Together(job, bent_lines(lines, start.entries[0], Lens(MODEL, start.k)))
     refined = together.solved(start)
+    job.tally.refinements += refined.iterations
     return job, Solution(refined, job.tally, together.covariance(refined))
 
 
 def _same_lens(entries: Array, seen: Array, corrected: Array) -> Array:
     """Coefficients that take corrected pixels to the seen ones, in the terms of a camera."""
-    a, s, b, u0, v0 = entries
-    y = (corrected[:, 1] - v0) / b
-    x = (corrected[:, 0] - u0 - s * y) / a
-    dy = (seen[:, 1] - corrected[:, 1]) / b
-    dx = (seen[:, 0] - corrected[:, 0] - s * dy) / a
-    _, _, by = bend(MODEL, np.zeros(len(coefficient_names(MODEL))), x, y)
+    x, y = _normalised(entries, corrected)
+    bent_x, bent_y = _normalised(entries, seen)
+    _, _, by = bend(MODEL, np.zeros(_K), x, y)
     columns = np.column_stack([np.concatenate(pair) for pair in by])
-    return np.linalg.lstsq(columns, np.concatenate([dx, dy]), rcond=None)[0]
+    return np.linalg.lstsq(columns, np.concatenate([bent_x - x, bent_y - y]), rcond=None)[0]
+
+
+def _normalised(entries: Array, pixels: Array) -> tuple[Array, Array]:
+    a, s, b, u0, v0 = entries
+    y = (pixels[:, 1] - v0) / b
+    return (pixels[:, 0] - u0 - s * y) / a, y
 
 
 @dataclass(frozen=True, eq=False)
-class _Equations:
-    """Both sets, at one lens and camera.
+class _PointEquations:
+    """The points' equations, reduced to A by elimination of the poses.
 
     Attributes
     ----------
-    normal : (V, 12 + K, 12 + K) array
-        Of the pixel error, from `normal_blocks`.
-    matrix, right : (f + K, f + K) and (f + K,) arrays
-        B and the right side for a Newton step; the points' rows are the first f.
+    by_own : (f, f + K) array
+        Q: derivatives by A's free entries and k.
+    square : (f, f) array
+        S, their variance but for that of the noise.
+    right : (f,) array
     gain : (V, 6, f + K) array
-        How the poses of a view follow A and k; without free poses, empty.
-    settled : (V, 6) array
-        Step of the poses alone.
+        How the poses of a view follow A and k; empty where poses are given.
+    pose_step : (V, 6) array
+        Of the poses alone.
     """
 
-    normal: Array
-    matrix: Array
+    by_own: Array
+    square: Array
     right: Array
     gain: Array
-    settled: Array
+    pose_step: Array
 
 
 class _Together:
@@ -126,97 +136,112 @@ class _Together:
 
     def __init__(self, job: Job, curves: Curves) -> None:
         self.job, self.curves = job, curves
-        self.n_coefficients = len(coefficient_names(MODEL))
         self.free = np.flatnonzero(job.known.free)
-        self.shared = camera_columns(self.n_coefficients)[np.flatnonzero(job.known.free_camera)]
-        # The same columns among the derivatives of the lines.
-        self.coefficients = CAMERA + np.arange(self.n_coefficients)
-        self.columns = np.concatenate([self.free, self.coefficients])
+        self.columns = np.concatenate([self.free, _BY_K])  # of A and k among the lines' derivatives
 
-    def solved(self, start: Refined) -> Refined:
-        """Newton's method from a start that is already near."""
-        state, done, iterations = start.state, False, 0
-        normal = start.normal
+    def solved(self, start: CameraState) -> Refined:
+        """Newton's method from a state that is already near."""
+        state, settled, iterations = start, False, 0
+        if not self.curves.sensible:
+            raise DegenerateGeometryError(_UNTOLD)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            while iterations < _ITERATIONS and not done:
-                equations = self._equations(state)
-                normal = equations.normal
-                step = _solve(equations.matrix, equations.right)
-                state, taken = self._moved(state, equations, step)
-                done = taken == 1.0 and bool(np.abs(step).max(initial=0.0) < _TOLERANCE)
+            while iterations < _ITERATIONS and not settled:
+                points = self._points(state)
+                matrix, lines = self._matrix(points)
+                step = _solve(matrix, np.concatenate([points.right, lines])[:, None])[:, 0]
+                state, taken = self._moved(state, points, step)
+                settled = taken == 1.0 and bool(np.abs(step).max() < _TOLERANCE)
                 iterations += 1
                 if not taken:
                     break
             normal, _ = normal_blocks(self.job.views.tiles, state)
-        self.job.tally.refinements += iterations
-        settled = np.array([done and start.converged])
-        return Refined(state, normal, normal[:, -1, -1].copy(), start.iterations + iterations, settled)
+        return Refined(state, normal, normal[:, -1, -1].copy(), iterations, np.array([settled]))
 
-    def _equations(self, state: CameraState) -> _Equations:
-        normal, _ = normal_blocks(self.job.views.tiles, state)
-        total = normal.sum(axis=0)
-        f = self.shared
-        S, g = total[f[:, None], f], total[f, -1]
-        gain, settled = np.zeros((0, 6, len(f))), np.zeros((0, 6))
-        if self.job.known.free_poses:
-            C = normal[:, f, POSE]
-            right = np.concatenate([np.swapaxes(C, 1, 2), normal[:, POSE, -1:]], axis=2)
-            solved = _solve(normal[:, POSE, POSE], right)
-            gain, settled = solved[:, :, :-1], solved[:, :, -1]
-            S = S - (C @ gain).sum(axis=0)
-            g = g - (C @ settled[..., None]).sum(axis=0)[:, 0]
+    def _matrix(self, points: _PointEquations) -> tuple[Array, Array]:
+        """B, and the right side of the lines' equations."""
         r, J, _ = self.curves.derivatives()
-        of_lines = J[:, self.coefficients].T
-        n = len(self.free)
-        matrix = np.concatenate([S[:n], of_lines @ J[:, self.columns]])
-        return _Equations(normal, matrix, np.concatenate([g[:n], of_lines @ r]), gain, settled)
+        by_k = J[:, _BY_K].T
+        return np.concatenate([points.by_own, by_k @ J[:, self.columns]]), by_k @ r
 
-    def _moved(self, state: CameraState, equations: _Equations, step: Array) -> tuple[CameraState, float]:
+    def _moved(self, state: CameraState, points: _PointEquations, step: Array) -> tuple[CameraState, float]:
         """Take the step, or as much of it as keeps the points in front and the lens unfolded."""
-        by_camera = np.zeros((1, 5 + self.n_coefficients))
+        by_camera = np.zeros((1, 5 + _K))
         by_camera[0, self.columns] = step
         by_pose = np.zeros((self.job.views.n_views, 6))
         if self.job.known.free_poses:
-            by_pose = equations.settled - equations.gain @ step
+            by_pose = points.pose_step - points.gain @ step
         length = 1.0
         for _ in range(_HALVINGS):
             trial = state.moved(length * by_camera, length * by_pose)
-            curves = self.curves.seen_through(trial.entries[0], trial.k).settled()
-            sensible = (trial.entries[0, [0, 2]] > 0).all() and curves.sensible
-            if sensible and normal_blocks(self.job.views.tiles, trial)[1].all():
-                self.curves = curves
-                return trial, length
+            if (trial.entries[0, [0, 2]] > 0).all() and np.isfinite(trial.k).all():
+                curves = self.curves.seen_through(trial.entries[0], trial.k).settled()
+                if curves.sensible and normal_blocks(self.job.views.tiles, trial)[1].all():
+                    self.curves = curves
+                    return trial, length
             length *= 0.5
         return state, 0.0
 
+    def _points(self, state: CameraState) -> _PointEquations:
+        tiles, width = self.job.views.tiles, 12 + _K
+        own = camera_columns(_K)[[*self.free, *range(5, 5 + _K)]]
+        fixed = width + self.free
+        blocks = []
+        for chunk in tiles.chunks():
+            view = tiles.view[chunk]
+            buffer = np.zeros((len(view), width + 5, 2, tiles.local.shape[2]))
+            derivatives(tiles, chunk, state, buffer[:, :width])
+            Xc = state.R[view] @ tiles.local[chunk] + state.t[view][:, :, None]
+            _through_fixed_lens(buffer, state.entries[0], Xc)
+            flat = buffer.reshape(len(view), width + 5, -1)
+            blocks.append(flat @ np.swapaxes(flat, 1, 2))
+        N = tiles.sum_by_view(np.concatenate(blocks))
+        wanted = np.array([*own, *fixed, width - 1])  # and the residual
+        rows = N[:, fixed][:, :, wanted]
+        solved = np.zeros((0, 6, len(wanted)))
+        if self.job.known.free_poses:
+            solved = _solve(N[:, POSE, POSE], N[:, POSE][:, :, wanted])
+            rows = rows - N[:, fixed, POSE] @ solved
+        total, n = rows.sum(axis=0), len(own)
+        return _PointEquations(total[:, :n], total[:, n:-1], total[:, -1], solved[:, :, :n], solved[:, :, -1])
+
     def covariance(self, refined: Refined) -> Array:
         """(f + K, f + K) covariance of A's free entries and the coefficients."""
-        equations, known = self._equations(refined.state), self.job.known
-        n, n_views = len(self.free), self.job.views.n_views
+        known, n = self.job.known, len(self.free)
+        points = self._points(refined.state)
+        B, _ = self._matrix(points)
         r, J, nu = self.curves.derivatives()
-        by_k, row = J[:, self.coefficients], self.curves.seen.lines.row
-        G = np.zeros((int(row.max()) + 1, 2, self.n_coefficients))
-        np.add.at(G, row, nu[:, :, None] * by_k[:, None, :])
+        by_k, lines = J[:, _BY_K], self.curves.seen.lines
+        G = np.zeros((int(lines.row.max()) + 1, 2, _K))
+        np.add.at(G, lines.row, nu[:, :, None] * by_k[:, None, :])
         M = np.tensordot(G, G, axes=((0, 1), (0, 1)))
         taken = float(np.trace(_solve(by_k.T @ by_k, M)))
-        of_lines = float(r @ r) / max(len(r) - 2 * len(self.curves.seen.lines) - taken, 1.0)
-        unknowns = n + self.n_coefficients + (6 * n_views if known.free_poses else 0)
+        of_lines = float(r @ r) / max(len(r) - 2 * len(lines) - taken, 1.0)
+        unknowns = n + _K + (6 * self.job.views.n_views if known.free_poses else 0)
         of_points = float(refined.cost.sum()) / max(2 * len(self.job.views.index) - unknowns, 1)
-        noise = np.empty_like(equations.matrix)
-        noise[:n, :n] = of_points * equations.matrix[:n, :n]
-        noise[n:, n:] = of_lines * M
-        noise[n:, :n] = np.sqrt(of_points * of_lines) * (by_k.T @ J[:, self.free])
-        noise[:n, n:] = noise[n:, :n].T
-        half = _solve(equations.matrix, _not_negative(noise))
-        return _not_negative(_solve(equations.matrix, half.T))
+        noise = np.zeros_like(B)
+        noise[:n, :n], noise[n:, n:] = of_points * points.square, of_lines * M
+        return _solve(B, _solve(B, noise).T)
 
 
-def _not_negative(covariance: Array) -> Array:
-    """The nearest covariance: of points that fit no camera at all, the sums above need not be one."""
-    scale = np.sqrt(np.diagonal(covariance).clip(1e-300))
-    outer = np.outer(scale, scale)
-    values, vectors = np.linalg.eigh(covariance / outer)
-    return (vectors * values.clip(0.0)) @ vectors.T * outer
+def _through_fixed_lens(buffer: Array, entries: Array, Xc: Array) -> None:
+    """Fill the last five columns: derivatives by A's entries when A moves points and the lens stays.
+
+    Moves of the normalised point, as the image shows them, are those of the pose's first two
+    translations times the depth.
+    """
+    a, s, b, _, _ = entries
+    depth = Xc[:, None, 2]
+    x, y = Xc[:, None, 0] / depth, Xc[:, None, 1] / depth
+    along_x, along_y = buffer[:, POSE.start + 3] * depth, buffer[:, POSE.start + 4] * depth
+    u, v = along_x / a, along_y / b - s * along_x / (a * b)
+    for column, values in enumerate((x * u, y * u, y * v, u, v), start=buffer.shape[1] - 5):
+        buffer[:, column] = values
+
+
+_UNTOLD = (
+    "straight lines and points do not determine lens and camera; give more views of the board from "
+    "different angles and over more of the image, or use another --distortion"
+)
 
 
 def _solve(matrix: Array, right: Array) -> Array:
@@ -230,15 +255,9 @@ def _solve(matrix: Array, right: Array) -> Array:
     diagonal = np.abs(np.diagonal(matrix, axis1=-2, axis2=-1))
     scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
     scaled = matrix * scale[..., :, None] * scale[..., None, :]
-    vector = right.ndim < matrix.ndim
-    columns = right[..., None] if vector else right
     try:
         if not np.isfinite(scaled).all() or np.linalg.cond(scaled).max() > 1 / _SINGULAR:
             raise np.linalg.LinAlgError
-        x = scale[..., :, None] * np.linalg.solve(scaled, scale[..., :, None] * columns)
+        return scale[..., :, None] * np.linalg.solve(scaled, scale[..., :, None] * right)
     except np.linalg.LinAlgError:
-        raise DegenerateGeometryError(
-            "straight lines and points do not determine lens and camera; give more views of the board from "
-            "different angles and over more of the image, or use another --distortion"
-        ) from None
-    return x[..., 0] if vector else x
+        raise DegenerateGeometryError(_UNTOLD) from None

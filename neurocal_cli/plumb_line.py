@@ -25,13 +25,15 @@ from neurocal_cli.lens import Lens
 from neurocal_cli.lens_domain import straightened
 from neurocal_cli.plumb_lines import FEWEST_ON_LINE, LinesSeen, find_lines
 from neurocal_cli.points import Correspondences
-from neurocal_cli.straightness import Curves, SeenLines, bent_lines
+from neurocal_cli.straightness import Curves, SeenLines, bent_lines, crookedness
 from neurocal_cli.views import noise_model
 
 __all__ = ["PlumbLine", "fit_plumb_line", "lines_in_pixels"]
 
 _MODEL = "k1k2"
 _CENTRE, _COEFFICIENTS = [3, 4], [5, 6]  # columns of the derivatives
+# k1 of lenses to begin with, in units of s: the last barrel is a fisheye's of half the image's width.
+_STRENGTHS = (0.0, -0.2, -0.5, -1.0, -2.0, -4.0, -8.0, 0.3, 1.0)
 _PRIOR = 0.25  # standard deviation of the centre, in units of s
 _FEWEST_EQUATIONS = 12  # places on lines, less two for each line
 _ITERATIONS = 50
@@ -124,7 +126,8 @@ def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> Plum
     curves = bent_lines(seen, np.array([1.0, 0.0, 1.0, *start]), Lens(_MODEL))
     free = _COEFFICIENTS if centre is not None else _CENTRE + _COEFFICIENTS
     spare = equations - len(free)
-    found = _fit(curves, np.array(free), spare)
+    _check_lines(curves)
+    found = _fit(bent_lines(seen, curves.entries, _start(curves)), np.array(free), spare)
     before, after = _rms(curves, equations) * scale, _rms(found, spare) * scale
     return PlumbLine(lines, found.entries[3:] * scale + middle, scale, found.lens, before, after)
 
@@ -147,6 +150,13 @@ def lines_in_pixels(
     return SeenLines(lines, pixels, None if whitening is None else whitening[lines.row])
 
 
+def _start(curves: Curves) -> Lens:
+    """The lens of some, of no fold, that makes the lines straightest: descent may not reach a strong one."""
+    lenses = [Lens(_MODEL, np.array([k1, max(-k1, 0.0) ** 2 / 2])) for k1 in _STRENGTHS]
+    crooked = [crookedness(curves.seen, curves.entries, lens) for lens in lenses]
+    return lenses[int(np.argmin(crooked))]
+
+
 def _rms(curves: Curves, spare: int) -> float:
     """Root mean square error in the image itself, not whitened."""
     plain = replace(curves, seen=replace(curves.seen, whitening=None)).settled()
@@ -163,10 +173,24 @@ def _frame(points: Correspondences) -> tuple[Array, float]:
 
 
 def _fit(curves: Curves, free: NDArray[np.intp], spare: int) -> Curves:
-    """Least squares over some columns, by Levenberg-Marquardt."""
+    """Least squares over some columns of the derivatives, by Levenberg-Marquardt.
+
+    Parameters
+    ----------
+    curves : Curves
+        That are `sensible`.
+    free : (n,) int array
+        Columns of A's entries and the coefficients to move; the centre has its prior.
+    spare : int
+        Equations less unknowns.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The lines do not tell what is to move.
+    """
     prior = np.zeros(5 + len(curves.lens.coefficients))
     prior[_CENTRE] = _PRIOR**-2
-    _check_lines(curves)
     r, J, _ = curves.derivatives()
     cost, damping = float(r @ r), 1e-4
     for _ in range(_ITERATIONS):

@@ -21,7 +21,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.lens import Lens, bend, undistort
 from neurocal_cli.plumb_lines import LinesSeen
 
-__all__ = ["CAMERA", "Curves", "SeenLines", "bent_lines"]
+__all__ = ["CAMERA", "Curves", "SeenLines", "bent_lines", "crookedness"]
 
 CAMERA = 5  # columns of A's entries A11, A12, A22, A13, A23, before the lens's coefficients
 
@@ -213,15 +213,31 @@ def bent_lines(seen: SeenLines, entries: Array, lens: Lens) -> Curves:
     The errors are smallest over lines and feet. Points that the lens cannot have seen make a result
     that is not `sensible`.
     """
-    a, s, b, u0, v0 = entries
-    y = (seen.pixels[:, 1] - v0) / b
-    x = (seen.pixels[:, 0] - u0 - s * y) / a
-    straight = np.column_stack(undistort(lens.model, lens.coefficients, x, y))
-    counts = seen.lines.counts
-    base = seen.sum_by_line(straight) / counts[:, None]
-    off = straight - base[seen.lines.line]
-    xx, xy, yy = (seen.sum_by_line(p) for p in (off[:, 0] ** 2, off[:, 0] * off[:, 1], off[:, 1] ** 2))
+    base, off, (xx, xy, yy) = _straight_lines(seen, entries, lens)
     angle = 0.5 * np.arctan2(2 * xy, xx - yy)
     along = np.column_stack([np.cos(angle), np.sin(angle)])
     feet = (off * along[seen.lines.line]).sum(axis=1)
     return Curves(seen, entries, lens, base, along, feet).settled()
+
+
+def crookedness(seen: SeenLines, entries: Array, lens: Lens) -> float:
+    """How far straightened points lie beside lines, by how far they spread along them, both squared.
+
+    Whatever the lens does to the scale, this stays; infinity where it cannot have seen a point.
+    """
+    _, _, (xx, xy, yy) = _straight_lines(seen, entries, lens)
+    across = 0.5 * (xx + yy - np.hypot(xx - yy, 2 * xy))
+    share = float(across.sum() / (xx + yy).sum())
+    return share if np.isfinite(share) else np.inf
+
+
+def _straight_lines(seen: SeenLines, entries: Array, lens: Lens) -> tuple[Array, Array, tuple[Array, ...]]:
+    """Straightened points: each line's centre (L, 2), the points about it (M, 2), its scatter xx, xy, yy."""
+    a, s, b, u0, v0 = entries
+    y = (seen.pixels[:, 1] - v0) / b
+    x = (seen.pixels[:, 0] - u0 - s * y) / a
+    straight = np.column_stack(undistort(lens.model, lens.coefficients, x, y))
+    base = seen.sum_by_line(straight) / seen.lines.counts[:, None]
+    off = straight - base[seen.lines.line]
+    products = off[:, 0] ** 2, off[:, 0] * off[:, 1], off[:, 1] ** 2
+    return base, off, tuple(seen.sum_by_line(product) for product in products)
