@@ -17,8 +17,6 @@ from neurocal_cli.lens_choice import choose_lens
 from neurocal_cli.neuro import solve
 from neurocal_cli.observability import check_points
 from neurocal_cli.pixel_error import CameraState
-from neurocal_cli.plumb_camera import lens_and_camera
-from neurocal_cli.plumb_line import fit_plumb_line
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known
 from neurocal_cli.reweighting import reweighted
@@ -143,6 +141,10 @@ class Fitter:
 
     def _lines_first(self, points: Correspondences) -> Fit:
         """The lens from straight lines, then the pinhole camera, then both together."""
+        # A hundredth of a second that other lenses are spared.
+        from neurocal_cli.plumb_camera import lens_and_camera
+        from neurocal_cli.plumb_line import fit_plumb_line
+
         plumb = fit_plumb_line(points, self.known.given_centre)
         job = self._job(arrange(plumb.corrected(points)), self.known)
         job, solution, share = reweighted(job, solve(job), points)

@@ -309,6 +309,23 @@ def test_std_is_true_and_nothing_biased_for_many_lenses(k: list[float], centre: 
     check_statistics(k, centre, 400, 0.1 - 1.75 / np.sqrt(2 * 400))
 
 
+@pytest.mark.parametrize("flat", [True, False])
+def test_wrong_points_are_set_aside_before_lines_tell_the_lens(flat: bool) -> None:
+    rng = np.random.default_rng(3)
+    scene = lens_scene([-0.25, 0.1], views=6) if flat else table_1()
+    good = scene.points(0.2, rng)
+    if not flat:
+        good = replace(good, pixels=good.pixels + bent(scene, "k1k2", [-0.25, 0.1]) - scene.pixels)
+    wrong = rng.choice(len(good), 4, replace=False)
+    pixels = good.pixels.copy()
+    pixels[wrong] += [[60.0, 20], [-30, 40], [15, -25], [0, 80]]
+    found = calibrate(replace(good, pixels=pixels), distortion="plumb-line")
+    kept = np.setdiff1d(np.arange(len(good)), wrong)
+    clean = calibrate(good.select(kept), distortion="plumb-line", outliers="keep")
+    assert found.n_rejected == 4
+    assert found.distortion == pytest.approx(clean.distortion, abs=1e-9)
+
+
 # Real data
 
 
