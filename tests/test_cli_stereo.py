@@ -56,7 +56,8 @@ def test_the_summary_says_what_was_found(files: tuple[Path, Path]) -> None:
     result = run("stereo", *files, "--no-skew")
     assert result.stdout.startswith("left:\n  camera_name: left\n")
     text = result.stderr
-    assert "rig: 4 views of both cameras, left 270 points (1 views alone), right 216 points" in text
+    assert "rig: 4 views of both cameras, left 270 points in 5 views, right 216 points in 4 views" in text
+    assert "note: the left camera alone saw left02" in text
     for label in ("alpha_u [px]", "X_right = R X_left + t", "t_z [mm]", "baseline [mm]", "left03 / right03"):
         assert any(line.startswith(label) for line in text.splitlines()), label
     assert "converged" in text.splitlines()[-1]

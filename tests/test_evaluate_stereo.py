@@ -227,6 +227,7 @@ def test_views_that_one_camera_missed_do_no_harm() -> None:
     scene = replace(flat(8), left_only=("01", "02"), right_only=("08",))
     found = evaluate_stereo(*calibrated(scene))
     assert [a for a, _ in found.pairs] == ["left03", "left04", "left05", "left06", "left07"]
+    assert found.alone == (("left01", "left02"), ("right08",))
     assert found.by_view.n_points == 5 * 54
 
 

@@ -6,7 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from rigs import KINDS, RigScene, corner, random_rig
+from scenes import random_rotation
 
 from neurocal_cli import Correspondences, Rig, calibrate
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
@@ -247,3 +250,25 @@ def test_what_makes_no_sense_is_refused() -> None:
         calibrate_stereo(points[0], replace(points[1], world=points[1].world / 25.4))
     with pytest.raises(DegenerateGeometryError, match="both cameras stand at one place"):
         calibrate_stereo(points[0], points[0], skew=False)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(-3, 3), st.integers(0, 2**31 - 1))
+def test_the_world_may_be_scaled_and_moved(log_scale: float, seed: int) -> None:
+    """The rig scales with the target and does not know where its coordinates begin."""
+    rng = np.random.default_rng(seed)
+    points = sides(flat(n_views=4), 0.2)
+    scale, turn, shift = 10**log_scale, random_rotation(rng), rng.normal(0, 300, 3)
+    moved = [replace(p, world=scale * (p.world @ turn.T + shift)) for p in points]
+    one, two = calibrate_stereo(*points, skew=False), calibrate_stereo(*moved, skew=False)
+    assert pytest.approx(one.R, abs=1e-6) == two.R
+    assert two.t / scale == pytest.approx(one.t, abs=1e-3 * one.std["baseline"])
+    assert two.std["baseline"] / scale == pytest.approx(one.std["baseline"], rel=1e-3)
+
+
+def test_exchanging_the_cameras_inverts_the_rig() -> None:
+    left, right = sides(flat(), 0.2)
+    one, two = calibrate_stereo(left, right, skew=False), calibrate_stereo(right, left, skew=False)
+    assert pytest.approx(one.R.T, abs=1e-6) == two.R
+    assert two.t == pytest.approx(-one.R.T @ one.t, abs=0.01 * one.std["baseline"])
+    assert two.rmse_px == pytest.approx(one.rmse_px, rel=1e-6)

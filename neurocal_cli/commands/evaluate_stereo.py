@@ -70,6 +70,9 @@ def stereo(cameras: tuple[str, ...], points: tuple[str, str] | None, method: str
         raise UsageError(f"evaluate stereo takes two calibrations or one rig, not {len(cameras)} files")
     check_one_stdin(*cameras, *(points or ()))
     evaluation = _evaluate(cameras, _read_points(points), method)
+    from neurocal_cli.stereo.report import views_alone
+
+    note(views_alone(evaluation.alone))
     if evaluation.fitted:
         names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
         note([f"{names}: not in the calibrations, so the poses are fitted with the cameras fixed"])

@@ -176,7 +176,8 @@ def _write(rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | No
 
 
 def _report(rig: Rig) -> None:
-    from neurocal_cli.stereo.report import rig_report
+    from neurocal_cli.stereo.report import rig_report, views_alone
 
+    note(views_alone(rig.alone))
     say(rig_report(rig))
     warn(rig.warnings)

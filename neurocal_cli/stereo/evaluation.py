@@ -106,6 +106,8 @@ class StereoEvaluation:
     baseline : float [world unit]
         Of the rig; nan without one.
     pairs : tuple of (left name, right name)
+    alone : two tuples of str
+        Views of the left and of the right camera without a pair, which are in nothing here.
     fitted : tuple of str
         Left camera's views whose poses were estimated from these very points.
     warnings : tuple of str
@@ -116,6 +118,7 @@ class StereoEvaluation:
     rig: SpaceError | None
     baseline: float
     pairs: tuple[tuple[str, str], ...]
+    alone: tuple[tuple[str, ...], tuple[str, ...]]
     fitted: tuple[str, ...]
     warnings: tuple[str, ...] = ()
 
@@ -205,6 +208,7 @@ class _Judge:
             through,
             float("nan") if self.rig is None else self.rig.baseline,
             self.views.both,
+            (self.views.left_only, self.views.right_only),
             tuple(a for a, _ in self.new),
             tuple(self.warnings),
         )

@@ -12,8 +12,15 @@ from neurocal_cli.report import align, rounded
 from neurocal_cli.stereo.evaluation import SpaceError, StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["rig_report", "stereo_evaluation_json", "stereo_evaluation_report", "stereo_evaluation_tables"]
+__all__ = [
+    "rig_report",
+    "stereo_evaluation_json",
+    "stereo_evaluation_report",
+    "stereo_evaluation_tables",
+    "views_alone",
+]
 
+_NAMED = 10  # views in a remark
 _MOST_VIEWS = 20  # rows of a table that still fit on a screen
 _ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
 
@@ -121,12 +128,21 @@ def rig_report(rig: Rig) -> str:
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
+def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
+    """Remarks that name the views which one camera alone saw."""
+    return [
+        f"the {side} camera alone saw {', '.join(map(_shown, names[:_NAMED]))}"
+        + (f" and {len(names) - _NAMED} more views" if len(names) > _NAMED else "")
+        for side, names in zip(("left", "right"), alone, strict=True)
+        if names
+    ]
+
+
 def _headline(rig: Rig) -> str:
     parts = [f"rig: {_counted(len(rig.pairs), 'view')} of both cameras"]
     for name, camera in (("left", rig.left), ("right", rig.right)):
-        alone = len(camera.views) - len(rig.pairs)
         parts.append(
-            f"{name} {_counted(len(camera.points), 'point')}" + (f" ({alone} views alone)" * (alone > 0))
+            f"{name} {_counted(len(camera.points), 'point')} in {_counted(len(camera.views), 'view')}"
         )
     return ", ".join(parts)
 

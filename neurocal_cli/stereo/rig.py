@@ -68,6 +68,15 @@ class Rig:
         return self.pose.t
 
     @property
+    def alone(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Views that the left, and that the right camera alone saw."""
+        both = [*self.pairs, *self.left_out]
+        return (
+            tuple(name for name in self.left.views if name not in {a for a, _ in both}),
+            tuple(name for name in self.right.views if name not in {b for _, b in both}),
+        )
+
+    @property
     def baseline(self) -> float:
         """Distance of the cameras [world unit]."""
         return float(np.linalg.norm(self.pose.t))
