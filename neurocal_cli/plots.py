@@ -14,8 +14,11 @@ from neurocal_cli.geometry import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import FigureBase
 
-__all__ = ["check_available", "draw_calibration"]
+    from neurocal_cli.stereo.rig import Rig
+
+__all__ = ["check_available", "draw_calibration", "draw_rig"]
 
 _MOST_ARROWS = 500  # more cannot be told apart
 _MANY_DOTS = 2000  # from here on they overlap, and an .svg of them grows large
@@ -59,32 +62,49 @@ def draw_calibration(calibration: Calibration, kind: str = "png") -> bytes:
     NeurocalError
         matplotlib is not installed.
     """
+    return _picture([calibration], kind)
+
+
+def draw_rig(rig: Rig, kind: str = "png") -> bytes:
+    """Draw both cameras of a rig side by side; see `draw_calibration`."""
+    return _picture([rig.left, rig.right], kind)
+
+
+def _picture(calibrations: list[Calibration], kind: str) -> bytes:
+    """One or several cameras, four panels each, next to each other."""
     check_available()
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    evaluation = evaluate_camera(calibration)
     # A figure of its own, not pyplot's: no global state, no window, no choice of a backend.
     with rc_context({"font.size": 9, "axes.titlesize": 10, "svg.hashsalt": "neurocal"}):
-        figure = Figure(figsize=(11, 8))
+        figure = Figure(figsize=(11 * len(calibrations), 8))
         figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12)
         FigureCanvasAgg(figure)
-        (arrows, scatter), (bars, curve) = figure.subplots(2, 2)
-        _draw_arrows(arrows, calibration, evaluation)
-        _draw_scatter(scatter, evaluation)
-        _draw_views(bars, evaluation)
-        _draw_curve(curve, calibration)
-        figure.suptitle(
-            f"{_plain(calibration.camera_name)}: rms {evaluation.rmse_px:.4g} px, "
-            f"max {evaluation.max_px:.4g} px, {evaluation.n_points} points, "
-            f"{len(evaluation.views)} view{'s' * (len(evaluation.views) != 1)}"
-        )
+        parts = [figure] if len(calibrations) == 1 else list(figure.subfigures(1, len(calibrations)))  # type: ignore[arg-type]
+        for part, calibration in zip(parts, calibrations, strict=True):
+            _draw_camera(part, calibration)
         buffer = BytesIO()
         # A date would make each picture differ from the last.
         undated = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
         figure.savefig(buffer, format=kind, dpi=120, metadata=undated[kind])
     return buffer.getvalue()
+
+
+def _draw_camera(part: FigureBase, calibration: Calibration) -> None:
+    """Four panels and a title."""
+    evaluation = evaluate_camera(calibration)
+    (arrows, scatter), (bars, curve) = part.subplots(2, 2)
+    _draw_arrows(arrows, calibration, evaluation)
+    _draw_scatter(scatter, evaluation)
+    _draw_views(bars, evaluation)
+    _draw_curve(curve, calibration)
+    part.suptitle(
+        f"{_plain(calibration.camera_name)}: rms {evaluation.rmse_px:.4g} px, "
+        f"max {evaluation.max_px:.4g} px, {evaluation.n_points} points, "
+        f"{len(evaluation.views)} view{'s' * (len(evaluation.views) != 1)}"
+    )
 
 
 def _plain(text: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.noise import common_share, measured, with_common_share
 from neurocal_cli.points import Correspondences
@@ -34,12 +35,18 @@ def reweighted(job: Job, solution: Solution, points: Correspondences) -> tuple[J
     if points.covariance is None or not measured(points.covariance):
         return job, solution, 0.0
     stated = points.covariance if job.views.order is None else points.covariance[job.views.order]
-    share = 0.0
+    # From equal weights: residuals of a fit that a few points rule would confirm that they should.
+    share = 1.0
+    job, solution = _with_share(job, solution, stated, share)
     for _ in range(_PASSES):
         last, share = share, common_share(stated, of_points(job.views, solution.refined.state))
         if abs(share - last) < _SETTLED:
             break
-        whitening = noise_model(with_common_share(stated, share))[1]
-        job = replace(job, views=replace(job.views, whitening=whitening), tally=job.tally)
-        solution = Solution(job.refine(solution.refined.state), job.tally)
+        job, solution = _with_share(job, solution, stated, share)
     return job, solution, share
+
+
+def _with_share(job: Job, solution: Solution, stated: Array, share: float) -> tuple[Job, Solution]:
+    whitening = noise_model(with_common_share(stated, share))[1]
+    job = replace(job, views=replace(job.views, whitening=whitening), tally=job.tally)
+    return job, Solution(job.refine(solution.refined.state), job.tally)

@@ -94,6 +94,14 @@ def test_known_cameras_are_given_one_by_one(files: tuple[Path, Path], tmp_path: 
     assert both.exit_code == 0, both.stderr
 
 
+def test_both_cameras_are_drawn(files: tuple[Path, Path], tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib")
+    result = run("stereo", *files, "--no-skew", "--plot", tmp_path / "rig.png", "-o", tmp_path / "rig.yaml")
+    assert result.exit_code == 0, result.stderr
+    assert (tmp_path / "rig.png").read_bytes().startswith(b"\x89PNG")
+    assert run("stereo", *files, "--plot", "rig.txt").exit_code == 2
+
+
 def test_ros_files_come_beside_the_rig(files: tuple[Path, Path], tmp_path: Path) -> None:
     names = tmp_path / "left.yaml", tmp_path / "right.yaml"
     result = run("stereo", *files, "--no-skew", "--alpha", "0", "--ros", *names, "-o", tmp_path / "rig.yaml")
@@ -129,7 +137,7 @@ def test_it_takes_calibrates_options() -> None:
 
     commands = [neurocal.get_command(Context(neurocal), name) for name in ("calibrate", "stereo")]
     one, two = ({p.name for p in command.params} for command in commands if command is not None)
-    assert one - two == {"points", "intrinsics", "extrinsics", "camera_name", "plot"}
+    assert one - two == {"points", "intrinsics", "extrinsics", "camera_name"}
 
 
 def error(result: Result, *parts: str) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.estimation import Estimation, estimation_options
-from neurocal_cli.commands.options import Command, output_option, points_argument
+from neurocal_cli.commands.options import Command, check_plot, output_option, plot_option, points_argument
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.errors import UsageError
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 __all__ = ["calibrate"]
 
 _NOT_CONVERGED = 3
-_PICTURES = (".png", ".pdf", ".svg")
 
 
 @click.command(cls=Command)
@@ -28,13 +27,7 @@ _PICTURES = (".png", ".pdf", ".svg")
 @click.option(
     "--camera-name", metavar="NAME", default="camera", help="Name of the camera, written to the file."
 )
-@click.option(
-    "--plot",
-    metavar="FILE.png",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Draw the errors and the learning curve to this .png, .pdf or .svg file.",
-)
+@plot_option
 @output_option("CAMERA.yaml", "the calibration")
 @click.pass_context
 def calibrate(
@@ -84,15 +77,7 @@ def calibrate(
 def _check_outputs(output: str, plot: str | None, camera_name: str) -> None:
     if not camera_name.strip() or not camera_name.isprintable():
         raise UsageError("--camera-name must be a name of printable characters")
-    if plot is None:
-        return
-    if not plot.lower().endswith(_PICTURES):
-        raise UsageError(f"--plot {plot}: the name must end in {', '.join(_PICTURES)}")
-    if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
-        raise UsageError("-o and --plot name the same file; give each its own")
-    from neurocal_cli.plots import check_available
-
-    check_available()
+    check_plot(plot, output)
 
 
 def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) -> Calibration:

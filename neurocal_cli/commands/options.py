@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import click
 from click.types import FloatParamType
 
+from neurocal_cli.errors import UsageError
+
 __all__ = [
     "INPUT",
     "Argument",
     "Command",
     "FiniteNumber",
+    "check_plot",
     "json_option",
     "output_option",
+    "plot_option",
     "points_argument",
 ]
+
+_PICTURES = (".png", ".pdf", ".svg")
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -98,3 +105,35 @@ def json_option(f: F) -> F:
     return click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")(
         f
     )
+
+
+def plot_option(f: F) -> F:
+    """Add ``--plot``, a picture of the errors; see `check_plot`."""
+    return click.option(
+        "--plot",
+        metavar="FILE.png",
+        type=click.Path(writable=False, readable=False),
+        show_default="none",
+        help="Draw the errors and the learning curve to this .png, .pdf or .svg file.",
+    )(f)
+
+
+def check_plot(plot: str | None, output: str) -> None:
+    """Refuse a picture that cannot be drawn, before any work is done.
+
+    Raises
+    ------
+    UsageError
+        A name that is no picture's, or the output's.
+    NeurocalError
+        matplotlib is not installed.
+    """
+    if plot is None:
+        return
+    if not plot.lower().endswith(_PICTURES):
+        raise UsageError(f"--plot {plot}: the name must end in {', '.join(_PICTURES)}")
+    if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
+        raise UsageError("-o and --plot name the same file; give each its own")
+    from neurocal_cli.plots import check_available
+
+    check_available()

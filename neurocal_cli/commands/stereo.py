@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.estimation import Estimation, estimation_options_without_files
-from neurocal_cli.commands.options import INPUT, Argument, Command, output_option
+from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option, plot_option
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.errors import UsageError
@@ -65,6 +65,7 @@ _NOT_CONVERGED = 3
     show_default="none",
     help="Also write two files that ROS's stereo nodes read, in metres.",
 )
+@plot_option
 @output_option("RIG.yaml", "the rig")
 @click.pass_context
 def stereo(
@@ -76,6 +77,7 @@ def stereo(
     right_intrinsics: str | None,
     alpha: float | None,
     ros: tuple[str, str] | None,
+    plot: str | None,
     output: str,
 ) -> None:
     """Calibrate two cameras and how the right one stands to the left, X_right = R X_left + t.
@@ -101,9 +103,10 @@ def stereo(
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
     check_one_stdin(left, right, left_intrinsics, right_intrinsics)
+    check_plot(plot, output)
     _check_outputs(output, ros)
     rig = _estimate((left, right), sides, estimation)
-    _write(rig, output, alpha, ros)
+    _write(rig, output, alpha, ros, plot)
     _report(rig)
     if not rig.converged:
         ctx.exit(_NOT_CONVERGED)
@@ -164,12 +167,16 @@ def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], esti
         )
 
 
-def _write(rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None) -> None:
+def _write(rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plot: str | None) -> None:
+    """Write all files, the picture drawn before any is touched."""
+    from neurocal_cli.io.files import write_whole
     from neurocal_cli.io.rig_yaml import format_ros_pair, write_rig
 
-    if ros is not None:
-        from neurocal_cli.io.files import write_whole
+    if plot is not None:
+        from neurocal_cli.plots import draw_rig
 
+        write_whole(plot, draw_rig(rig, os.path.splitext(plot)[1][1:].lower()))
+    if ros is not None:
         for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
             write_whole(name, text)
     write_rig(rig, output, alpha)
