@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fit_box import half_widths
-from neurocal_cli.detection.fit_edges import OFFSET, EdgeData, edge_data, fit_edges, moments, with_weight
+from neurocal_cli.detection.fit_edges import (
+    OFFSET,
+    EdgeData,
+    edge_data,
+    fit_edges,
+    light_at,
+    moments,
+    with_weight,
+)
 from neurocal_cli.detection.fit_gate import believable, smooth
 from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
@@ -40,6 +48,7 @@ _LEAST_SCALE = 0.1  # of the noise by the final residuals; less cannot be, the r
 _WIDEST = 12.0  # px, of the strips for moments
 _SHARP = 0.45  # px; blur below which the pixel's box is taken exactly
 _NEAREST_SHARP = 0.75  # px from the crossing lines, beyond which no pixel reaches over them
+_PRECISE = 0.003  # sigma; standard deviation of offsets
 _CLEARLY = 0.97  # of chi2, with which another profile than the pixel's box is believed
 _WORSE = 1.2  # of chi2, with which another blur is not
 _COLUMNS = 12  # of pixels along an edge before the last fit
@@ -261,23 +270,10 @@ def _blurred(lines: Lines, sigma: float) -> list[Shape]:
 
 def _last_fit(board: Board, first: Fitted) -> Fitted:
     """Edges fitted with what all of them share, and the map through them."""
-    fit, good, n = first.fit, first.good, len(first.good)
-    shading = _shading(first)
+    good, n = first.good, len(first.good)
     lines = board.lines(first.map.map)
-    blur = BoardBlur.of(fit, lines.normal, good)
-    sigma = blur.along(lines.normal)
-    reach = _REACH * sigma
-    data = _pixels(board, lines, sigma, shading, reach, 1)
-    data = with_weight(data, np.full_like(data.weight, 1 / first.noise.edge))
-    prior = level_prior(shading, lines.middle, sigma, blur.spread, first.noise.edge)
-    offset = first.map.residual[:n] + first.map.shift[0]
-    start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
-    half_length = 0.5 * lines.length
-    fit = fit_edges(data, start, prior, half_length, first.shape, _STEPS)
-    shape = profile_shape(data, fit, first.shape, good)
-    noise = Noise.of(fit, data.weight, board.floor)
-    data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
-    fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
+    shading = _shading(first)
+    fit, data, shape, noise = _fine_fit(board, first, lines, shading)
     scale = max(median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
@@ -293,6 +289,30 @@ def _last_fit(board: Board, first: Fitted) -> Fitted:
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
     good = believable(fit, departure, data.beyond)
     return Fitted(lines, fit, data, mapped, shading, shape, noise, good)
+
+
+def _fine_fit(
+    board: Board, first: Fitted, lines: Lines, shading: Shading
+) -> tuple[Fit, EdgeData, Shape, Noise]:
+    """Fits to all pixels, with levels, blur, profile and noise from the whole board."""
+    n, half_length = len(first.good), 0.5 * lines.length
+    shape = profile_shape(first.data, first.fit, first.shape, first.good)
+    noise = Noise.of(first.fit, first.data.weight, board.floor)
+    blur = BoardBlur.of(first.fit, lines.normal, first.good)
+    sigma = blur.along(lines.normal)
+    data = _pixels(board, lines, sigma, shading, _REACH * sigma, 1)
+    prior = level_prior(shading, lines.middle, sigma, blur.spread, noise.edge)
+    offset = first.map.residual[:n] + first.map.shift[0]
+    start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
+    data = with_weight(data, noise.weighted(light_at(data, start), data.weight))
+    fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
+    if median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * median(sigma)) ** 2:
+        # So precise that the profile from a share of the pixels is what is worst known.
+        shape = profile_shape(data, fit, shape, first.good)
+        noise = Noise.of(fit, data.weight, board.floor)
+        data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
+        fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
+    return fit, data, shape, noise
 
 
 def _stride(lines: Lines) -> int:

@@ -34,7 +34,17 @@ from neurocal_cli.detection.fit_profile import erf_and_density, response
 from neurocal_cli.detection.fit_strips import Lines, Strips
 from neurocal_cli.geometry import Array
 
-__all__ = ["OFFSET", "TILT", "EdgeData", "edge_data", "fit_edges", "linearised", "moments", "with_weight"]
+__all__ = [
+    "OFFSET",
+    "TILT",
+    "EdgeData",
+    "edge_data",
+    "fit_edges",
+    "light_at",
+    "linearised",
+    "moments",
+    "with_weight",
+]
 
 Single = NDArray[np.float32]
 
@@ -174,6 +184,12 @@ def fit_edges(
         return lambda values: linearised(pixels, levers, values, form)
 
     return gauss_newton(model_of, start, prior, data.weight, steps)
+
+
+def light_at(data: EdgeData, values: Array) -> Single:
+    """About the light x (E, N) between the levels, for weights that change slowly with it."""
+    offset, sigma = (values[:, k, None].astype(np.float32) for k in (OFFSET, BLUR))
+    return np.asarray(erf_and_density((data.d - offset) / sigma)[0] * data.Q, dtype=np.float32)
 
 
 def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Linear:
