@@ -306,8 +306,9 @@ def _fine_fit(
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     data = with_weight(data, noise.weighted(light_at(data, start), data.weight))
     fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
-    if median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * median(sigma)) ** 2:
-        # So precise that the profile from a share of the pixels is what is worst known.
+    usual = median(sigma)
+    if usual < _SHARP or median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
+        # So precise, or so sharp, that the profile from a share of the pixels is what is worst known.
         shape = profile_shape(data, fit, shape, first.good)
         noise = Noise.of(fit, data.weight, board.floor)
         data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
