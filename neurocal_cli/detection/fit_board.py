@@ -47,6 +47,7 @@ _NORMAL = 1.4826  # standard deviations in a median of absolute values
 _LEAST_SCALE = 0.1  # of the noise by the final residuals; less cannot be, the rounding being known
 _WIDEST = 12.0  # px, of the strips for moments
 _SHARP = 0.45  # px; blur below which the pixel's box is taken exactly
+_NEAREST_FIRST, _ENDS = 2.0, 0.12  # sigma, but no more than so much of the length, before the last fit
 _NEAREST_SHARP = 0.75  # px from the crossing lines, beyond which no pixel reaches over them
 _PRECISE = 0.003  # sigma; standard deviation of offsets
 _CLEARLY = 0.97  # of chi2, with which another profile than the pixel's box is believed
@@ -328,6 +329,9 @@ def _pixels(
     strips = gather(board.image, lines, half, np.zeros((len(half), 1)), stride)
     contrast = shading.at(lines.middle)[1]
     nearest = np.where(sigma < _SHARP, _NEAREST_SHARP / sigma, _NEAREST)
+    if stride > 1:
+        # The crossing lines are not well known yet.
+        nearest = np.maximum(nearest, np.minimum(_NEAREST_FIRST, _ENDS * lines.length / sigma))
     return edge_data(strips, lines, sigma, shading.slopes(lines.middle), contrast, nearest)
 
 

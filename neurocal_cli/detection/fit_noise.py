@@ -31,7 +31,9 @@ _LEAST_BLUR = 0.2905  # px
 _ROUND, _ROUND_ROWS = 0.5, 1.0  # relative, of the blur's square; rows' worth of belief that it is round
 _BLUR_SPREAD = 0.03  # relative, of single edges' blur around the board's at least
 _ENOUGH = 10000  # pixels to learn the profile's shape from
-_TAILS, _BENDS = 0.05, 0.3  # standard deviations of the coefficients before anything is known
+# Standard deviations of the coefficients before anything is known: they bind what blur and contrast can
+# stand in for, and give way to ten thousand pixels.
+_TAILS, _BENDS = 0.01, 0.03
 _RIDGE = 1e-5
 _LEAST_SPREAD = 0.0002  # of levels, in variances of the noise
 
