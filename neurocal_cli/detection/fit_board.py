@@ -52,7 +52,7 @@ _NEAREST_SHARP = 0.75  # px from the crossing lines, beyond which no pixel reach
 _PRECISE = 0.003  # sigma; standard deviation of offsets
 _CLEARLY = 0.97  # of chi2, with which another profile than the pixel's box is believed
 _WORSE = 1.2  # of chi2, with which another blur is not
-_COLUMNS = 12  # of pixels along an edge before the last fit
+_COLUMNS = 40  # of pixels along an edge, before the last fit
 _BLUR_OFF = 0.1  # relative error of the blur that makes the first fit be done again
 _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations before anything is known
 
