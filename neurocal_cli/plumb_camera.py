@@ -184,7 +184,8 @@ class _Together:
     def _points(self, state: CameraState) -> _PointEquations:
         tiles, width = self.job.views.tiles, 12 + _K
         own = camera_columns(_K)[[*self.free, *range(5, 5 + _K)]]
-        fixed = width + self.free
+        fixed = width + np.arange(5)
+        taken = np.concatenate([np.arange(POSE.start, POSE.stop), fixed])
         blocks = []
         for chunk in tiles.chunks():
             view = tiles.view[chunk]
@@ -193,14 +194,15 @@ class _Together:
             Xc = state.R[view] @ tiles.local[chunk] + state.t[view][:, :, None]
             _through_fixed_lens(buffer, state.entries[0], Xc)
             flat = buffer.reshape(len(view), width + 5, -1)
-            blocks.append(flat @ np.swapaxes(flat, 1, 2))
+            # Not the whole square: it is larger than what OpenBLAS keeps to one thread, and more in all.
+            blocks.append(flat[:, taken] @ np.swapaxes(flat, 1, 2))
         N = tiles.sum_by_view(np.concatenate(blocks))
-        wanted = np.array([*own, *fixed, width - 1])  # and the residual
-        rows = N[:, fixed][:, :, wanted]
+        wanted = np.array([*own, *fixed[self.free], width - 1])  # and the residual
+        rows, poses = N[:, 6 + self.free][:, :, wanted], N[:, :6]
         solved = np.zeros((0, 6, len(wanted)))
         if self.job.known.free_poses:
-            solved = _solve(N[:, POSE, POSE], N[:, POSE][:, :, wanted])
-            rows = rows - N[:, fixed, POSE] @ solved
+            solved = _solve(poses[:, :, POSE], poses[:, :, wanted])
+            rows = rows - np.swapaxes(poses[:, :, fixed[self.free]], 1, 2) @ solved
         total, n = rows.sum(axis=0), len(own)
         return _PointEquations(total[:, :n], total[:, n:-1], total[:, -1], solved[:, :, :n], solved[:, :, -1])
 
