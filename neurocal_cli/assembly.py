@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.camera import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.fitting import Fit
-from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
+from neurocal_cli.geometry import Array
 from neurocal_cli.job import Solution
-from neurocal_cli.lens import Lens, coefficient_names
+from neurocal_cli.lens import Lens
 from neurocal_cli.observability import refuse_undetermined
+from neurocal_cli.parameters import parameter_covariance, parameter_warnings, pose_std
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, intrinsic_matrix
 from neurocal_cli.uncertainty import Covariance, covariance
@@ -23,10 +23,6 @@ from neurocal_cli.whiteness import of_points
 
 __all__ = ["assemble"]
 
-# A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
-_POOR = 0.05
-_POOR_THETA = 0.02  # rad
-_TOLD_APART = 2.0  # standard deviations
 _NAMED = 5  # wrong points that the warning names
 
 
@@ -115,26 +111,18 @@ class _Assembly:
             distortion=refined.state.k,
             network=self._network(rmse),
             camera_name=name,
-            warnings=(
-                *_warnings(intrinsics, std),
-                *_noise_coefficients(Lens(known.lens.model, refined.state.k), std),
-            ),
+            warnings=parameter_warnings(intrinsics, Lens(known.lens.model, refined.state.k), std),
         )
 
     def _camera_covariance(self, intrinsics: Intrinsics, cov: Covariance) -> tuple[Array, dict[str, float]]:
         """Covariance of the intrinsic parameters and the lens's coefficients, and their std; 0 if given."""
         known = self.known
-        coefficients = coefficient_names(known.lens.model)
-        J = np.zeros((5 + len(coefficients),) * 2)
-        J[:5, :5] = intrinsics.entry_jacobian() * self.views.pixel_scale
-        J[5:, 5:] = np.eye(len(coefficients))
-        J = J[:, np.flatnonzero(known.free_camera)]
-        block = J @ cov.entries @ J.T
-        std = {
-            name: 0.0 if name in known.fixed else float(np.sqrt(block[n, n]))
-            for n, name in enumerate((*INTRINSIC_NAMES, *coefficients))
-        }
-        return block, std
+        free = np.flatnonzero(known.free_camera)
+        entries = np.zeros((len(known.free_camera),) * 2)
+        entries[np.ix_(free, free)] = cov.entries
+        return parameter_covariance(
+            intrinsics, known.lens.model, entries, self.views.pixel_scale, known.fixed
+        )
 
     def _views(self, cov: Covariance) -> tuple[dict[str, ViewResult], float, float]:
         """Poses in world units with their std, and the pixel error (3), unweighted."""
@@ -145,12 +133,7 @@ class _Assembly:
         if known.poses is not None:
             R = np.stack([known.poses[name].R for name in views.names])
             t_world = np.stack([known.poses[name].t for name in views.names])
-        # t = scale tau_centre - R c: omega turns R c with it.
-        J = np.zeros((len(R), 6, 6))
-        J[:, :3, :3] = euler_jacobian(R)
-        J[:, 3:, :3] = cross_matrix(centre)
-        J[:, 3:, 3:] = np.eye(3) * views.scale[:, None, None]
-        std = np.sqrt(np.maximum(np.diagonal(J @ cov.poses @ np.swapaxes(J, 1, 2), axis1=1, axis2=2), 0.0))
+        std = pose_std(R, centre, views.scale, cov.poses)
         squared = self._squared_errors()
         rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
         R.setflags(write=False)
@@ -193,33 +176,3 @@ class _Assembly:
             rmse_after=rmse,
             curve=tuple((tally.curve * px).tolist()),
         )
-
-
-def _noise_coefficients(lens: Lens, std: Mapping[str, float]) -> tuple[str, ...]:
-    """Warn of coefficients that the data does not tell from 0."""
-    pairs = zip(coefficient_names(lens.model), lens.coefficients, strict=True)
-    noise = [
-        f"{name} ({k:.2g} +- {std[name]:.2g})" for name, k in pairs if 0 < abs(k) < _TOLD_APART * std[name]
-    ]
-    if not noise:
-        return ()
-    return (f"not told from 0: {', '.join(noise)}; a simpler --distortion would do",)
-
-
-def _warnings(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:
-    """Parameters that exist but are badly determined."""
-    alpha = max(intrinsics.alpha_u, intrinsics.alpha_v)
-    limits = {
-        "alpha_u": _POOR * intrinsics.alpha_u,
-        "alpha_v": _POOR * intrinsics.alpha_v,
-        "u0": _POOR * alpha,
-        "v0": _POOR * alpha,
-        "theta": _POOR_THETA,
-    }
-    poor = [f"{name} (std {std[name]:.2g})" for name in INTRINSIC_NAMES if std[name] > limits[name]]
-    if not poor:
-        return ()
-    return (
-        f"badly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
-        "the target more, or give what is known (--no-skew, --type 2)",
-    )

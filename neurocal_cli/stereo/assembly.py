@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.arrowhead import ArrowheadCovariance, arrowhead_covariance
 from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.camera import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
-from neurocal_cli.lens import coefficient_names
+from neurocal_cli.geometry import Array, euler_jacobian
+from neurocal_cli.given_lens import folds_back
+from neurocal_cli.lens import Lens
+from neurocal_cli.parameters import parameter_covariance, parameter_warnings, pose_std
 from neurocal_cli.pixel_error import ENTRIES, POSE, CameraState, residuals
 from neurocal_cli.problems import intrinsic_matrix
 from neurocal_cli.stereo.pixel_error import Columns, Sightings, through_rig
@@ -173,20 +175,28 @@ class _RigAssembly:
         seen: Sightings,
         columns: NDArray[np.intp],
     ) -> dict[str, Any]:
-        names = (*INTRINSIC_NAMES, *coefficient_names(camera.lens))
-        J = np.eye(len(names))
-        J[:5, :5] = intrinsics.entry_jacobian() * seen.pixel_scale
-        block = J @ self._shared_block(columns) @ J.T
+        block, std = parameter_covariance(
+            intrinsics, camera.lens, self._shared_block(columns), seen.pixel_scale, given.fixed
+        )
+        names = list(std)
         free = [k for k, name in enumerate(names) if name not in given.fixed]
-        std = {
-            name: 0.0 if name in given.fixed else float(np.sqrt(block[k, k])) for k, name in enumerate(names)
-        }
+        lens = Lens(camera.lens, camera.k)
+        where = folds_back(lens, intrinsics.A, given.points)
+        if where is not None:
+            raise DegenerateGeometryError(
+                f"{given.points.source}: together with the other camera, the distortion {lens.model} folds "
+                f"back inside the {where}; choose a simpler model, or give points nearer to the image's "
+                "corners"
+            )
+        before = parameter_warnings(given.intrinsics, Lens(camera.lens, given.distortion), given.std)
+        now = parameter_warnings(intrinsics, lens, std)
         return {
             "intrinsics": intrinsics,
             "std": std,
             "distortion": camera.k,
             "covariance": block[np.ix_(free, free)],
             "covariance_names": tuple(names[k] for k in free),
+            "warnings": (*now, *(text for text in given.warnings if text not in before)),
         }
 
     def _world_poses(self, side: int) -> tuple[Array, Array]:
@@ -209,13 +219,8 @@ class _RigAssembly:
         mixed = by_rig @ cross @ np.swapaxes(by_pose, 1, 2)
         covariance = by_pose @ own @ np.swapaxes(by_pose, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
         covariance += by_rig @ self._shared_block(columns.rig) @ np.swapaxes(by_rig, 1, 2)
-        # t = scale tau - R c: omega turns R c with it.
-        J = np.zeros((len(R), 6, 6))
-        J[:, :3, :3] = euler_jacobian(R)
-        J[:, 3:, :3] = cross_matrix((R @ frames.centre[seen.view][..., None])[..., 0])
-        J[:, 3:, 3:] = np.eye(3) * frames.scale[seen.view][:, None, None]
-        block = J @ covariance @ np.swapaxes(J, 1, 2)
-        return np.sqrt(np.maximum(np.diagonal(block, axis1=1, axis2=2), 0.0))
+        centre = (R @ frames.centre[seen.view][..., None])[..., 0]
+        return pose_std(R, centre, frames.scale[seen.view], covariance)
 
 
 def _scaled(inverse: ArrowheadCovariance, variance: float) -> ArrowheadCovariance:

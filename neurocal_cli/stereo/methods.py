@@ -73,7 +73,9 @@ def calibrate_stereo(
         cameras.append(calibrate(points, **side, progress=_named(progress, name)))
     rig = fit_rig(cameras[0], cameras[1], refine_cameras=True, **_agreement(options))
     warnings = [
-        f"{name}: {text}" for name, camera in zip(_SIDES, cameras, strict=True) for text in camera.warnings
+        f"{name}: {text}"
+        for name, camera in zip(_SIDES, (rig.left, rig.right), strict=True)
+        for text in camera.warnings
     ]
     return replace(rig, warnings=(*rig.warnings, *warnings))
 

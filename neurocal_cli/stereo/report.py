@@ -9,8 +9,9 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.lens import coefficient_names
 from neurocal_cli.report import align, rounded
-from neurocal_cli.stereo.evaluation import SpaceError, StereoEvaluation
+from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.stereo.space_error import SpaceError
 
 __all__ = [
     "rig_report",

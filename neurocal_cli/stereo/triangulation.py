@@ -1,9 +1,7 @@
 """Points in space from their pixels in both cameras, in the left camera's frame.
 
-`optimal` minimises the squared pixel errors of both images over the point, lenses included (the
-maximum-likelihood point for Gaussian noise): Gauss-Newton for thousands of points at a time on
-(x, y, w), the point being (x, y, 1) / w. Its left image depends on x and y alone and its right one hardly
-bends with w, at any distance up to infinity, so two or three steps do.
+`optimal` minimises the squared pixel errors of both images over the point, lenses included: the
+maximum-likelihood point for Gaussian noise.
 
 `linear` takes the smallest singular vector of the four image equations and `midpoint` the middle of the
 shortest segment between both rays, each on pixels that the lenses were taken off (Hartley and Sturm 1997).
@@ -20,19 +18,15 @@ from numpy.typing import NDArray
 from neurocal_cli.camera import Pose
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import bend, undistort
-from neurocal_cli.pixel_error import ENTRIES
 from neurocal_cli.problems import KnownCamera
+from neurocal_cli.stereo.image_camera import ImageCamera
+from neurocal_cli.stereo.point_batch import PointBatch
 
 __all__ = ["METHODS", "Triangulated", "epipolar_limit", "triangulate"]
 
 METHODS = ("optimal", "linear", "midpoint")
 
 _AT_ONCE = 4096  # points whose arrays stay in the processor's cache
-_MOST_STEPS = 30
-_SETTLED = 1e-9  # px: a step that moves no image by more is the last
-_SMALL_STEP = 0.02  # of Newton's in the image plane: the next one would be a thousandth
-_RISE, _ROUNDING = 1 + 1e-9, 1e-18  # of a squared error, and px^2: what is no rise but rounding
 _OFF = 5.0  # standard deviations of the epipolar error
 
 
@@ -111,7 +105,7 @@ def triangulate(
     n = len(pixels[0])
     if len(pixels[1]) != n:
         raise InputError(f"{n} left pixels but {len(pixels[1])} right ones; give one of each for every point")
-    cameras = _Camera.of(left), _Camera.of(right)
+    cameras = ImageCamera.of(left), ImageCamera.of(right)
     rigs = _Rigs.of([pose] if isinstance(pose, Pose) else pose, which, n)
     points, epipolar, behind = np.empty((n, 3)), np.empty(n), np.empty(n, dtype=bool)
     covariance = np.empty((n, 6)) if method == "optimal" else None
@@ -119,7 +113,7 @@ def triangulate(
         for start in range(0, n, _AT_ONCE):
             rows = slice(start, start + _AT_ONCE)
             factors = None if whitening is None else (whitening[0][rows].T, whitening[1][rows].T)
-            batch = _Batch(cameras, rigs.of_points(rows), pixels[0][rows].T, pixels[1][rows].T, factors)
+            batch = PointBatch(cameras, rigs.of_points(rows), pixels[0][rows].T, pixels[1][rows].T, factors)
             if covariance is None:
                 points[rows] = batch.linear() if method == "linear" else batch.midpoint()
                 epipolar[rows], behind[rows] = batch.compare(points[rows])
@@ -133,57 +127,6 @@ def _pixels(values: Array) -> Array:
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise InputError(f"pixels must have the shape (N, 2), found {pixels.shape}")
     return pixels
-
-
-@dataclass(frozen=True, eq=False)
-class _Camera:
-    """Entries of A and the lens."""
-
-    entries: tuple[float, float, float, float, float]
-    model: str
-    k: Array
-
-    @classmethod
-    def of(cls, camera: KnownCamera) -> _Camera:
-        a, s, b, u0, v0 = camera.intrinsics.A[ENTRIES].tolist()
-        bends = camera.distortion_model == "fisheye" or bool(np.any(camera.distortion))
-        model = camera.distortion_model if bends else "none"
-        return cls((a, s, b, u0, v0), model, np.asarray(camera.distortion, dtype=float))
-
-    def straight(self, pixels: Array) -> tuple[Array, Array]:
-        """Normalised image points without the lens; nan where there are none."""
-        x, y = self._normalised(pixels)
-        return (x, y) if self.model == "none" else undistort(self.model, self.k, x, y)
-
-    def nearly_straight(self, pixels: Array) -> tuple[Array, Array]:
-        """The same to a thousandth or so, in two of Newton's steps, wherever these do."""
-        x, y = self._normalised(pixels)
-        if self.model == "none":
-            return x, y
-        near_x, near_y = x, y
-        for _ in range(2):
-            (bent_x, bent_y), (xx, xy, yx, yy), _ = bend(self.model, self.k, near_x, near_y)
-            det = xx * yy - xy * yx
-            step_x = (yy * (x - bent_x) - xy * (y - bent_y)) / det
-            step_y = (xx * (y - bent_y) - yx * (x - bent_x)) / det
-            near_x, near_y = near_x + step_x, near_y + step_y
-        far = ~((det > 0) & (step_x * step_x + step_y * step_y < _SMALL_STEP**2))
-        if far.any():
-            near_x[far], near_y[far] = undistort(self.model, self.k, x[far], y[far])
-        return near_x, near_y
-
-    def _normalised(self, pixels: Array) -> tuple[Array, Array]:
-        a, s, b, u0, v0 = self.entries
-        y = (pixels[1] - v0) / b
-        return (pixels[0] - u0 - s * y) / a, y
-
-    def seen(self, x: Array, y: Array) -> tuple[Array, Array, tuple[Array | float, ...]]:
-        """Pixels of normalised points and their derivatives du/dx, du/dy, dv/dx, dv/dy."""
-        a, s, b, u0, v0 = self.entries
-        if self.model == "none":
-            return a * x + s * y + u0, b * y + v0, (a, s, 0.0, b)
-        (x, y), (xx, xy, yx, yy), _ = bend(self.model, self.k, x, y)
-        return a * x + s * y + u0, b * y + v0, (a * xx + s * yx, a * xy + s * yy, b * yx, b * yy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,218 +148,3 @@ class _Rigs:
         """[R | t] with points along the last axis, (3, 4, n), or (3, 4, 1) for one that all share."""
         P = np.concatenate([self.R, self.t[..., None]], axis=2)
         return np.moveaxis(P if self.which is None else P[self.which[rows]], 0, -1)
-
-
-class _Batch:
-    """Some thousand points; all arrays (n,)."""
-
-    def __init__(
-        self,
-        cameras: tuple[_Camera, _Camera],
-        rig: Array,
-        left: Array,
-        right: Array,
-        whitening: tuple[Array, Array] | None,
-    ) -> None:
-        self.cameras, self.pixels, self.whitening = cameras, (left, right), whitening
-        self.P = rig
-        # Of a rig that all share, plain numbers: quicker than arrays of one.
-        entries = rig[..., 0].tolist() if rig.shape[2] == 1 else rig
-        self.R, self.t = [row[:3] for row in entries], [row[3] for row in entries]
-
-    def _rays(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        return self.cameras[0].straight(self.pixels[0]), self.cameras[1].straight(self.pixels[1])
-
-    def _turned(self, x: Array, y: Array) -> list[Array]:
-        """R (x, y, 1): the left ray's direction in the right camera's frame."""
-        return [row[0] * x + row[1] * y + row[2] for row in self.R]
-
-    def optimal(self) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        x, y = (np.array(values) for values in self.cameras[0].nearly_straight(self.pixels[0]))
-        w = self._nearest_w(x, y, *self.cameras[1].nearly_straight(self.pixels[1]))
-        left_out = ~np.isfinite(x + w)
-        x[left_out], y[left_out], w[left_out] = 0.0, 0.0, 1.0  # so that they do no harm
-        N, cost = self._normal(x, y, w)
-        for _ in range(_MOST_STEPS):
-            step = _solve(N)
-            moved = _step_length(N, step)
-            if not moved.max(initial=0.0) > _SETTLED:
-                break
-            x, y, w, N, cost = self._descend((x, y, w), step, N, cost)
-        points = np.stack([x / w, y / w, 1 / w], axis=1)
-        covariance = _point_covariance(_inverse(N), x, y, w)
-        depth = self._depth(x, y, w)
-        behind = left_out | ~(w > 0) | ~(depth > 0)
-        epipolar = np.sqrt(cost)
-        points[left_out], covariance[left_out], epipolar[left_out] = np.nan, np.nan, np.nan
-        return points, covariance, epipolar, behind
-
-    def _descend(
-        self, state: tuple[Array, Array, Array], step: list[Array], N: list[Array], cost: Array
-    ) -> tuple[Array, Array, Array, list[Array], Array]:
-        """One step for each point, halved for those whose error it would raise."""
-        x, y, w = (value + change for value, change in zip(state, step, strict=True))
-        N_new, new = self._normal(x, y, w)
-        worse = ~(new <= cost * _RISE + _ROUNDING)
-        length = 1.0
-        while worse.any() and length > 1e-3:
-            length *= 0.5
-            x, y, w = (
-                np.where(worse, value + length * change, now)
-                for value, change, now in zip(state, step, (x, y, w), strict=True)
-            )
-            N_new, new = self._normal(x, y, w)
-            worse = ~(new <= cost * _RISE + _ROUNDING)
-        if worse.any():
-            x, y, w = (np.where(worse, old, now) for old, now in zip(state, (x, y, w), strict=True))
-            N_new, new = (
-                [np.where(worse, a, b) for a, b in zip(N, N_new, strict=True)],
-                np.where(worse, cost, new),
-            )
-        return x, y, w, N_new, new
-
-    def _nearest_w(self, x: Array, y: Array, x_r: Array, y_r: Array) -> Array:
-        """Inverse depth along the left ray that comes nearest to the right image point; linear."""
-        h0, h1, h2 = self._turned(x, y)
-        t0, t1, t2 = self.t
-        a, b = t0 - x_r * t2, t1 - y_r * t2
-        return np.asarray((a * (x_r * h2 - h0) + b * (y_r * h2 - h1)) / (a * a + b * b))
-
-    def _depth(self, x: Array, y: Array, w: Array) -> Array:
-        """Depth in the right camera times w: positive in front of it where w is."""
-        row = self.R[2]
-        return np.asarray(row[0] * x + row[1] * y + row[2] + w * self.t[2])
-
-    def _normal(self, x: Array, y: Array, w: Array) -> tuple[list[Array], Array]:
-        """Normal equations: xx, xy, xw, yy, yw, ww, then the right-hand sides x, y, w; and the cost."""
-        u, v, J = self.cameras[0].seen(x, y)
-        du, dv = self.pixels[0][0] - u, self.pixels[0][1] - v
-        ux, uy, vx, vy = J
-        if self.whitening is not None:
-            p, q, r = self.whitening[0]
-            du, ux, uy = p * du + q * dv, p * ux + q * vx, p * uy + q * vy
-            dv, vx, vy = r * dv, r * vx, r * vy
-        xx, xy, yy = ux * ux + vx * vx, ux * uy + vx * vy, uy * uy + vy * vy
-        gx, gy = ux * du + vx * dv, uy * du + vy * dv
-        cost = du * du + dv * dv
-        u, v, (ux, uy, uw), (vx, vy, vw) = self._right(x, y, w)
-        du, dv = self.pixels[1][0] - u, self.pixels[1][1] - v
-        if self.whitening is not None:
-            p, q, r = self.whitening[1]
-            du = p * du + q * dv
-            ux, uy, uw = p * ux + q * vx, p * uy + q * vy, p * uw + q * vw
-            dv, vx, vy, vw = r * dv, r * vx, r * vy, r * vw
-        cost = cost + du * du + dv * dv
-        return [
-            xx + ux * ux + vx * vx, xy + ux * uy + vx * vy, ux * uw + vx * vw,
-            yy + uy * uy + vy * vy, uy * uw + vy * vw, uw * uw + vw * vw,
-            gx + ux * du + vx * dv, gy + uy * du + vy * dv, uw * du + vw * dv,
-        ], cost  # fmt: skip
-
-    def _right(
-        self, x: Array, y: Array, w: Array
-    ) -> tuple[Array, Array, tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-        """Right pixels and their derivatives by x, y, w."""
-        h0, h1, h2 = (h + t * w for h, t in zip(self._turned(x, y), self.t, strict=True))
-        q = 1.0 / h2
-        x_r, y_r = h0 * q, h1 * q
-        u, v, (ux, uy, vx, vy) = self.cameras[1].seen(x_r, y_r)
-        by_u, by_v = [], []
-        for n in range(3):
-            down = self.t[2] if n == 2 else self.R[2][n]
-            across, along = (self.t[k] if n == 2 else self.R[k][n] for k in (0, 1))
-            dx, dy = (across - x_r * down) * q, (along - y_r * down) * q
-            by_u.append(ux * dx + uy * dy)
-            by_v.append(vx * dx + vy * dy)
-        return u, v, (by_u[0], by_u[1], by_u[2]), (by_v[0], by_v[1], by_v[2])
-
-    def linear(self) -> Array:
-        """(n, 3) smallest singular vectors of the image equations."""
-        P, rays = np.moveaxis(self.P, -1, 0), self._rays()
-        equations = np.zeros((len(self.pixels[0][0]), 4, 4))
-        equations[:, 0, 0] = equations[:, 1, 1] = -1.0
-        equations[:, 0, 2], equations[:, 1, 2] = rays[0]
-        for row, ray in enumerate(rays[1]):
-            equations[:, 2 + row] = ray[:, None] * P[:, 2] - P[:, row]
-        nowhere = ~np.isfinite(equations).all(axis=(1, 2))
-        equations[nowhere] = np.eye(4)
-        last = np.linalg.svd(equations)[2][:, 3]
-        points = last[:, :3] / last[:, 3:]
-        points[nowhere] = np.nan
-        return np.asarray(points)
-
-    def midpoint(self) -> Array:
-        """(n, 3) middles of the shortest segments between the rays."""
-        seen, (x, y) = self._rays()
-        left = np.stack([*seen, np.ones_like(x)])
-        # The right camera's rays and centre in the left one's frame.
-        right = np.stack([self.R[0][k] * x + self.R[1][k] * y + self.R[2][k] for k in range(3)])
-        centre = np.stack([-sum(self.R[j][k] * self.t[j] for j in range(3)) + 0.0 * x for k in range(3)])
-        ll, lr, rr = ((a * b).sum(axis=0) for a, b in ((left, left), (left, right), (right, right)))
-        lc, rc = (left * centre).sum(axis=0), (right * centre).sum(axis=0)
-        det = ll * rr - lr * lr
-        along_left, along_right = (rr * lc - lr * rc) / det, (lr * lc - ll * rc) / det
-        return np.asarray(0.5 * (along_left * left + centre + along_right * right)).T
-
-    def compare(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Distance of the points' images from the pixels [px], and which points are behind."""
-        X, Y, Z = points.T
-        w = 1.0 / Z
-        x, y = X * w, Y * w
-        _, cost = self._normal(x, y, w)
-        behind = ~(Z > 0) | ~(self._depth(x, y, w) > 0) | ~np.isfinite(cost)
-        return np.sqrt(cost), behind
-
-
-def _solve(N: list[Array]) -> list[Array]:
-    """Steps of x, y, w by Cholesky's factors, written out."""
-    a, b, c, d, e, f, gx, gy, gw = N
-    l10, l20 = b / a, c / a
-    d1 = d - l10 * b
-    e1 = e - l10 * c
-    l21 = e1 / d1
-    f2 = f - l20 * c - l21 * e1
-    gy = gy - l10 * gx
-    gw = gw - l20 * gx - l21 * gy
-    w = gw / f2
-    y = gy / d1 - l21 * w
-    x = gx / a - l10 * y - l20 * w
-    good = np.isfinite(x + y + w)
-    if not good.all():
-        x, y, w = (np.where(good, value, 0.0) for value in (x, y, w))
-    return [x, y, w]
-
-
-def _step_length(N: list[Array], step: list[Array]) -> Array:
-    """By how much a step moves the images [px]: its length in the metric of the normal matrix."""
-    a, b, c, d, e, f = N[:6]
-    x, y, w = step
-    return np.sqrt(np.abs(x * (a * x + 2 * (b * y + c * w)) + y * (d * y + 2 * e * w) + f * w * w))
-
-
-def _inverse(N: list[Array]) -> list[Array]:
-    """Entries xx, xy, xw, yy, yw, ww of the inverse of each symmetric 3 x 3 matrix."""
-    a, b, c, d, e, f = N[:6]
-    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
-    det = a * A + b * B + c * C
-    return [A / det, B / det, C / det, (a * f - c * c) / det, (b * c - a * e) / det, (a * d - b * b) / det]
-
-
-def _point_covariance(inverse: list[Array], x: Array, y: Array, w: Array) -> Array:
-    """(n, 6) covariance of (x, y, 1) / w from that of x, y, w."""
-    xx, xy, xw, yy, yw, ww = inverse
-    q = 1.0 / w
-    q2 = q * q
-    # d(X, Y, Z) = q (dx - X dw, dy - Y dw, -Z dw) with X = x q, Y = y q, Z = q.
-    X, Y = x * q, y * q
-    return np.stack(
-        [
-            q2 * (xx - 2 * X * xw + X * X * ww),
-            q2 * (xy - Y * xw - X * yw + X * Y * ww),
-            q2 * q * (X * ww - xw),
-            q2 * (yy - 2 * Y * yw + Y * Y * ww),
-            q2 * q * (Y * ww - yw),
-            q2 * q2 * ww,
-        ],
-        axis=1,
-    )

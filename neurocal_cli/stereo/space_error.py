@@ -1,0 +1,161 @@
+"""Errors of points in space: averages over all, by view and by depth, and NSCE.
+
+The normalised stereo calibration error of Weng, Cohen and Herniou (1992) compares the error across the line
+of sight with the size of a pixel at the point's depth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array
+
+__all__ = ["DepthError", "SpaceError", "space_error"]
+
+_MOST_DEPTHS = 5  # rows of the table of depths
+_POINTS_PER_DEPTH = 20
+
+
+@dataclass(frozen=True)
+class DepthError:
+    """Errors of the points at some depths.
+
+    Attributes
+    ----------
+    nearest, farthest : float [world unit]
+    n_points : int
+    rmse : float [world unit]
+    relative : float
+        Rms of the error over the depth.
+    """
+
+    nearest: float
+    farthest: float
+    n_points: int
+    rmse: float
+    relative: float
+
+
+@dataclass(frozen=True, eq=False)
+class SpaceError:
+    """Errors of triangulated points, in the left camera's frame.
+
+    Attributes
+    ----------
+    n_points, n_behind : int
+        Points in the averages; those that came out behind a camera are in none.
+    rmse : float [world unit]
+        ``sqrt(mean(dX^2 + dY^2 + dZ^2))``.
+    rmse_x, rmse_y, rmse_z : float [world unit]
+        Of each axis; their squares add up to that of `rmse`.
+    max : float [world unit]
+        Longest error.
+    nsce : float
+        Normalised stereo calibration error: 1 is a pixel's rounding.
+    epipolar_px : float [px]
+        Rms of the smallest shift of both pixels that makes their rays meet.
+    relative : float
+        Rms of the error over the depth.
+    views : dict of (n_points, rmse) by the left camera's view name
+    depths : tuple of DepthError
+        Nearest first, about as many points in each.
+    errors : (N, 3) array
+        Triangulated minus true; nan for points behind a camera.
+    """
+
+    n_points: int
+    n_behind: int
+    rmse: float
+    rmse_x: float
+    rmse_y: float
+    rmse_z: float
+    max: float
+    nsce: float
+    epipolar_px: float
+    relative: float
+    views: Mapping[str, tuple[int, float]]
+    depths: tuple[DepthError, ...]
+    errors: Array
+
+
+def space_error(
+    seen: Array,
+    true: Array,
+    epipolar: Array,
+    view: NDArray[np.intp],
+    names: list[str],
+    alpha_u: float,
+    alpha_v: float,
+) -> SpaceError:
+    """Compare points with where they are.
+
+    Parameters
+    ----------
+    seen, true : (N, 3) arrays
+        In the left camera's frame; rows of `seen` that are nan count as behind.
+    epipolar : (N,) array [px]
+    view : (N,) int array
+        Places in `names`.
+    names : list of str
+    alpha_u, alpha_v : float [px]
+        Of the left camera, for NSCE.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        All points are behind.
+    """
+    errors = seen - true
+    fine = np.isfinite(errors).all(axis=1)
+    if not fine.any():
+        raise DegenerateGeometryError(
+            "every point comes out behind a camera; check which file is the left camera's and which the "
+            "right one's"
+        )
+    e, depth = errors[fine], seen[fine, 2]
+    squares = (e**2).sum(axis=1)
+    axes = np.sqrt((e**2).mean(axis=0))
+    # Half a pixel's rounding at the point's depth, rms: Z / (alpha sqrt(12)).
+    rounding = depth**2 * (alpha_u**-2 + alpha_v**-2) / 12
+    counts = np.bincount(view[fine], minlength=len(names))
+    sums = np.bincount(view[fine], weights=squares, minlength=len(names))
+    present = np.bincount(view, minlength=len(names)) > 0
+    return SpaceError(
+        n_points=int(fine.sum()),
+        n_behind=int((~fine).sum()),
+        rmse=float(np.sqrt(squares.mean())),
+        rmse_x=float(axes[0]),
+        rmse_y=float(axes[1]),
+        rmse_z=float(axes[2]),
+        max=float(np.sqrt(squares.max())),
+        nsce=float(np.sqrt((e[:, 0] ** 2 + e[:, 1] ** 2) / rounding).mean()),
+        epipolar_px=float(np.sqrt((epipolar[fine] ** 2).mean())),
+        relative=float(np.sqrt((squares / depth**2).mean())),
+        views={
+            name: (int(counts[k]), float(np.sqrt(sums[k] / counts[k])) if counts[k] else float("nan"))
+            for k, name in enumerate(names)
+            if present[k]
+        },
+        depths=_by_depth(squares, true[fine, 2], depth),
+        errors=errors,
+    )
+
+
+def _by_depth(squares: Array, true: Array, seen: Array) -> tuple[DepthError, ...]:
+    order = np.argsort(true, kind="stable")
+    parts = np.array_split(order, max(1, min(_MOST_DEPTHS, len(order) // _POINTS_PER_DEPTH)))
+    return tuple(
+        DepthError(
+            float(true[part[0]]),
+            float(true[part[-1]]),
+            len(part),
+            float(np.sqrt(squares[part].mean())),
+            float(np.sqrt((squares[part] / seen[part] ** 2).mean())),
+        )
+        for part in parts
+    )
