@@ -170,3 +170,23 @@ def test_other_units_are_refused(cameras: tuple[Path, Path], tmp_path: Path) -> 
     assert "\n  unit: mm\n" in text
     (tmp_path / "r.yaml").write_text(text.replace("\n  unit: mm\n", "\n  unit: inch\n"))
     one_line_error(evaluate(cameras[0], tmp_path / "r.yaml"), "in mm", "in inch", "same unit")
+
+
+def test_opencvs_cameras_are_judged_by_points_with_fitted_poses(tmp_path: Path) -> None:
+    made, rng = scene(), np.random.default_rng(4)
+    words = []
+    for side in (0, 1):
+        K = made.cameras[side]
+        (tmp_path / f"{side}.yaml").write_text(
+            "image_width: 640\nimage_height: 480\n"
+            f"camera_matrix: {{rows: 3, cols: 3, data: {K.A.ravel().tolist()}}}\n"
+        )
+        write_points(made.points(side, 0.2, rng), tmp_path / f"{side}.csv")
+        words.append(tmp_path / f"{side}.yaml")
+    result = evaluate(*words, "--points", tmp_path / "0.csv", tmp_path / "1.csv", "--json")
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr.count("note: only the intrinsic parameters and the lens are used") == 2
+    values = json.loads(result.stdout)
+    assert values["rig"]["epipolar_px"] == pytest.approx(0.2, rel=0.2)
+    assert values["baseline"] == pytest.approx(np.linalg.norm(made.rig.t), rel=0.01)
+    one_line_error(evaluate(*words), "has no neurocal block")

@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands.estimation import given_camera
 from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
 from neurocal_cli.commands.tables import show
-from neurocal_cli.errors import UsageError
+from neurocal_cli.errors import FormatError, UsageError
 
 if TYPE_CHECKING:
+    from neurocal_cli.calibration import Calibration
     from neurocal_cli.points import Correspondences
     from neurocal_cli.stereo.evaluation import StereoEvaluation
 
@@ -27,8 +29,8 @@ __all__ = ["stereo"]
     required=True,
     type=INPUT,
     cls=Argument,
-    description="The calibrations of the left and the right camera, or one RIG.yaml with both; - is standard "
-    "input.",
+    description="The calibrations of the left and the right camera, with --points also ROS or OpenCV ones; "
+    "or one RIG.yaml with both; - is standard input.",
 )
 @click.option(
     "--points",
@@ -102,8 +104,29 @@ def _evaluate(
         return evaluate_rig(read_rig(cameras[0]), points, method=method)
     from neurocal_cli.io.calibration_yaml import read_calibration
 
-    left, right = (read_calibration(name) for name in cameras)
+    if points is None:
+        left, right = (read_calibration(name) for name in cameras)
+    else:
+        left, right = (_camera(name, seen) for name, seen in zip(cameras, points, strict=True))
     return evaluate_stereo(left, right, points, method=method)
+
+
+def _camera(name: str, points: Correspondences) -> Calibration:
+    """Read a calibration, or any camera file: then its poses are fitted to the points."""
+    from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.methods import calibrate
+
+    try:
+        return read_calibration(name)
+    except FormatError as error:
+        if name == "-":
+            raise
+        try:
+            points, camera = given_camera(name, points)
+        except FormatError:
+            raise error from None  # no camera file of any kind: tell why it is no calibration
+        note([f"only the intrinsic parameters and the lens are used, and the poses fitted: {error}"])
+    return calibrate(points, type=3, intrinsics=camera, outliers="keep")
 
 
 def _show(evaluation: StereoEvaluation, as_json: bool) -> None:

@@ -188,7 +188,9 @@ class _RigAssembly:
                 f"back inside the {where}; choose a simpler model, or give points nearer to the image's "
                 "corners"
             )
-        before = parameter_warnings(given.intrinsics, Lens(camera.lens, given.distortion), given.std)
+        before: tuple[str, ...] = ()
+        if given.std.keys() >= std.keys():
+            before = parameter_warnings(given.intrinsics, Lens(camera.lens, given.distortion), given.std)
         now = parameter_warnings(intrinsics, lens, std)
         return {
             "intrinsics": intrinsics,

@@ -19,6 +19,7 @@ __all__ = ["calibrate_stereo"]
 Progress = Callable[[str, float], None]
 
 _SIDES = ("left", "right")
+_OF_LEAST_SQUARES = ("neuro", "nonlinear")  # other methods' cameras stay as they are: that is their result
 
 
 def calibrate_stereo(
@@ -71,7 +72,8 @@ def calibrate_stereo(
     for name, points, side in zip(_SIDES, (left, right), sides, strict=True):
         side = {"camera_name": name} | side
         cameras.append(calibrate(points, **side, progress=_named(progress, name)))
-    rig = fit_rig(cameras[0], cameras[1], refine_cameras=True, **_agreement(options))
+    best = all(camera.method in _OF_LEAST_SQUARES for camera in cameras)
+    rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, **_agreement(options))
     warnings = [
         f"{name}: {text}"
         for name, camera in zip(_SIDES, (rig.left, rig.right), strict=True)
