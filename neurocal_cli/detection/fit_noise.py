@@ -33,7 +33,7 @@ _BLUR_SPREAD = 0.03  # relative, of single edges' blur around the board's at lea
 _ENOUGH = 10000  # pixels to learn the profile's shape from
 # Standard deviations of the coefficients before anything is known: they bind what blur and contrast can
 # stand in for, and give way to ten thousand pixels.
-_TAILS, _BENDS = 0.01, 0.03
+_TAILS, _BENDS = 0.01, 0.06
 _RIDGE = 1e-5
 _LEAST_SPREAD = 0.0002  # of levels, in variances of the noise
 
