@@ -31,7 +31,7 @@ Single = NDArray[np.float32]
 # Values of a vertex's fit: offset [px] and tilt [px over the half length] of the line along c and of that
 # along r, then those of `Fit`.
 FIRST, SECOND = 0, 2
-_LAST, _MOST_LAST = 1.5, 0.08  # sigma left out at the board's end, and at most, as a share of the line
+_LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, and at most, as a share of the line
 # Terms of the series for oblique crossings up to a cosine, and for all others.
 _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
 _ALONE = 9.0  # sigma to the next parallel line, beyond which it cannot be noticed
