@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,8 @@ import pytest
 from test_fit_models import some_map
 
 from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fit_newton import BLUR, Fit, Linear, Part, Prior, gauss_newton
+from neurocal_cli.detection.fit_noise import BoardBlur
 from neurocal_cli.detection.fit_robust import Rows, choose_map, fit_map, median
 from neurocal_cli.detection.fit_shading import Levels, fit_shading
 from neurocal_cli.detection.fit_strips import gather, grid_lines
@@ -31,6 +34,67 @@ def test_map_is_fitted_through_outliers_with_a_true_covariance() -> None:
         error = ((fit.map.at(GRID) - true.at(GRID)) * direction).sum(axis=1)
         squares.append((error**2 / fit.map.variance(GRID, direction)).mean())
     assert np.mean(squares) == pytest.approx(1, abs=0.3)
+
+
+def test_anchors_do_not_decide_what_is_an_outlier() -> None:
+    """Edges of an uneven board far outside their own variances, and more anchors that are all in place."""
+    true = some_map(0).shaped(0, 0)
+    rng = np.random.default_rng(2)
+    edges = Rows.of_points(GRID[:20], true.at(GRID[:20]) + rng.normal(0, 0.1, (20, 2)), 0.003)
+    anchors = Rows.of_points(GRID, true.at(GRID), 2.0)
+    assert edges.and_(anchors).telling.tolist() == [True] * 40 + [False] * 108
+    fit = fit_map(true, edges.and_(anchors), np.zeros(0))
+    assert (fit.weight[:40] > 0).all()
+
+
+def test_form_does_not_follow_the_bumps_of_an_uneven_board() -> None:
+    true = some_map(0).shaped(1, 0)
+    for seed in range(5):
+        pixels = true.at(GRID) + np.random.default_rng(seed).normal(0, 0.1, GRID.shape)
+        start = homography_start(true.frame, GRID, pixels)
+        chosen = choose_map(start, Rows.of_points(GRID, pixels, 0.003), np.zeros(0))
+        assert chosen.map.degree == 0
+        assert chosen.map.radial <= 1
+
+
+@pytest.mark.parametrize("sigma", [(0.9, 0.6), (0.6, 0.9), (0.8, 0.8)])
+def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> None:
+    rng = np.random.default_rng(3)
+    angle = rng.normal(0, 0.1, 60) + np.repeat([0, np.pi / 2], 30)
+    normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    true = np.sqrt(normal**2 @ np.square(sigma))
+    values = np.ones((60, 5))
+    values[:, BLUR] = true * rng.normal(1, 0.01, 60)
+    values[7, BLUR] = 3.0  # one is wrong
+    information = np.tile(1e6 * np.eye(5), (60, 1, 1))
+    prior = Prior(np.ones((60, 3)), np.zeros((60, 3, 3)))
+    nothing = np.zeros((60, 1), dtype=np.float32)
+    linear = Linear(np.zeros((60, 5, 1), dtype=np.float32), nothing, nothing, nothing)
+    ones = np.ones(60)
+    fit = Fit(values, information, prior, ones, ones.astype(np.int64), ones, linear)
+    blur = BoardBlur.of(fit, normal, ones.astype(bool))
+    np.testing.assert_allclose(blur.along(normal), true, rtol=0.08)
+
+
+def test_fits_settle_where_their_steps_are_too_long() -> None:
+    """An arctangent's Gauss-Newton steps from beyond 1.4 lead farther and farther away."""
+
+    def model_of(part: Part) -> Callable[[Array], Linear]:
+        def model(values: Array) -> Linear:
+            place = values[:, :1]
+            jacobian = np.zeros((len(values), 4, 1), dtype=np.float32)
+            jacobian[:, 0] = 1 / (1 + place**2)
+            residual = (-np.arctan(place)).astype(np.float32)
+            return Linear(jacobian, residual, residual, residual)
+
+        return model
+
+    start = np.array([[0.3, 0, 1, 5.0]] * 19 + [[4.0, 0, 1, 5.0]])
+    prior = Prior(start[:, 1:].copy(), np.tile(np.eye(3) * 1e3, (20, 1, 1)))
+    weight = np.full((20, 1), 1e4, dtype=np.float32)
+    fit = gauss_newton(model_of, start, prior, weight, 6)
+    np.testing.assert_allclose(fit.values[:, 0], 0, atol=0.01)
+    assert fit.step.max() < 0.5
 
 
 def test_shift_of_alternating_edges_is_told_from_the_map() -> None:
