@@ -43,8 +43,8 @@ class CameraState:
     t : (V, 3) array
     lens : str
         One of `lens.MODELS`.
-    k : (K,) array
-        Its coefficients.
+    k : (K,) or (V, K) array
+        Its coefficients, the same for all views or each view's own.
     """
 
     entries: Array
@@ -60,8 +60,13 @@ class CameraState:
             entries=self.entries + by_camera[:, :5],
             R=rotation_step(by_pose[:, :3]) @ self.R,
             t=self.t + by_pose[:, 3:],
-            k=self.k + by_camera[0, 5:],
+            k=self.k + (by_camera[0, 5:] if self.k.ndim == 1 else by_camera[:, 5:]),
         )
+
+
+    def coefficients(self, view: NDArray[np.intp]) -> Array:
+        """The coefficients that the points of some tiles are bent by, given each tile's view."""
+        return self.k if self.k.ndim == 1 else self.k[view].T[..., None]
 
 
 def normal_blocks(tiles: Tiles, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
@@ -100,7 +105,7 @@ def residuals(tiles: Tiles, state: CameraState) -> Array:
         Xc = state.R[view] @ tiles.local[chunk] + state.t[view][:, :, None]
         x, y = Xc[:, 0] / Xc[:, 2], Xc[:, 1] / Xc[:, 2]
         if state.lens != "none":
-            (x, y), _, _ = bend(state.lens, state.k, x, y)
+            (x, y), _, _ = bend(state.lens, state.coefficients(view), x, y)
         out[chunk, 0] = tiles.pixels[chunk, 0] - (a * x + s * y + u0)
         out[chunk, 1] = tiles.pixels[chunk, 1] - (b * y + v0)
     return out
@@ -127,7 +132,7 @@ def derivatives(tiles: Tiles, chunk: slice, state: CameraState, out: Array) -> N
     motions: list[tuple[Any, Any]] = [(-x * Y2, -Y3 - y * Y2), (Y3 + x * Y1, y * Y1), (-Y2, Y1)]  # by omega
     motions += [(q, 0.0), (0.0, q), (-x * q, -y * q)]  # by tau
     if state.lens != "none":
-        (x, y), (xx, xy, yx, yy), by_k = bend(state.lens, state.k, x, y)
+        (x, y), (xx, xy, yx, yy), by_k = bend(state.lens, state.coefficients(view), x, y)
         sensible &= (xx * yy - xy * yx > 0).all(axis=1)
         motions = [(xx * dx + xy * dy, yx * dx + yy * dy) for dx, dy in motions] + by_k
     u, v = out[:, :, 0], out[:, :, 1]

@@ -111,6 +111,14 @@ class Correspondences:
                 raise InputError(f"{self.source}: image_center must be two finite numbers")
             self._set(image_center=(u0, v0))
 
+    @classmethod
+    def none(cls, image_size: tuple[int, int] | None = None, unit: str = "mm") -> Correspondences:
+        """No points at all, for a camera that was not found from any of its own."""
+        empty = cls(np.zeros((1, 3)), np.zeros((1, 2)), image_size=image_size, unit=unit)
+        empty._set(world=_frozen(np.zeros((0, 3))), pixels=_frozen(np.zeros((0, 2))))
+        empty._set(view_names=(), view_index=_frozen(np.zeros(0, dtype=np.int64)))
+        return empty
+
     def __len__(self) -> int:
         return len(self.world)
 

@@ -93,7 +93,7 @@ class _Descent:
     def __init__(self, tiles: Tiles, start: CameraState, free: NDArray[np.bool_], free_pose: bool) -> None:
         self.tiles, self.state = tiles, start
         # Columns of the free camera parameters, and their places among all of them.
-        self.camera = camera_columns(len(start.k))
+        self.camera = camera_columns(start.k.shape[-1])
         self.free, self.free_pose = np.flatnonzero(free), free_pose
         self.together = len(start.entries) == 1 and bool(self.free.size) and tiles.n_views > 1
         groups = 1 if self.together else tiles.n_views

@@ -1,0 +1,91 @@
+"""What else goes through or near values at settings: tables, splines, polynomials.
+
+Each is linear in what it is made from: M (n, S) with y(x) = M y_S for those that pass through the
+settings' values, Phi (n, K) with y(x) = Phi c for polynomials.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["grid_axes", "lookup_matrix", "monomials", "spline_matrix", "thin_plate_matrix"]
+
+
+def grid_axes(x: Array) -> list[Array] | None:
+    """The values of each control if the settings (S, D), sorted, are a full grid; else None."""
+    axes = [np.unique(column) for column in x.T]
+    if np.prod([len(axis) for axis in axes]) != len(x) or min(len(axis) for axis in axes) < 2:
+        return None
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, x.shape[1])
+    return axes if np.array_equal(grid, x) else None
+
+
+def lookup_matrix(axes: list[Array], x: Array) -> Array:
+    """Linear (bilinear) interpolation in a grid; outside, the outermost cells go on."""
+    return _tensor([_linear(axis, column) for axis, column in zip(axes, x.T, strict=True)])
+
+
+def spline_matrix(axes: list[Array], x: Array) -> Array:
+    """Cubic (bicubic) splines through a grid, without a knot at the second and last but one value."""
+    return _tensor([_cubic(axis, column) for axis, column in zip(axes, x.T, strict=True)])
+
+
+def thin_plate_matrix(nodes: Array, x: Array) -> Array:
+    """Thin-plate splines through settings anywhere; cubic in one dimension."""
+
+    def kernel(a: Array, b: Array) -> Array:
+        r2 = ((a[:, None] - b[None]) ** 2).sum(axis=-1)
+        if a.shape[1] == 1:
+            return r2 * np.sqrt(r2)
+        return 0.5 * r2 * np.log(np.maximum(r2, 1e-300))
+
+    S, D = nodes.shape
+    plane = np.column_stack([np.ones(S), nodes])
+    system = np.block([[kernel(nodes, nodes), plane], [plane.T, np.zeros((D + 1, D + 1))]])
+    right = np.column_stack([kernel(x, nodes), np.ones(len(x)), x])
+    return np.asarray(np.linalg.lstsq(system, right.T, rcond=None)[0][:S].T)
+
+
+def monomials(x: Array, degree: int) -> Array:
+    """Products of powers of the controls up to a total degree; (n, K)."""
+    columns = [np.ones(len(x))]
+    powers = [(0,) * x.shape[1]]
+    for total in range(1, degree + 1):
+        for first in range(total + 1):
+            power = (total,) if x.shape[1] == 1 else (total - first, first)
+            if power not in powers:
+                powers.append(power)
+                columns.append(np.prod(x ** np.array(power), axis=1))
+    return np.column_stack(columns)
+
+
+def _tensor(matrices: list[Array]) -> Array:
+    """Weights on a grid from those along its axes."""
+    product = matrices[0]
+    for more in matrices[1:]:
+        product = (product[:, :, None] * more[:, None]).reshape(len(product), -1)
+    return product
+
+
+def _linear(axis: Array, x: Array) -> Array:
+    cell = np.clip(np.searchsorted(axis, x, side="right") - 1, 0, len(axis) - 2)
+    share = (x - axis[cell]) / (axis[cell + 1] - axis[cell])
+    weights = np.zeros((len(x), len(axis)))
+    weights[range(len(x)), cell] = 1 - share
+    weights[range(len(x)), cell + 1] = share
+    return weights
+
+
+def _cubic(axis: Array, x: Array) -> Array:
+    """Weights of the not-a-knot spline; a polynomial through fewer than 5 values."""
+    low, width = axis[0], axis[-1] - axis[0]
+    knots = (axis[2:-2] - low) / width if len(axis) > 4 else np.zeros(0)
+
+    def basis(values: Array) -> Array:
+        t = (values - low) / width
+        powers = [t**k for k in range(min(len(axis), 4))]
+        return np.column_stack([*powers, *(np.maximum(t - knot, 0.0) ** 3 for knot in knots)])
+
+    return np.asarray(np.linalg.solve(basis(axis).T, basis(x).T).T)

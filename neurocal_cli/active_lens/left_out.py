@@ -1,0 +1,63 @@
+"""Leaving out one setting at a time, without training again.
+
+Around the minimum the networks are linear in their weights, so a setting's influence can be taken
+back: with K = J A^-1 J^T H, the prediction of setting s from all others errs by (I - K_ss)^-1 e_s,
+e_s being the error with it (the formula behind PRESS).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.active_lens.joint import Joint
+from neurocal_cli.active_lens.static import Tables, scaled_solve
+from neurocal_cli.geometry import Array
+
+__all__ = ["LeftOut", "left_out_errors"]
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Errors at settings that are predicted from all others.
+
+    Attributes
+    ----------
+    pixels : (S,) array [px]
+        Pixel error there, noise included.
+    surprise : (S,) array
+        Squared error over its expectation, a mean over the local parameters; about 1.
+    """
+
+    pixels: Array
+    surprise: Array
+
+
+def left_out_errors(x: Array, joint: Joint, tables: Tables, variance: float) -> LeftOut:
+    """Predict each setting from all others.
+
+    Parameters
+    ----------
+    x : (S, D) array
+    joint : Joint
+    tables : Tables
+    variance : float [px^2]
+    """
+    local, jacobians = joint.nets.local_with_jacobians(x)
+    J = np.concatenate(jacobians, axis=2)
+    S, L, P = J.shape
+    normal = tables.normal
+    H = normal.H[:, :L, :L]
+    spread = J @ joint.covariance[:P, :P] @ np.swapaxes(J, 1, 2)
+    # The constants of the networks and of the tables differ; what the local parameters do about it is no error.
+    error = local - tables.local
+    K = spread @ H / variance
+    remain = np.eye(L) - K
+    out = np.linalg.solve(remain, error[..., None])
+    spread_out = np.linalg.solve(remain, spread)
+    expected = spread_out + variance * scaled_solve(H, np.tile(np.eye(L), (S, 1, 1)))
+    surprise = (out * scaled_solve(expected, out)).sum(axis=(1, 2)) / L
+    squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
+    counts = np.maximum(normal.H[:, 2, 2], 1.0)  # by u0: a residual moves by 1, so this is the number of points
+    return LeftOut(np.sqrt(np.maximum(squares, 0.0) / counts), np.maximum(surprise, 0.0))

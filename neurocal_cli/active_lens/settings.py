@@ -1,0 +1,120 @@
+"""Points seen at many settings of one lens."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+
+__all__ = ["CONTROLS", "LensPoints", "describe", "scaled_controls"]
+
+CONTROLS = ("zoom", "focus")
+
+
+@dataclass(frozen=True, eq=False)
+class LensPoints:
+    """Known points with the lens setting at which each was seen.
+
+    Attributes
+    ----------
+    points : Correspondences
+        A view is one image, so it has one setting.
+    controls : tuple of str
+        Which of zoom and focus there are.
+    settings : (S, D) array
+        The different settings in ascending order, in the user's own units.
+    view_setting : (V,) int array
+        Setting of each view.
+    """
+
+    points: Correspondences
+    controls: tuple[str, ...]
+    settings: Array
+    view_setting: NDArray[np.int64]
+
+    @classmethod
+    def grouped(cls, points: Correspondences, columns: Mapping[str, Array]) -> LensPoints:
+        """Group points by setting.
+
+        Parameters
+        ----------
+        points : Correspondences
+        columns : dict of (N,) arrays by control
+            The setting of each row.
+
+        Raises
+        ------
+        InputError
+            No such column, numbers that are not finite, a view with two settings.
+        """
+        controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
+        if not controls:
+            raise InputError(
+                f"{points.source}: there is no column zoom or focus; name the setting of each point in one or both"
+            )
+        values = np.column_stack([np.asarray(columns[name], dtype=float) for name in controls])
+        if values.shape != (len(points), len(controls)):
+            raise InputError(f"{points.source}: {', '.join(controls)} need one number for each point")
+        finite = np.isfinite(values).all(axis=1)
+        if not finite.all():
+            row = int(np.argmin(finite))
+            raise InputError(f"{points.place(row)}: the setting must be of finite numbers; correct or remove the row")
+        first = np.unique(points.view_index, return_index=True)[1]
+        differs = (values != values[first][points.view_index]).any(axis=1)
+        if differs.any():
+            row = int(np.argmax(differs))
+            name = points.view_names[points.view_index[row]]
+            raise InputError(
+                f"{points.place(row)}: the view {name!r} has points at two settings; give each image a view of its own"
+            )
+        settings, index = np.unique(values[first], axis=0, return_inverse=True)
+        return cls(points, controls, settings, index.ravel())
+
+    @property
+    def n_settings(self) -> int:
+        """S."""
+        return len(self.settings)
+
+    @property
+    def point_setting(self) -> NDArray[np.int64]:
+        """(N,) setting of each point."""
+        return self.view_setting[self.points.view_index]
+
+    def varying(self) -> LensPoints:
+        """Without the controls that never change.
+
+        Raises
+        ------
+        InputError
+            There is only one setting.
+        """
+        moves = np.ptp(self.settings, axis=0) > 0
+        if not moves.any():
+            raise InputError(
+                f"{self.points.source}: all points are at one setting, {describe(self.controls, self.settings[0])}; "
+                "a lens needs several, and `neurocal calibrate` takes one"
+            )
+        controls = tuple(name for name, moving in zip(self.controls, moves, strict=True) if moving)
+        return LensPoints(self.points, controls, self.settings[:, moves], self.view_setting)
+
+    def select(self, keep: NDArray[np.bool_]) -> LensPoints:
+        """Restrict to some settings; keep is (S,)."""
+        columns = dict(zip(self.controls, self.settings[self.point_setting].T, strict=True))
+        rows = keep[self.point_setting]
+        return LensPoints.grouped(self.points.select(rows), {name: c[rows] for name, c in columns.items()})
+
+
+def describe(controls: tuple[str, ...], setting: Array) -> str:
+    """Name a setting, as in ``zoom 250 focus 4``."""
+    return " ".join(f"{name} {value:.10g}" for name, value in zip(controls, setting, strict=True))
+
+
+def scaled_controls(settings: Array, low: Array, high: Array) -> Array:
+    """Settings on a scale from -1 to 1 over the calibrated range."""
+    return 2 * (np.asarray(settings, dtype=float) - low) / (high - low) - 1
