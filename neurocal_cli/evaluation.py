@@ -116,6 +116,8 @@ def evaluate_camera(
     seed = 0
     if isinstance(calibration, Calibration):
         points = calibration.points if points is None else points
+        if not len(points):
+            raise InputError("the calibration holds no points of its own; give the points to judge it by")
         warnings += _compare(calibration, points)
         seed = calibration.seed
         poses = {name: view.pose for name, view in calibration.views.items()}

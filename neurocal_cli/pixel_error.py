@@ -63,7 +63,6 @@ class CameraState:
             k=self.k + (by_camera[0, 5:] if self.k.ndim == 1 else by_camera[:, 5:]),
         )
 
-
     def coefficients(self, view: NDArray[np.intp]) -> Array:
         """The coefficients that the points of some tiles are bent by, given each tile's view."""
         return self.k if self.k.ndim == 1 else self.k[view].T[..., None]

@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from neurocal_cli.active_lens.simulated import SimulatedZoom
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera import Intrinsics, Pose, project
+from neurocal_cli.io.lens_points import write_lens_points
 from neurocal_cli.io.points_csv import write_points
 from neurocal_cli.points import Correspondences
 
@@ -123,9 +125,22 @@ def seen(
     return np.round(pixels + SIGMA * rng.normal(size=pixels.shape), 5)
 
 
+def zoom_settings() -> tuple[np.ndarray, np.ndarray]:
+    """A grid of 7 x 5 settings of zoom and focus encoders, and the 6 x 4 in the middle of its cells."""
+    zoom, focus = np.linspace(0, 3000, 7), np.linspace(0, 900, 5)
+    return _grid(zoom, focus), _grid((zoom[1:] + zoom[:-1]) / 2, (focus[1:] + focus[:-1]) / 2)
+
+
+def _grid(zoom: np.ndarray, focus: np.ndarray) -> np.ndarray:
+    return np.stack(np.meshgrid(zoom, focus, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
 if __name__ == "__main__":
     write_points(corner(), str(HERE / "points.csv"))
     write_points(flat_views(), str(HERE / "flat.csv"))
     for side, points in zip(("left", "right"), stereo_views(), strict=True):
         write_points(points, str(HERE / f"stereo_{side}.csv"))
     (HERE / "matches.csv").write_text(matches())
+    lens, noise = SimulatedZoom(), np.random.default_rng(3)
+    for settings, name in zip(zoom_settings(), ("zoom.csv", "zoom_between.csv"), strict=True):
+        write_lens_points(lens.points(settings, 4, SIGMA, noise), str(HERE / name))

@@ -18,7 +18,7 @@ LIBRARY = [name for name in MODULES if not name.startswith("commands/") and name
 HOMES = {
     "click": ("commands/",),
     "rich": ("commands/",),
-    "matplotlib": ("plots.py",),
+    "matplotlib": ("plots.py", "active_lens/plots.py"),
     "yaml": ("io/",),
     "cv2": ("detection/", "rendering/", "io/images.py", "remapping.py"),
     "scipy": (),

@@ -86,7 +86,7 @@ def _turn(learner: JointLearner, nets: LensNets, shared: Array, rate: float) -> 
     L = local.shape[1]
     d = np.column_stack([local - learner.reference, np.broadcast_to(shared, (len(local), len(shared)))])
     pull = normal.g - (normal.H @ d[..., None])[..., 0]
-    outputs, by_output = outputs_to_local(nets.scale, np.column_stack([net.output(learner.x) for net in nets.nets]))
+    _, by_output = outputs_to_local(nets.scale, np.column_stack([net.output(learner.x) for net in nets.nets]))
     # On the networks' own scales: gradients, second derivatives, and the calibrating net's targets.
     gradient = (np.swapaxes(by_output, 1, 2) @ pull[:, :L, None])[..., 0] / learner.variance
     curvature = np.einsum("sia,sij,sja->sa", by_output, normal.H[:, :L, :L], by_output) / learner.variance

@@ -117,7 +117,9 @@ class PixelData:
     @property
     def counts(self) -> NDArray[np.int64]:
         """(S,) points of each setting."""
-        return np.bincount(self.setting, weights=self.views.counts, minlength=self.n_settings).astype(np.int64)
+        return np.bincount(self.setting, weights=self.views.counts, minlength=self.n_settings).astype(
+            np.int64
+        )
 
     def linearise(self, local: Array, constants: Constants) -> tuple[Normal, Constants]:
         """Model the pixel error around local parameters (S, L) and constants.
@@ -143,6 +145,8 @@ class PixelData:
             theta = len(self.names)
             summed[:, theta, :] = summed[:, :, theta] = 0.0
             summed[:, theta, theta] = 1.0
+        upper = np.triu(summed)  # exactly symmetric, as a file of it will be
+        summed = upper + np.swapaxes(np.triu(summed, 1), 1, 2)
         good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
         return Normal(summed[:, :L, :L], summed[:, :L, -1], summed[:, -1, -1], good), constants
 
@@ -207,4 +211,3 @@ class PixelData:
 
     def _in_pixels(self, normal: Array) -> Array:
         return normal * self.views.pixel_scale**2
-

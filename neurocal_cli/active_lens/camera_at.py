@@ -49,10 +49,16 @@ def camera_at(
         spread["theta"] = 0.0
     theta = prediction.constants.theta if lens.free_theta else np.pi / 2
     return Calibration(
-        intrinsics=Intrinsics(*values[:4].tolist(), theta),
+        intrinsics=Intrinsics(values[0], values[1], values[2], values[3], theta),
         std=spread,
         fixed=frozenset() if has_theta else frozenset({"theta"}),
-        views=_pose(lens, prediction.local[0], prediction.constants.R, prediction.constants.t, prediction.covariance[0]),
+        views=_pose(
+            lens,
+            prediction.local[0],
+            prediction.constants.R,
+            prediction.constants.t,
+            prediction.covariance[0],
+        ),
         points=Correspondences.none(lens.image_size, lens.unit),
         type=1,
         method="lens",

@@ -13,7 +13,7 @@ best ones, the committee is those that agree most between the settings (`_agreei
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +52,7 @@ class Budget:
     starts: int = 12
     best: int = 12
     members: int = 8
-    schedule: Schedule = Schedule()
+    schedule: Schedule = field(default_factory=Schedule)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,13 @@ def fit_committee(
     """
     probe = _probe(x.shape[1])
     L = len(names)
-    order = [j for j, name in enumerate(names) if name == "t_z"] + [2, 3, *range(4 + ("t_z" in names), L), 0, 1]
+    order = [j for j, name in enumerate(names) if name == "t_z"] + [
+        2,
+        3,
+        *range(4 + ("t_z" in names), L),
+        0,
+        1,
+    ]
     values, held = local.copy(), np.zeros(L, dtype=bool)
     chosen: dict[int, list[ParameterNet]] = {}
     scale = "log"
@@ -170,7 +176,9 @@ def _fit(x: Array, targets: Array, variance: Array, rng: np.random.Generator, bu
         topology = Topology(x.shape[1], own, hidden)
         start = topology.random_weights(budget.starts if own + hidden else 1, rng)
         trained = train(topology, x, scaled, variance / spread**2, start, budget.schedule)
-        for w, a, tau2, e in zip(trained.weights, trained.precision, trained.scatter, trained.evidence, strict=True):
+        for w, a, tau2, e in zip(
+            trained.weights, trained.precision, trained.scatter, trained.evidence, strict=True
+        ):
             nets.append(ParameterNet(topology, w, a, centre, spread, float(tau2) * spread**2))
             evidence.append(float(e))
     order = np.argsort(-np.array(evidence), kind="stable")

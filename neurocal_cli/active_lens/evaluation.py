@@ -111,24 +111,27 @@ def _matched(lens: ActiveLens, points: LensPoints) -> tuple[LensPoints, list[str
     missing = [name for name in lens.controls if name not in points.controls]
     if missing:
         raise InputError(
-            f"{source}: there is no column {missing[0]}, which this lens was calibrated over; name the setting of "
+            f"{source}: there is no column {missing[0]}, which this lens was calibrated over; name the "
+            "setting of "
             "each point"
         )
     here, there = points.points.image_size, lens.image_size
     if here is not None and there is not None and here != there:
         raise InputError(
-            f"{source}: the points' image_size {here[0]} x {here[1]} differs from the lens's {there[0]} x {there[1]}"
+            f"{source}: the points' image_size {here[0]} x {here[1]} differs from the lens's "
+            f"{there[0]} x {there[1]}"
         )
     columns = dict(zip(points.controls, points.settings[points.point_setting].T, strict=True))
     # Every point counts the same, as in any reprojection error.
     plain = replace(points.points, covariance=None)
     matched = LensPoints.grouped(plain, {name: columns[name] for name in lens.controls})
-    outside = ((matched.settings < lens.low) | (matched.settings > lens.high)).any(axis=1)
+    outside = np.asarray(((matched.settings < lens.low) | (matched.settings > lens.high)).any(axis=1))
     warnings = []
     if outside.any():
         first = describe(lens.controls, matched.settings[int(np.argmax(outside))])
         warnings.append(
-            f"{int(outside.sum())} of {len(outside)} settings lie outside the calibrated range, the first at {first}: "
+            f"{int(outside.sum())} of {len(outside)} settings lie outside the calibrated range, the "
+            f"first at {first}: "
             "what the networks say there is a guess"
         )
     return matched, warnings
@@ -141,7 +144,11 @@ def _poses(lens: ActiveLens, points: LensPoints, local: Array, theta: float) -> 
     number = {name: k for k, name in enumerate(points.points.view_names)}
     n_k = len(coefficient_names(lens.model))
     for s, values in enumerate(local):
-        camera = _Known(Intrinsics(*values[:4], theta), lens.model, Lens(lens.model, values[len(values) - n_k :]).coefficients)
+        camera = _Known(
+            Intrinsics(values[0], values[1], values[2], values[3], theta),
+            lens.model,
+            Lens(lens.model, values[len(values) - n_k :]).coefficients,
+        )
         part = points.points.select(points.point_setting == s)
         try:
             fit = calibrate(part, type=3, intrinsics=camera, distortion="none", outliers="keep")

@@ -14,7 +14,7 @@ from neurocal_cli.active_lens.committee import Budget, fit_committee
 from neurocal_cli.active_lens.joint import Joint, train_joint
 from neurocal_cli.active_lens.left_out import left_out_errors
 from neurocal_cli.active_lens.lens_model import ActiveLens, Member, Rejected, TableRecord
-from neurocal_cli.active_lens.nets import LensNets
+from neurocal_cli.active_lens.nets import LensNets, to_scale
 from neurocal_cli.active_lens.outliers import bad_pixels, doubtful, stands_out
 from neurocal_cli.active_lens.settings import LensPoints, describe, scaled_controls
 from neurocal_cli.active_lens.static import (
@@ -26,6 +26,7 @@ from neurocal_cli.active_lens.static import (
     fit_local,
 )
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
+from neurocal_cli.geometry import Array
 from neurocal_cli.lens import MODELS
 
 __all__ = ["CAMERAS", "DISTORTIONS", "OUTLIERS", "TRAININGS", "fit_lens"]
@@ -135,7 +136,9 @@ def fit_lens(
     check_settings(lens.n_settings, len(lens.controls), lens.points.source)
     one_view = np.bincount(lens.view_setting).max() == 1
     budget = Budget() if topologies is None else Budget(topologies=topologies)
-    options = Options(training, camera == "still" or (camera == "auto" and bool(one_view)), skew, budget, seed)
+    options = Options(
+        training, camera == "still" or (camera == "auto" and bool(one_view)), skew, budget, seed
+    )
     reject = outliers == "reject"
     if distortion == "auto":
         start = _choose_model(lens, options, reject, report)
@@ -155,7 +158,8 @@ def check_settings(count: int, controls: int, source: str) -> None:
     least = controls + 2
     if count < least:
         raise InputError(
-            f"{source}: there are {count} settings, too few to follow {controls} control{'s' * (controls > 1)}; "
+            f"{source}: there are {count} settings, too few to follow {controls} "
+            f"control{'s' * (controls > 1)}; "
             f"give at least {least}, and better 5 of each"
         )
 
@@ -169,7 +173,8 @@ def _begin(lens: LensPoints, model: str, options: Options, reject: bool, report:
         tables = common_tables(data, static.local, first_constants(static, lens, options.still), report)
         if not tables.normal.sensible or not np.isfinite(tables.normal.cost).all():
             raise DegenerateGeometryError(
-                f"{lens.points.source}: no constants were found that all settings share; did the camera or the "
+                f"{lens.points.source}: no constants were found that all settings share; did the "
+                "camera or the "
                 "target move? Then give each setting several views of the board, --camera moving"
             )
         bad = bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if reject else None
@@ -235,14 +240,16 @@ def _held_out(start: _Start, options: Options) -> float:
         seen = replace(normal, H=normal.H[part], g=normal.g[part], cost=normal.cost[part])
         rng = np.random.default_rng(options.seed)
         names, local = start.data.names, start.tables.local
-        members = fit_committee(x[part], names, local[part], seen, start.variance, rng, _QUICK, lambda share: None)
+        members = fit_committee(
+            x[part], names, local[part], seen, start.variance, rng, _QUICK, lambda share: None
+        )
         predicted = np.mean([nets.local(x) for nets in members], axis=0)
         there, _ = start.data.linearise(np.where(part[:, None], local, predicted), start.tables.constants)
         squares += float(there.cost[~part].sum()) if np.isfinite(there.cost).all() else np.inf
     return float(np.sqrt(squares / len(start.lens.points)))
 
 
-def _scaled(lens: LensPoints) -> np.ndarray:
+def _scaled(lens: LensPoints) -> Array:
     return scaled_controls(lens.settings, lens.settings.min(axis=0), lens.settings.max(axis=0))
 
 
@@ -260,7 +267,9 @@ def _learn(start: _Start, options: Options, reject: bool, report: Progress) -> t
         tables = common_tables(data, static.local, first_constants(static, lens, options.still))
         rest = _Start(lens, data, static, tables, start.rejected)
         trial = _train(rest, options, replace(options.budget, starts=6), report)
-        reason = stands_out(_provisional(rest, trial, options), start.lens.settings[suspect], start.tables, suspect)
+        reason = stands_out(
+            _provisional(rest, trial, options), start.lens.settings[suspect], start.tables, suspect
+        )
         if reason is None:
             return start, joints
         rejected = Rejected(tuple(start.lens.settings[suspect].tolist()), reason)
@@ -281,13 +290,14 @@ def _train(start: _Start, options: Options, budget: Budget, report: Progress) ->
         lambda share: report("fitting a network to each parameter", share),
     )
     train = train_joint if options.training == "joint" else train_alternating
+    # A lens that does not return to its place shows it to every network; one that cannot follow is alone.
+    scatter = np.min([_scatter(nets, start.tables) for nets in members], axis=0)
     joints = []
     for k, nets in enumerate(members):
 
         def tell(share: float, k: int = k) -> None:
             report("all networks together", (k + share) / len(members))
 
-        scatter = _scatter(nets, start.tables)
         joints.append(train(start.data, x, nets, start.tables.constants, start.variance, scatter, tell))
     joints = [joint for joint in joints if np.isfinite(joint.evidence)]
     if not joints:
@@ -296,12 +306,10 @@ def _train(start: _Start, options: Options, budget: Budget, report: Progress) ->
     return joints[: max(1, round(_KEPT * len(joints)))]
 
 
-def _scatter(nets: LensNets, tables: Tables) -> np.ndarray:
+def _scatter(nets: LensNets, tables: Tables) -> Array:
     """(L,) variance of the local parameters from setting to setting, from that of the outputs."""
     scatter = np.array([net.scatter for net in nets.nets])
     alpha = np.median(tables.local[:, :2], axis=0)
-    from neurocal_cli.active_lens.nets import to_scale
-
     slope = float(np.median(np.abs(to_scale(nets.scale, tables.local[:, 0])[1])))
     scatter[0] /= slope**2
     scatter[1] = scatter[1] * alpha[1] ** 2 + scatter[0]
@@ -310,7 +318,7 @@ def _scatter(nets: LensNets, tables: Tables) -> np.ndarray:
 
 def _provisional(start: _Start, joints: list[Joint], options: Options) -> ActiveLens:
     """A lens without the figures that only a finished one needs."""
-    scatter = np.median([_scatter(joint.nets, start.tables) for joint in joints], axis=0)
+    scatter = np.min([_scatter(joint.nets, start.tables) for joint in joints], axis=0)
     averaged = fit_local(
         start.data, start.tables.local, first_constants(start.static, start.lens, options.still)
     )
@@ -375,7 +383,8 @@ def _warnings(lens: ActiveLens, start: _Start, tables_rms: float) -> tuple[str, 
         warnings.append(f"the setting {where} is left out: {rejected.reason}")
     if lens.rmse_px > _POOR_FIT * tables_rms:
         warnings.append(
-            f"the networks follow the settings only to {lens.rmse_px:.3g} px, tables of them fit to {tables_rms:.3g} "
+            f"the networks follow the settings only to {lens.rmse_px:.3g} px, tables of them fit to "
+            f"{tables_rms:.3g} "
             "px: the lens does not return to the same place, or changes faster than the settings tell"
         )
     return tuple(warnings)

@@ -65,7 +65,10 @@ class LensCameras:
         missing = [name for name in _INTRINSIC if columns.get(name) is None]
         if not controls or missing:
             lacking = missing[0] if missing else "zoom or focus"
-            raise InputError(f"{source}: there is no column {lacking}; known cameras need zoom and/or focus, alpha_u, alpha_v, u0, v0")
+            raise InputError(
+                f"{source}: there is no column {lacking}; known cameras need zoom and/or focus, "
+                "alpha_u, alpha_v, u0, v0"
+            )
         names = (*_INTRINSIC, *(["t_z"] if columns.get("t_z") is not None else []))
         settings = np.column_stack([np.asarray(columns[name], dtype=float) for name in controls])
         local = np.column_stack([np.asarray(columns[name], dtype=float) for name in names])
@@ -146,5 +149,6 @@ def _scatter_normal(members: tuple[LensNets, ...], local: Array) -> Normal:
     scatter = np.median([[net.scatter for net in nets.nets] for nets in members], axis=0)
     _, by_local = local_to_outputs(members[0].scale, local)
     H = np.swapaxes(by_local, 1, 2) @ (by_local / scatter[:, None])
+    H = np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2)  # exactly symmetric, as a file of it will be
     S, L = local.shape
     return Normal(H, np.zeros((S, L)), np.zeros(S), True)

@@ -24,6 +24,7 @@ __all__ = ["Joint", "JointLearner", "gauss_newton", "loosened", "posterior", "tr
 _ROUNDS = 16  # of normal matrices
 _STEPS = 25  # of Levenberg-Marquardt on one set of them
 _SETTLED = 0.5  # of 2 E, a quarter of a standard deviation: a round that gains less is the last
+_SMALL = 0.02  # of 2 E: a step that gains less is the last on a set of matrices
 _FIRST = 4  # rounds in which the priors follow the data
 
 
@@ -169,7 +170,7 @@ class JointLearner:
                 gained = cost - after
                 self.nets, self.shared, cost = nets, shared, after
                 self.damping = max(0.2 * self.damping, 1e-12)
-                if gained < 1e-7 * abs(cost):
+                if gained < _SMALL:
                     break
             else:
                 self.damping *= 5
@@ -205,7 +206,7 @@ class JointLearner:
         cost = self.cost(self.nets, self.shared)
         _, volume = np.linalg.slogdet(N)
         symmetries = sum(net.topology.log_symmetries for net in self.nets.nets)
-        evidence = -0.5 * cost - 0.5 * volume + 0.5 * float(np.log(self.nets.prior).sum()) + symmetries
+        evidence = symmetries - 0.5 * cost - 0.5 * volume + 0.5 * float(np.log(self.nets.prior).sum())
         return Joint(self.nets, self.constants, cost, _inverse(N), float(evidence), converged)
 
 

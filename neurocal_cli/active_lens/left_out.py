@@ -50,14 +50,16 @@ def left_out_errors(x: Array, joint: Joint, tables: Tables, variance: float) -> 
     normal = tables.normal
     H = normal.H[:, :L, :L]
     spread = J @ joint.covariance[:P, :P] @ np.swapaxes(J, 1, 2)
-    # The constants of the networks and of the tables differ; what the local parameters do about it is no error.
+    # With constants of its own, a lens may differ from the tables everywhere alike; that is small.
     error = local - tables.local
     K = spread @ H / variance
     remain = np.eye(L) - K
-    out = np.linalg.solve(remain, error[..., None])
+    out = np.asarray(np.linalg.solve(remain, error[..., None]), dtype=np.float64)
     spread_out = np.linalg.solve(remain, spread)
     expected = spread_out + variance * scaled_solve(H, np.tile(np.eye(L), (S, 1, 1)))
-    surprise = (out * scaled_solve(expected, out)).sum(axis=(1, 2)) / L
+    surprise = (out * scaled_solve(expected, np.asarray(out))).sum(axis=(1, 2)) / L
     squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
-    counts = np.maximum(normal.H[:, 2, 2], 1.0)  # by u0: a residual moves by 1, so this is the number of points
+    counts = np.maximum(
+        normal.H[:, 2, 2], 1.0
+    )  # by u0: a residual moves by 1, so this is the number of points
     return LeftOut(np.sqrt(np.maximum(squares, 0.0) / counts), np.maximum(surprise, 0.0))

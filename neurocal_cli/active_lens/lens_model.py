@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.active_lens.blocks import Constants, Normal
 from neurocal_cli.active_lens.joint import posterior
@@ -126,7 +127,7 @@ class ActiveLens:
     variance: float
     scatter: Array
     free_theta: bool
-    counts: Array
+    counts: NDArray[np.int64]
     rmse: Array
     rejected: tuple[Rejected, ...]
     left_out_px: float
@@ -161,10 +162,13 @@ class ActiveLens:
         """Covariance of each member's weights and constants."""
         x = self.scaled(self.settings)
         return tuple(
-            posterior(x, member.nets, self.tables.normal, self.variance, self.scatter) for member in self.members
+            posterior(x, member.nets, self.tables.normal, self.variance, self.scatter)
+            for member in self.members
         )
 
-    def setting_of(self, values: dict[str, float | None], extrapolate: bool = False) -> tuple[Array, list[str]]:
+    def setting_of(
+        self, values: dict[str, float | None], extrapolate: bool = False
+    ) -> tuple[Array, list[str]]:
         """Put a setting in the order of the controls, (D,), and check it.
 
         Parameters
@@ -215,16 +219,18 @@ class ActiveLens:
         pairs = [member.nets.local_with_jacobians(x) for member in self.members]
         locals_ = np.array([local for local, _ in pairs])
         if not (np.isfinite(locals_).all() and (locals_[:, :, :2] > 0).all()):
-            bad = int(np.argmin((np.isfinite(locals_).all(axis=2) & (locals_[:, :, :2] > 0).all(axis=2)).all(axis=0)))
+            bad = int(
+                np.argmin(
+                    (np.isfinite(locals_).all(axis=2) & (locals_[:, :, :2] > 0).all(axis=2)).all(axis=0)
+                )
+            )
             raise InputError(
                 f"the networks know no camera at {describe(self.controls, np.atleast_2d(settings)[bad])}; "
                 "choose a setting in the calibrated range"
             )
         constants, offsets = _mean_constants([member.constants for member in self.members], self.still)
         Q = self.tables.normal.H.shape[1] - len(self.names)
-        within = np.mean(
-            [_spread(J, C, Q) for (_, J), C in zip(pairs, self.posteriors, strict=True)], axis=0
-        )
+        within = np.mean([_spread(J, C, Q) for (_, J), C in zip(pairs, self.posteriors, strict=True)], axis=0)
         offsets = offsets[:, :Q]
         both = np.concatenate([locals_, np.broadcast_to(offsets[:, None], (*locals_.shape[:2], Q))], axis=2)
         deviation = both - both.mean(axis=0)

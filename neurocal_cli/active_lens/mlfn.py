@@ -135,7 +135,9 @@ def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array,
     """Output (B, n), first hidden layer (B, n, D own), what the second sees (B, n, R), second (B, n, H)."""
     part = topology.parts
     B, n, D = len(weights), *x.shape
-    bent = np.tanh(weights[:, None, part["s"]] * np.repeat(x, topology.own, axis=1) + weights[:, None, part["c"]])
+    bent = np.tanh(
+        weights[:, None, part["s"]] * np.repeat(x, topology.own, axis=1) + weights[:, None, part["c"]]
+    )
     r = np.concatenate([np.broadcast_to(x, (B, n, D)), bent], axis=2)
     U = weights[:, part["U"]].reshape(B, topology.hidden, topology.width)
     g = np.tanh(r @ np.swapaxes(U, 1, 2) + weights[:, None, part["b"]])

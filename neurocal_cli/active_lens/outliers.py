@@ -32,7 +32,9 @@ def bad_pixels(rms: Array) -> BadSetting | None:
     worst, typical = int(rms.argmax()), float(np.median(rms))
     if rms[worst] <= _PIXELS * typical:
         return None
-    return BadSetting(worst, f"its pixels fit only to {rms[worst]:.3g} px, those of the others to {typical:.3g} px")
+    return BadSetting(
+        worst, f"its pixels fit only to {rms[worst]:.3g} px, those of the others to {typical:.3g} px"
+    )
 
 
 def doubtful(errors: LeftOut) -> int | None:
@@ -63,4 +65,6 @@ def stands_out(lens: ActiveLens, setting: Array, tables: Tables, s: int) -> str 
     pixels = float(np.sqrt(max(error @ H @ error, 0.0) / max(tables.normal.H[s, 2, 2], 1.0)))
     if sigmas < _SIGMAS or pixels < _VISIBLE * np.sqrt(2 * lens.variance):
         return None
-    return f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations away from what the other settings tell"
+    return (
+        f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations away from what the other settings tell"
+    )

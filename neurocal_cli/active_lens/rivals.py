@@ -9,6 +9,7 @@ rival misses nothing but the network.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 
@@ -51,10 +52,10 @@ def rivals_of(lens: ActiveLens, scale: str | None = None) -> dict[str, Rival]:
         if lens.known and suffix:
             continue  # there is nothing that parameters of known cameras could share
         if axes is not None:
-            rivals[f"lookup{suffix}"] = _through(table, scale, lambda to, axes=axes: lookup_matrix(axes, to))
-            rivals[f"spline{suffix}"] = _through(table, scale, lambda to, axes=axes: spline_matrix(axes, to))
+            rivals[f"lookup{suffix}"] = _through(table, scale, partial(lookup_matrix, axes))
+            rivals[f"spline{suffix}"] = _through(table, scale, partial(spline_matrix, axes))
         if x.shape[1] > 1 and len(x) >= 4:
-            rivals[f"thin_plate{suffix}"] = _through(table, scale, lambda to: thin_plate_matrix(x, to))
+            rivals[f"thin_plate{suffix}"] = _through(table, scale, partial(thin_plate_matrix, x))
     for degree in _degrees(x):
         rivals[f"polynomial_{degree}"] = _polynomial(lens.static, lens.variance, scale, x, degree)
         if not lens.known:
@@ -84,7 +85,10 @@ def _polynomial(table: TableRecord, variance: float, scale: str, x: Array, degre
     Phi = monomials(x, degree)
     weight = 1 / np.sqrt(np.maximum(spread, 1e-300))
     coefficients = np.column_stack(
-        [np.linalg.lstsq(Phi * w[:, None], y * w, rcond=None)[0] for y, w in zip(outputs.T, weight.T, strict=True)]
+        [
+            np.linalg.lstsq(Phi * w[:, None], y * w, rcond=None)[0]
+            for y, w in zip(outputs.T, weight.T, strict=True)
+        ]
     )
     return lambda to: (outputs_to_local(scale, monomials(to, degree) @ coefficients)[0], table.constants)
 

@@ -56,7 +56,8 @@ class LensPoints:
         controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
         if not controls:
             raise InputError(
-                f"{points.source}: there is no column zoom or focus; name the setting of each point in one or both"
+                f"{points.source}: there is no column zoom or focus; name the setting of each point in "
+                "one or both"
             )
         values = np.column_stack([np.asarray(columns[name], dtype=float) for name in controls])
         if values.shape != (len(points), len(controls)):
@@ -64,14 +65,17 @@ class LensPoints:
         finite = np.isfinite(values).all(axis=1)
         if not finite.all():
             row = int(np.argmin(finite))
-            raise InputError(f"{points.place(row)}: the setting must be of finite numbers; correct or remove the row")
+            raise InputError(
+                f"{points.place(row)}: the setting must be of finite numbers; correct or remove the row"
+            )
         first = np.unique(points.view_index, return_index=True)[1]
         differs = (values != values[first][points.view_index]).any(axis=1)
         if differs.any():
             row = int(np.argmax(differs))
             name = points.view_names[points.view_index[row]]
             raise InputError(
-                f"{points.place(row)}: the view {name!r} has points at two settings; give each image a view of its own"
+                f"{points.place(row)}: the view {name!r} has points at two settings; give each image a "
+                "view of its own"
             )
         settings, index = np.unique(values[first], axis=0, return_inverse=True)
         return cls(points, controls, settings, index.ravel())
@@ -97,7 +101,8 @@ class LensPoints:
         moves = np.ptp(self.settings, axis=0) > 0
         if not moves.any():
             raise InputError(
-                f"{self.points.source}: all points are at one setting, {describe(self.controls, self.settings[0])}; "
+                f"{self.points.source}: all points are at one setting, "
+                f"{describe(self.controls, self.settings[0])}; "
                 "a lens needs several, and `neurocal calibrate` takes one"
             )
         controls = tuple(name for name, moving in zip(self.controls, moves, strict=True) if moving)

@@ -8,7 +8,7 @@ the pixel error over all settings: the best that any table of values at the sett
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,7 +101,11 @@ def calibrate_each(
         for name, view in cal.views.items():
             R[number[name]], t[number[name]] = view.pose.R, view.pose.t
         t_z = [float(np.mean([view.pose.t[2] for view in cal.views.values()]))] if data.still else []
-        lensing = cal.distortion if cal.distortion_model == data.model else np.zeros(len(coefficient_names(data.model)))
+        lensing = (
+            cal.distortion
+            if cal.distortion_model == data.model
+            else np.zeros(len(coefficient_names(data.model)))
+        )
         local[s] = [K.alpha_u, K.alpha_v, K.u0, K.v0, *t_z, *lensing]
         theta[s], rmse[s] = K.theta, cal.rmse_px
     good = np.isfinite(rmse)

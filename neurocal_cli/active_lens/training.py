@@ -206,4 +206,6 @@ class _Learner:
         log_prior = 0.5 * np.log(self.prior).sum(axis=1)
         noise = (self.include * np.log(self.variance + self.tau2[:, None])).sum(axis=1)
         evidence = -self.cost - 0.5 * volume + log_prior - 0.5 * noise + self.topology.log_symmetries
-        return Trained(self.topology, self.w, self.a, self.tau2, np.where(np.isfinite(evidence), evidence, -np.inf))
+        return Trained(
+            self.topology, self.w, self.a, self.tau2, np.where(np.isfinite(evidence), evidence, -np.inf)
+        )

@@ -27,6 +27,7 @@ _SUMMARIES = {
     "calibrate": "Calibrate a camera from known points and the pixels where they were seen.",
     "detect": "Find chessboards in images and measure the mid-points of their squares' edges.",
     "evaluate": "Measure how good a result is.",
+    "lens": "Calibrate a camera whose zoom and focus move.",
     "stereo": "Calibrate two cameras and how the right one stands to the left, X_right = R X_left + t.",
     "triangulate": "Find points in space from their pixels in the left and the right image.",
     "undistort": "Take a lens's distortion off images and points.",

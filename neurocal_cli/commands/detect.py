@@ -10,6 +10,7 @@ import click
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, one_line, say, warn
+from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import NeurocalError, UsageError
 
 if TYPE_CHECKING:
@@ -107,21 +108,11 @@ def detect(
       neurocal detect left*.jpg --board corner.yaml --overlay seen | neurocal calibrate -
     """  # noqa: D301 - as in the group
     check_one_stdin(*images, board)
-    _compute_in_one_thread()
+    compute_in_one_thread()
     target = _board(board, cols, rows, square, unit)
     outcomes = _examined(images, target, points, gamma, overlay, jobs)
     _report(outcomes)
     _write(outcomes, target, overlay, output)
-
-
-def _compute_in_one_thread() -> None:
-    """Keep the linear algebra to one thread, for this process and those it starts.
-
-    The matrices are small: threads cost three times the time they save, and their number would
-    show in the last digits. It must be said before numpy is loaded; the user's own choice stands.
-    """
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "VECLIB_MAXIMUM_THREADS"):
-        os.environ.setdefault(name, "1")
 
 
 def _board(

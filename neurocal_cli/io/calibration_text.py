@@ -171,6 +171,8 @@ def _observation_lines(points: Correspondences) -> Iterator[str]:
         blocks.append(points.covariance)
     yield "  observations:"
     yield f"    columns: [{', '.join(columns)}]"
-    yield "    rows:"
+    yield "    rows:" if heads else "    rows: []"
+    if not heads:
+        return
     numbers = flow(np.hstack(blocks))[2:-2].split("], [")
     yield "\n".join([f"{head}{row}]" for head, row in zip(heads, numbers, strict=True)])

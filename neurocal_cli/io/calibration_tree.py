@@ -46,8 +46,8 @@ def calibration_from_field(root: Field) -> Calibration:
     """
     block = neurocal_block(root)
     views = _views(block)
-    points = _points(root, block, set(views))
     fit = block["fit"]
+    points = _points(root, block, set(views), fit["n_points"].integer() == 0)
     if fit["n_points"].integer() != len(points):
         raise FormatError(
             f"fit.n_points is {fit['n_points'].integer()}, but there are {len(points)} observations: the "
@@ -242,9 +242,11 @@ def _straight_lines(field: Field | None) -> StraightLines | None:
     )
 
 
-def _points(root: Field, block: Field, views: set[str]) -> Correspondences:
+def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspondences:
     observations = block["observations"]
     columns = _columns(observations)
+    if none and not columns:  # a camera that a lens gave
+        return Correspondences.none(_image_size(root), block["unit"].text() if "unit" in block else "mm")
     numbers = _numbers(observations, columns, _NUMBER_COLUMNS)
     labels = {name: _labels(observations, columns, name) for name in ("view", "point") if name in columns}
     strange = set(labels.get("view", ())) - views if "view" in columns else set()
@@ -254,7 +256,6 @@ def _points(root: Field, block: Field, views: set[str]) -> Correspondences:
             "calibrate again or correct its name",
             root.source,
         )
-    width, height = (root[key].integer() if key in root else 0 for key in ("image_width", "image_height"))
     center = block.get("image_center")
     has_covariance = all(name in columns for name in _COVARIANCE_COLUMNS)
     try:
@@ -264,13 +265,18 @@ def _points(root: Field, block: Field, views: set[str]) -> Correspondences:
             view=labels.get("view"),
             point=labels.get("point"),
             covariance=_numbers(observations, columns, _COVARIANCE_COLUMNS) if has_covariance else None,
-            image_size=(width, height) if width and height else None,
+            image_size=_image_size(root),
             image_center=None if center is None else tuple(center.array(2).tolist()),
             unit=block["unit"].text() if "unit" in block else "mm",
             source=root.source,
         )
     except InputError as error:
         raise FormatError(str(error)) from error
+
+
+def _image_size(root: Field) -> tuple[int, int] | None:
+    width, height = (root[key].integer() if key in root else 0 for key in ("image_width", "image_height"))
+    return (width, height) if width and height else None
 
 
 def _columns(observations: Field) -> dict[str, list[Any]]:

@@ -148,7 +148,8 @@ def _check_settings(tables: list[Table], notes: list[str]) -> None:
                 row = int(np.argmax(differs))
                 raise InputError(
                     f"{table.source}:{table.lines[row]}: {name} changes from {setting:g} to {column[row]:g}: "
-                    "points at several zoom/focus settings; calibrate one setting at a time"
+                    "points at several zoom/focus settings; `neurocal lens fit` takes them, calibrate "
+                    "one setting at a time"
                 )
         if setting is not None:
             notes.append(f"{tables[0].source}: {name} is {setting:g} throughout; the column is not used")

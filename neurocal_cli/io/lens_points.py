@@ -1,0 +1,154 @@
+"""Points at many lens settings, and known cameras at them, from CSV."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.active_lens.fit_known import LensCameras
+from neurocal_cli.active_lens.settings import CONTROLS, LensPoints, describe
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.files import read_bytes, write_whole
+from neurocal_cli.io.points_csv import POINTS, format_points
+from neurocal_cli.io.points_join import correspondences
+from neurocal_cli.io.table import Schema, Table, parse_table
+
+__all__ = ["CAMERAS", "read_lens_data", "read_lens_points", "write_lens_points"]
+
+CAMERAS = Schema(
+    kind="cameras",
+    required=("alpha_u", "alpha_v", "u0", "v0"),
+    optional=("t_z", *CONTROLS),
+)
+
+
+def read_lens_data(
+    paths: str | Path | Sequence[str | Path], *, notes: list[str] | None = None
+) -> LensPoints | LensCameras:
+    """Read points at many settings, or known cameras, whichever the header names.
+
+    Parameters
+    ----------
+    paths : str, Path or a sequence of them
+        ``-`` is stdin.
+    notes : list of str, optional
+        Remarks about what was left out are appended.
+
+    Raises
+    ------
+    FormatError, InputError
+        A file that cannot be read, without the setting's column, or with what does not fit together.
+    """
+    several = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    if not several:
+        raise InputError("there are no files; give at least one")
+    contents = [read_bytes(path) for path in several]
+    remarks = notes if notes is not None else []
+    if all(_names_cameras(data) for data, _ in contents):
+        return _cameras([parse_table(data, source, CAMERAS) for data, source in contents], remarks)
+    return _points([parse_table(data, source, POINTS) for data, source in contents], remarks)
+
+
+def read_lens_points(
+    paths: str | Path | Sequence[str | Path], *, notes: list[str] | None = None
+) -> LensPoints:
+    """Read points at many settings; see `read_lens_data`."""
+    data = read_lens_data(paths, notes=notes)
+    if not isinstance(data, LensPoints):
+        raise FormatError("has known cameras, not points; give columns X,Y,Z,u,v", data.source)
+    return data
+
+
+def write_lens_points(lens: LensPoints, path: str | Path) -> None:
+    """Write points with the columns of their settings, which read back to the last bit."""
+    lines = format_points(lens.points).split("\n")
+    first = next(k for k, line in enumerate(lines) if not line.startswith("#"))
+    settings = [",".join(map(repr, row)) for row in lens.settings.tolist()]
+    lines[first] = ",".join([*lens.controls, lines[first]])
+    for k, s in enumerate(lens.point_setting.tolist(), start=first + 1):
+        lines[k] = f"{settings[s]},{lines[k]}"
+    write_whole(path, "\n".join(lines))
+
+
+def _names_cameras(data: bytes) -> bool:
+    """Whether the header has alpha_u."""
+    for line in data.splitlines():
+        if line.strip() and not line.lstrip(b"\xef\xbb\xbf \t").startswith(b"#"):
+            return b"alpha_u" in line
+    return False
+
+
+def _cameras(tables: list[Table], notes: list[str]) -> LensCameras:
+    for table in tables:
+        _note_unknown(table, notes)
+    shared = [
+        name for name in (*CAMERAS.required, *CAMERAS.optional) if all(name in t.numbers for t in tables)
+    ]
+    _require_setting([set(table.numbers) for table in tables], tables)
+    sizes = {table.metadata.image_size for table in tables} - {None}
+    if len(sizes) > 1:
+        raise InputError(f"{tables[0].source}: the files' image_size differs; cameras of one lens have one")
+    return LensCameras.of(
+        {name: np.concatenate([table.numbers[name] for table in tables]) for name in shared},
+        next(iter(sizes), None),
+        tables[0].metadata.unit or "mm",
+        tables[0].source,
+    )
+
+
+def _note_unknown(table: Table, notes: list[str]) -> None:
+    if table.unknown:
+        names = ", ".join(repr(name[:40]) for name in table.unknown)
+        notes.append(f"{table.source}: column{'s' * (len(table.unknown) > 1)} not used: {names}")
+
+
+def _require_setting(names: list[set[str]], tables: list[Table]) -> tuple[str, ...]:
+    """The controls that all files have.
+
+    Raises
+    ------
+    FormatError
+        None, or other ones in another file.
+    """
+    for found, table in zip(names, tables, strict=True):
+        if found.isdisjoint(CONTROLS):
+            raise FormatError(
+                "there is no column zoom or focus; name the setting of each row in one or both", table.source
+            )
+        if found & set(CONTROLS) != names[0] & set(CONTROLS):
+            raise FormatError(f"has not the same of zoom and focus as {tables[0].source}", table.source)
+    return tuple(name for name in CONTROLS if name in names[0])
+
+
+def _points(tables: list[Table], notes: list[str]) -> LensPoints:
+    controls = _require_setting([set(table.numbers) for table in tables], tables)
+    values = [np.column_stack([table.numbers[name] for name in controls]) for table in tables]
+    plain = []
+    for table, setting in zip(tables, values, strict=True):
+        numbers = {name: column for name, column in table.numbers.items() if name not in controls}
+        labels = table.labels | {"view": _images(table, controls, setting, len(tables) > 1)}
+        plain.append(replace(table, numbers=numbers, labels=labels))
+    points = correspondences(plain, notes)
+    columns = np.vstack(values)
+    return LensPoints.grouped(points, {name: columns[:, k] for k, name in enumerate(controls)})
+
+
+def _images(table: Table, controls: tuple[str, ...], setting: Array, several: bool) -> NDArray[Any]:
+    """A view for each image: the file's own label, made different where it occurs at several settings."""
+    distinct, index = np.unique(setting, axis=0, return_inverse=True)
+    index = index.ravel()
+    texts = np.array([describe(controls, row) for row in distinct])[index]
+    own = table.labels.get("view")
+    if own is None:
+        return np.char.add(f"{Path(table.source).stem} ", texts) if several else texts
+    _, view = np.unique(own, return_inverse=True)
+    pairs = np.unique(np.column_stack([view.ravel(), index]), axis=0)
+    if len(pairs) == len(np.unique(view)):
+        return own
+    return np.char.add(np.char.add(own, " "), texts)

@@ -1,0 +1,267 @@
+"""Lens files: an active lens as YAML, its networks and what they learnt from; numbers read back exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli import __version__
+from neurocal_cli.active_lens.blocks import Constants, Normal
+from neurocal_cli.active_lens.lens_model import ActiveLens, Member, Rejected, TableRecord
+from neurocal_cli.active_lens.mlfn import Topology
+from neurocal_cli.active_lens.nets import SCALES, LensNets, ParameterNet
+from neurocal_cli.active_lens.settings import CONTROLS
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.files import write_whole
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
+from neurocal_cli.io.yaml_tree import read_yaml
+from neurocal_cli.lens import coefficient_names
+
+__all__ = ["format_lens", "read_lens", "write_lens"]
+
+_FORMAT = 1
+_BLOCK = "neurocal_lens"
+_CAMERA = ("alpha_u", "alpha_v", "u0", "v0")
+_MOST_UNITS = 1000
+
+
+def format_lens(lens: ActiveLens) -> str:
+    """Text of a lens file.
+
+    Raises
+    ------
+    InputError
+        A unit or reason that UTF-8 cannot hold.
+    """
+    lines = [f"{_BLOCK}:"]
+    for part in (_record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)):
+        lines += [f"  {line}" for line in part]
+    return "\n".join([*lines, ""])
+
+
+def write_lens(lens: ActiveLens, path: str | Path) -> None:
+    """Write a lens file, whole or not at all; ``-`` is stdout."""
+    write_whole(path, format_lens(lens))
+
+
+def read_lens(path: str | Path) -> ActiveLens:
+    """Read a lens file; ``-`` is stdin.
+
+    Raises
+    ------
+    FormatError
+        The file cannot be read, is another kind of file, or a key is missing or wrong.
+    """
+    tree, source = read_yaml(path)
+    root = Field(tree, source)
+    if not isinstance(tree, dict) or _BLOCK not in root:
+        kind = "is a camera" if isinstance(tree, dict) and "camera_matrix" in root else "is not a lens"
+        raise FormatError(f"{kind}; give a file that `neurocal lens fit` wrote", source)
+    try:
+        return _lens(root[_BLOCK])
+    except InputError as error:
+        raise FormatError(str(error), source) from error
+
+
+def _bool(value: bool) -> str:
+    return "true" if value else "false"
+
+
+def _words(names: tuple[str, ...]) -> str:
+    return f"[{', '.join(map(text, names))}]"
+
+
+def _record_lines(lens: ActiveLens) -> Iterator[str]:
+    width, height = lens.image_size or (0, 0)
+    yield f"format: {_FORMAT}"
+    yield f"version: {text(__version__)}"
+    yield f"controls: {_words(lens.controls)}"
+    yield f"parameters: {_words(lens.names)}"
+    yield f"distortion: {text(lens.model)}"
+    yield f"camera: {'known' if lens.known else 'still' if lens.still else 'moving'}"
+    yield f"skew: {_bool(lens.free_theta)}"
+    yield f"training: {text(lens.training)}"
+    yield f"seed: {lens.seed}"
+    yield f"converged: {_bool(lens.converged)}"
+    yield f"unit: {text(lens.unit)}"
+    yield f"image_width: {width}"
+    yield f"image_height: {height}"
+    yield "fit: " + mapping(
+        n_points=str(int(lens.counts.sum())),
+        rmse_px=number(lens.rmse_px if not lens.known else np.nan),
+        left_out_px=number(lens.left_out_px),
+        variance=number(lens.variance),
+    )
+    yield f"scatter: {flow(lens.scatter)}"
+    yield "rejected:" if lens.rejected else "rejected: []"
+    for bad in lens.rejected:
+        yield f"  - {mapping(setting=flow(np.array(bad.setting)), reason=quoted(bad.reason))}"
+    yield "warnings:" if lens.warnings else "warnings: []"
+    for warning in lens.warnings:
+        yield f"  - {quoted(warning)}"
+
+
+def _setting_lines(lens: ActiveLens) -> Iterator[str]:
+    yield "settings:"
+    yield f"  columns: [{', '.join([*lens.controls, 'n_points', 'rmse_px'])}]"
+    yield "  rows:"
+    for setting, count, rmse in zip(lens.settings, lens.counts.tolist(), lens.rmse.tolist(), strict=True):
+        yield f"    - [{', '.join(map(number, setting.tolist()))}, {count}, {number(rmse)}]"
+
+
+def _member_lines(lens: ActiveLens) -> Iterator[str]:
+    yield "members:"
+    for member in lens.members:
+        yield f"  - scale: {member.nets.scale}"
+        yield f"    constants: {_constants(member.constants)}"
+        yield "    networks:"
+        for name, net in zip(lens.names, member.nets.nets, strict=True):
+            yield f"      {name}:"
+            yield f"        hidden: [{net.topology.own}, {net.topology.hidden}]"
+            for key in ("centre", "spread", "scatter"):
+                yield f"        {key}: {number(getattr(net, key))}"
+            yield f"        precision: {flow(net.precision)}"
+            yield f"        weights: {flow(net.weights)}"
+
+
+def _constants(constants: Constants) -> str:
+    return mapping(theta=number(constants.theta), R=flow(constants.R), t=flow(constants.t))
+
+
+def _tables_lines(lens: ActiveLens) -> Iterator[str]:
+    for name, table in (("tables", lens.tables), ("static", lens.static)):
+        yield f"{name}:"
+        yield f"  constants: {_constants(table.constants)}"
+        upper = np.triu_indices(table.normal.H.shape[1])
+        for key, values in (
+            ("local", table.local),
+            ("H", table.normal.H[:, upper[0], upper[1]]),
+            ("g", table.normal.g),
+            ("cost", table.normal.cost),
+        ):
+            yield f"  {key}: {flow(values)}"
+
+
+def _lens(block: Field) -> ActiveLens:
+    if block["format"].integer() != _FORMAT:
+        raise FormatError(f"{block.path}.format is not {_FORMAT}; update neurocal", block.source)
+    controls = _names(block["controls"])
+    if not controls or any(name not in CONTROLS for name in controls) or len(set(controls)) < len(controls):
+        block["controls"].fail("zoom, focus or both")
+    camera = block["camera"].text()
+    if camera not in ("known", "still", "moving"):
+        block["camera"].fail("known, still or moving")
+    names, model = _parameter_names(block, camera)
+    settings, counts, rmse = _settings(block["settings"], len(controls))
+    L, S = len(names), len(settings)
+    members = tuple(_member(field, names, len(controls)) for field in block["members"].items())
+    if not members:
+        block["members"].fail("a list of at least one lens")
+    width, height = block["image_width"].integer(), block["image_height"].integer()
+    fit = block["fit"]
+    Q = {"known": 0, "still": 6, "moving": 1}[camera]
+    return ActiveLens(
+        controls=controls,
+        settings=settings,
+        names=names,
+        model=model,
+        still=camera == "still",
+        known=camera == "known",
+        members=members,
+        tables=_table(block["tables"], S, L, Q),
+        static=_table(block["static"], S, L, Q),
+        variance=_positive(fit["variance"]),
+        scatter=block["scatter"].array(L),
+        free_theta=block["skew"].boolean(),
+        counts=counts,
+        rmse=rmse,
+        rejected=tuple(_rejected(field, len(controls)) for field in block["rejected"].items()),
+        left_out_px=fit["left_out_px"].number_or_nan(),
+        training=block["training"].text(),
+        seed=block["seed"].integer(),
+        converged=block["converged"].boolean(),
+        image_size=(width, height) if width and height else None,
+        unit=block["unit"].text(),
+        warnings=tuple(field.text() for field in block["warnings"].items()),
+    )
+
+
+def _names(field: Field) -> tuple[str, ...]:
+    return tuple(name.text() for name in field.items())
+
+
+def _positive(field: Field) -> float:
+    value = field.number()
+    if value <= 0:
+        field.fail("a positive number")
+    return value
+
+
+def _parameter_names(block: Field, camera: str) -> tuple[tuple[str, ...], str]:
+    """Names of the local parameters, which the camera and the lens model leave no choice of."""
+    model = block["distortion"].text()
+    try:
+        coefficients = coefficient_names(model)
+    except InputError as error:
+        raise FormatError(f"{block.path}.distortion: {error}", block.source) from error
+    names = _names(block["parameters"])
+    t_z = ("t_z",) if camera == "still" or (camera == "known" and "t_z" in names) else ()
+    expected = (*_CAMERA, *t_z, *coefficients)
+    if names != expected:
+        block["parameters"].fail(f"the list {', '.join(expected)}")
+    return names, model
+
+
+def _settings(field: Field, D: int) -> tuple[Array, NDArray[np.int64], Array]:
+    table = field["rows"].array(-1, D + 2, unknown=True)
+    settings, counts = table[:, :D], table[:, D]
+    if not np.isfinite(table[:, : D + 1]).all() or len(table) < 2 or not (np.ptp(settings, axis=0) > 0).all():
+        field["rows"].fail("several rows of finite settings")
+    return np.ascontiguousarray(settings), counts.astype(np.int64), np.ascontiguousarray(table[:, D + 1])
+
+
+def _member(field: Field, names: tuple[str, ...], D: int) -> Member:
+    scale = field["scale"].text()
+    if scale not in SCALES:
+        field["scale"].fail(f"one of {', '.join(SCALES)}")
+    nets = tuple(_net(field["networks"][name], D) for name in names)
+    return Member(LensNets(scale, nets), _read_constants(field["constants"]))
+
+
+def _net(field: Field, D: int) -> ParameterNet:
+    hidden = field["hidden"].array(2)
+    if not ((hidden >= 0) & (hidden <= _MOST_UNITS) & (hidden == np.floor(hidden))).all():
+        field["hidden"].fail("two numbers of units")
+    topology = Topology(D, int(hidden[0]), int(hidden[1]))
+    return ParameterNet(
+        topology,
+        field["weights"].array(topology.n_weights),
+        field["precision"].array(topology.n_groups),
+        field["centre"].number(),
+        _positive(field["spread"]),
+        field["scatter"].number(),
+    )
+
+
+def _read_constants(field: Field) -> Constants:
+    return Constants(field["theta"].number(), field["R"].array(3, 3), field["t"].array(2))
+
+
+def _rejected(field: Field, D: int) -> Rejected:
+    return Rejected(tuple(field["setting"].array(D).tolist()), field["reason"].text())
+
+
+def _table(field: Field, S: int, L: int, Q: int) -> TableRecord:
+    size = L + Q
+    upper = np.triu_indices(size)
+    flat = field["H"].array(S, len(upper[0]))
+    H = np.zeros((S, size, size))
+    H[:, upper[0], upper[1]] = flat
+    H[:, upper[1], upper[0]] = flat
+    normal = Normal(H, field["g"].array(S, size), field["cost"].array(S), True)
+    return TableRecord(field["local"].array(S, L), _read_constants(field["constants"]), normal)
