@@ -22,13 +22,16 @@ from neurocal_cli.active_lens.blocks import Normal
 from neurocal_cli.active_lens.mlfn import Topology
 from neurocal_cli.active_lens.nets import SCALES, LensNets, ParameterNet, to_scale
 from neurocal_cli.active_lens.static import scaled_solve
-from neurocal_cli.active_lens.training import Schedule, train
+from neurocal_cli.active_lens.training import Schedule, is_sparse, train
 from neurocal_cli.geometry import Array
 
-__all__ = ["TOPOLOGIES", "Budget", "fit_committee"]
+__all__ = ["TOPOLOGIES", "Budget", "fit_committee", "suitable_topologies"]
 
 # (own, hidden): units of the first layer for each control, units of the second.
 TOPOLOGIES = ((0, 0), (1, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
+# Three values of a control do not tell how it bends: no units of its own then.
+_SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
+_WEIGHTS_PER_SETTING = 1.5
 _GRID = 13  # places on each control where networks are compared
 
 
@@ -38,7 +41,8 @@ class Budget:
 
     Parameters
     ----------
-    topologies : tuple of (int, int)
+    topologies : tuple of (int, int), optional
+        Default: those that the settings allow.
     starts : int
         Random starts of each topology.
     best : int
@@ -48,7 +52,7 @@ class Budget:
     schedule : Schedule
     """
 
-    topologies: tuple[tuple[int, int], ...] = TOPOLOGIES
+    topologies: tuple[tuple[int, int], ...] | None = None
     starts: int = 12
     best: int = 12
     members: int = 8
@@ -127,6 +131,13 @@ def fit_committee(
     return tuple(LensNets(scale, tuple(chosen[j][k] for j in range(L))) for k in range(budget.members))
 
 
+def suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
+    """Topologies that are worth trying on settings (S, D): hardly more weights than settings."""
+    limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
+    choices = _SPARSE if is_sparse(x) else TOPOLOGIES
+    return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
+
+
 def _probe(D: int) -> Array:
     """Places between the settings, a grid over the whole range."""
     axes = np.meshgrid(*[np.linspace(-1, 1, _GRID)] * D, indexing="ij")
@@ -172,7 +183,7 @@ def _fit(x: Array, targets: Array, variance: Array, rng: np.random.Generator, bu
     spread = max(spread, float(np.sqrt(variance.mean())), 1e-9 * abs(centre)) or 1.0
     scaled = (targets - centre) / spread
     nets, evidence = [], []
-    for own, hidden in budget.topologies:
+    for own, hidden in budget.topologies or suitable_topologies(x):
         topology = Topology(x.shape[1], own, hidden)
         start = topology.random_weights(budget.starts if own + hidden else 1, rng)
         trained = train(topology, x, scaled, variance / spread**2, start, budget.schedule)

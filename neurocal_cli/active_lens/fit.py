@@ -12,7 +12,7 @@ from neurocal_cli.active_lens.alternating import train_alternating
 from neurocal_cli.active_lens.blocks import Constants, PixelData
 from neurocal_cli.active_lens.committee import Budget, fit_committee
 from neurocal_cli.active_lens.joint import Joint, train_joint
-from neurocal_cli.active_lens.left_out import left_out_errors
+from neurocal_cli.active_lens.left_out import LeftOut, left_out_errors
 from neurocal_cli.active_lens.lens_model import ActiveLens, Member, Rejected, TableRecord
 from neurocal_cli.active_lens.nets import LensNets, to_scale
 from neurocal_cli.active_lens.outliers import bad_pixels, doubtful, stands_out
@@ -25,6 +25,7 @@ from neurocal_cli.active_lens.static import (
     first_constants,
     fit_local,
 )
+from neurocal_cli.active_lens.training import Schedule
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import MODELS
@@ -37,8 +38,9 @@ CAMERAS = ("auto", "still", "moving")
 DISTORTIONS = (*MODELS, "auto")
 LADDER = ("none", "k1", "k1k2", "plumb_bob")  # what auto chooses from
 
-_QUICK = Budget(topologies=((1, 1), (1, 2)), starts=6, best=6, members=2)
-_WORTH = 0.98  # a richer lens model must lower the held-out error to this share of it
+_QUICK = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
+_WORTH = 0.98  # a richer lens model must lower the held-out error to this share of it ...
+_CHANCE = 3.0  # ... and the residual variance by so many of its standard deviations
 _KEPT = 0.5  # share of the committee's members that is kept, those of highest evidence
 _POOR_FIT = 1.5  # error of the lens over that of the tables from which on it is warned of
 
@@ -135,7 +137,7 @@ def fit_lens(
     lens = points.varying()
     check_settings(lens.n_settings, len(lens.controls), lens.points.source)
     one_view = np.bincount(lens.view_setting).max() == 1
-    budget = Budget() if topologies is None else Budget(topologies=topologies)
+    budget = Budget(topologies=topologies)
     options = Options(
         training, camera == "still" or (camera == "auto" and bool(one_view)), skew, budget, seed
     )
@@ -219,15 +221,18 @@ def _choose_model(lens: LensPoints, options: Options, reject: bool, report: Prog
             continue
         report(f"trying distortion {model}", 0.5)
         error_px = _held_out(start, options)
-        if best is not None and not error_px < _WORTH * best[0]:
-            if model == "k1k2":  # its second coefficient may need the tangential ones
-                continue
-            break
-        best = (error_px, start)
+        if best is None or (_explains_more(start, best[1]) and error_px < _WORTH * best[0]):
+            best = (error_px, start)
     if best is None:
         assert failure is not None
         raise failure
     return best[1]
+
+
+def _explains_more(rich: _Start, simple: _Start) -> bool:
+    """Whether the residual variance falls by more than chance makes it."""
+    freedom = 2 * len(rich.lens.points)
+    return rich.variance < simple.variance * (1 - _CHANCE * np.sqrt(2 / freedom))
 
 
 def _held_out(start: _Start, options: Options) -> float:
@@ -259,7 +264,7 @@ def _learn(start: _Start, options: Options, reject: bool, report: Progress) -> t
         joints = _train(start, options, options.budget, report)
         if not reject or len(start.rejected) >= max(1, start.lens.n_settings // 5):
             return start, joints
-        suspect = doubtful(left_out_errors(_scaled(start.lens), joints[0], start.tables, start.variance))
+        suspect = doubtful(_left_out(start, joints[0]))
         if suspect is None:
             return start, joints
         keep = np.arange(start.lens.n_settings) != suspect
@@ -316,6 +321,11 @@ def _scatter(nets: LensNets, tables: Tables) -> Array:
     return scatter
 
 
+def _left_out(start: _Start, joint: Joint) -> LeftOut:
+    scatter = _scatter(joint.nets, start.tables)
+    return left_out_errors(_scaled(start.lens), joint, start.tables, start.variance, scatter)
+
+
 def _provisional(start: _Start, joints: list[Joint], options: Options) -> ActiveLens:
     """A lens without the figures that only a finished one needs."""
     scatter = np.min([_scatter(joint.nets, start.tables) for joint in joints], axis=0)
@@ -364,7 +374,7 @@ def _assemble(start: _Start, joints: list[Joint], options: Options, points: Lens
     constants = replace(constants, theta=float(np.mean([joint.constants.theta for joint in joints])))
     there, _ = start.data.linearise(local, constants)
     rmse = np.sqrt(there.cost / start.data.counts)
-    errors = [left_out_errors(x, joint, start.tables, start.variance) for joint in joints]
+    errors = [_left_out(start, joint) for joint in joints]
     # Linear in the weights is an approximation that fails for a member now and then: the median holds.
     squares = np.median([e.pixels**2 for e in errors], axis=0)
     left_out = float(np.sqrt((squares * start.data.counts).sum() / len(start.lens.points)))

@@ -105,7 +105,7 @@ def fit_lens_cameras(
     low, high = cameras.settings.min(axis=0), cameras.settings.max(axis=0)
     x = 2 * (cameras.settings - low) / (high - low) - 1
     L, S = len(cameras.names), len(x)
-    budget = Budget() if topologies is None else Budget(topologies=topologies)
+    budget = Budget(topologies=topologies)
     empty = Normal(np.zeros((0, L, L)), np.zeros((0, L)), np.zeros(0), True)
     members = fit_committee(
         x,

@@ -10,7 +10,7 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["grid_axes", "lookup_matrix", "monomials", "spline_matrix", "thin_plate_matrix"]
+__all__ = ["grid_axes", "lookup_matrix", "monomials", "powers_up_to", "spline_matrix", "thin_plate_matrix"]
 
 
 def grid_axes(x: Array) -> list[Array] | None:
@@ -48,17 +48,17 @@ def thin_plate_matrix(nodes: Array, x: Array) -> Array:
     return np.asarray(np.linalg.lstsq(system, right.T, rcond=None)[0][:S].T)
 
 
-def monomials(x: Array, degree: int) -> Array:
-    """Products of powers of the controls up to a total degree; (n, K)."""
-    columns = [np.ones(len(x))]
-    powers = [(0,) * x.shape[1]]
-    for total in range(1, degree + 1):
-        for first in range(total + 1):
-            power = (total,) if x.shape[1] == 1 else (total - first, first)
-            if power not in powers:
-                powers.append(power)
-                columns.append(np.prod(x ** np.array(power), axis=1))
-    return np.column_stack(columns)
+def powers_up_to(nodes: Array, degree: int) -> Array:
+    """Powers of the controls (K, D) up to a total degree, as far as the settings (S, D) tell them apart."""
+    most = [len(np.unique(column)) - 1 for column in nodes.T]
+    ranges = np.meshgrid(*[np.arange(min(limit, degree) + 1) for limit in most], indexing="ij")
+    powers = np.stack(ranges, axis=-1).reshape(-1, nodes.shape[1])
+    return np.asarray(powers[powers.sum(axis=1) <= degree])
+
+
+def monomials(x: Array, powers: Array) -> Array:
+    """Products of powers (K, D) of the controls (n, D); (n, K)."""
+    return np.asarray(np.prod(x[:, None] ** powers, axis=2))
 
 
 def _tensor(matrices: list[Array]) -> Array:

@@ -17,6 +17,7 @@ import numpy as np
 from neurocal_cli.active_lens.blocks import Constants, Normal, PixelData
 from neurocal_cli.active_lens.nets import LensNets
 from neurocal_cli.active_lens.static import scaled_solve
+from neurocal_cli.active_lens.training import followed
 from neurocal_cli.geometry import Array
 
 __all__ = ["Joint", "JointLearner", "gauss_newton", "loosened", "posterior", "train_joint"]
@@ -195,7 +196,7 @@ class JointLearner:
             here = leverage[start : start + P]
             effective = np.maximum(kinds.sum(axis=1) - net.precision * (kinds @ here), 1e-3)
             squares = np.maximum(kinds @ net.weights**2, 1e-12)
-            target = np.clip(effective / squares, 1e-3, 1e4)
+            target = followed(effective, squares, self.x)
             nets.append(replace(net, precision=np.sqrt(net.precision * target)))
             start += P
         self.nets = replace(self.nets, nets=tuple(nets))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neurocal_cli.active_lens.joint import Joint
+from neurocal_cli.active_lens.joint import Joint, loosened
 from neurocal_cli.active_lens.static import Tables, scaled_solve
 from neurocal_cli.geometry import Array
 
@@ -34,7 +34,7 @@ class LeftOut:
     surprise: Array
 
 
-def left_out_errors(x: Array, joint: Joint, tables: Tables, variance: float) -> LeftOut:
+def left_out_errors(x: Array, joint: Joint, tables: Tables, variance: float, scatter: Array) -> LeftOut:
     """Predict each setting from all others.
 
     Parameters
@@ -43,6 +43,8 @@ def left_out_errors(x: Array, joint: Joint, tables: Tables, variance: float) -> 
     joint : Joint
     tables : Tables
     variance : float [px^2]
+    scatter : (L,) array
+        Of the local parameters from setting to setting.
     """
     local, jacobians = joint.nets.local_with_jacobians(x)
     J = np.concatenate(jacobians, axis=2)
@@ -52,11 +54,12 @@ def left_out_errors(x: Array, joint: Joint, tables: Tables, variance: float) -> 
     spread = J @ joint.covariance[:P, :P] @ np.swapaxes(J, 1, 2)
     # With constants of its own, a lens may differ from the tables everywhere alike; that is small.
     error = local - tables.local
-    K = spread @ H / variance
+    K = spread @ loosened(normal, scatter, variance).H[:, :L, :L] / variance
     remain = np.eye(L) - K
     out = np.asarray(np.linalg.solve(remain, error[..., None]), dtype=np.float64)
     spread_out = np.linalg.solve(remain, spread)
-    expected = spread_out + variance * scaled_solve(H, np.tile(np.eye(L), (S, 1, 1)))
+    own = variance * scaled_solve(H, np.tile(np.eye(L), (S, 1, 1))) + np.diag(scatter)
+    expected = np.asarray(spread_out + own)
     surprise = (out * scaled_solve(expected, np.asarray(out))).sum(axis=(1, 2)) / L
     squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
     counts = np.maximum(

@@ -18,6 +18,7 @@ from neurocal_cli.active_lens.interpolation import (
     grid_axes,
     lookup_matrix,
     monomials,
+    powers_up_to,
     spline_matrix,
     thin_plate_matrix,
 )
@@ -56,19 +57,20 @@ def rivals_of(lens: ActiveLens, scale: str | None = None) -> dict[str, Rival]:
             rivals[f"spline{suffix}"] = _through(table, scale, partial(spline_matrix, axes))
         if x.shape[1] > 1 and len(x) >= 4:
             rivals[f"thin_plate{suffix}"] = _through(table, scale, partial(thin_plate_matrix, x))
-    for degree in _degrees(x):
-        rivals[f"polynomial_{degree}"] = _polynomial(lens.static, lens.variance, scale, x, degree)
+    for degree, powers in _degrees(x):
+        rivals[f"polynomial_{degree}"] = _polynomial(lens.static, lens.variance, scale, x, powers)
         if not lens.known:
-            rivals[f"polynomial_{degree}_joint"] = _joint_polynomial(lens, scale, x, degree)
+            rivals[f"polynomial_{degree}_joint"] = _joint_polynomial(lens, scale, x, powers)
     return rivals
 
 
-def _degrees(x: Array) -> Iterator[int]:
-    """Degrees whose coefficients the settings determine."""
+def _degrees(x: Array) -> Iterator[tuple[int, Array]]:
+    """Degrees, and powers of the controls, whose coefficients the settings determine."""
     for degree in range(1, _MOST_DEGREE + 1):
-        Phi = monomials(x, degree)
-        if Phi.shape[1] < len(x) and np.linalg.matrix_rank(Phi) == Phi.shape[1]:
-            yield degree
+        powers = powers_up_to(x, degree)
+        enough = powers.sum(axis=1).max() == degree and len(powers) < len(x)
+        if enough and np.linalg.matrix_rank(monomials(x, powers)) == len(powers):
+            yield degree, powers
 
 
 def _through(table: TableRecord, scale: str, matrix: Callable[[Array], Array]) -> Rival:
@@ -76,13 +78,13 @@ def _through(table: TableRecord, scale: str, matrix: Callable[[Array], Array]) -
     return lambda to: (outputs_to_local(scale, matrix(to) @ outputs)[0], table.constants)
 
 
-def _polynomial(table: TableRecord, variance: float, scale: str, x: Array, degree: int) -> Rival:
+def _polynomial(table: TableRecord, variance: float, scale: str, x: Array, powers: Array) -> Rival:
     """Each parameter by itself, weighted by the variances of the static calibrations."""
     outputs, by_local = local_to_outputs(scale, table.local)
     L = outputs.shape[1]
     inverse = scaled_solve(table.normal.H[:, :L, :L], np.tile(np.eye(L), (len(x), 1, 1)))
     spread = variance * np.einsum("sij,sjk,sik->si", by_local, inverse, by_local)
-    Phi = monomials(x, degree)
+    Phi = monomials(x, powers)
     weight = 1 / np.sqrt(np.maximum(spread, 1e-300))
     coefficients = np.column_stack(
         [
@@ -90,13 +92,13 @@ def _polynomial(table: TableRecord, variance: float, scale: str, x: Array, degre
             for y, w in zip(outputs.T, weight.T, strict=True)
         ]
     )
-    return lambda to: (outputs_to_local(scale, monomials(to, degree) @ coefficients)[0], table.constants)
+    return lambda to: (outputs_to_local(scale, monomials(to, powers) @ coefficients)[0], table.constants)
 
 
-def _joint_polynomial(lens: ActiveLens, scale: str, x: Array, degree: int) -> Rival:
+def _joint_polynomial(lens: ActiveLens, scale: str, x: Array, powers: Array) -> Rival:
     """All parameters and the constants together, by Gauss-Newton steps on the normal matrices."""
     table = lens.tables
-    Phi = monomials(x, degree)
+    Phi = monomials(x, powers)
     outputs, _ = local_to_outputs(scale, table.local)
     S, L = outputs.shape
     K, Q = Phi.shape[1], table.normal.H.shape[1] - L
@@ -112,4 +114,4 @@ def _joint_polynomial(lens: ActiveLens, scale: str, x: Array, degree: int) -> Ri
         step = scaled_solve(N[None], np.einsum("sap,sa->p", J, pull)[None, :, None])[0, :, 0]
         c, shared = c + step[: K * L].reshape(K, L), shared + step[K * L :]
     constants = table.constants.moved(shared) if Q else table.constants
-    return lambda to: (outputs_to_local(scale, monomials(to, degree) @ c)[0], constants)
+    return lambda to: (outputs_to_local(scale, monomials(to, powers) @ c)[0], constants)

@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 from neurocal_cli.active_lens.mlfn import Topology, respond_with_jacobian
 from neurocal_cli.geometry import Array
 
-__all__ = ["Schedule", "Trained", "prior_precision", "train"]
+__all__ = ["Schedule", "Trained", "followed", "is_sparse", "prior_precision", "train"]
 
 _FLAT = 1e-4  # precision of the weights that are free: a std of 100 spreads of the targets
-_LEAST, _MOST = 1e-3, 1e4  # precisions of the priors
+_MOST = 1e4  # precision of a prior
+_LEAST, _LEAST_SPARSE = 0.03, 1.0
+_ENOUGH_VALUES = 4
 _DAMPING = (1e-10, 1e8)
 
 
@@ -68,6 +70,21 @@ class Trained:
     precision: Array
     scatter: Array
     evidence: Array
+
+
+def is_sparse(x: Array) -> bool:
+    """Whether a control has too few different values in the settings (S, D) to tell how it bends."""
+    return min(len(np.unique(column)) for column in x.T) < _ENOUGH_VALUES
+
+
+def followed(effective: Array, squares: Array, x: Array) -> Array:
+    """Precision that MacKay's rule gives a prior, within limits.
+
+    Data that leave a direction open do not shrink weights along it. So priors stay narrower than 6
+    standard units, and than 1 where a unit could turn between two of three values, seen by nobody.
+    """
+    least = _LEAST_SPARSE if is_sparse(x) else _LEAST
+    return np.clip(effective / squares, least, _MOST)
 
 
 def prior_precision(topology: Topology, precision: Array) -> Array:
@@ -141,7 +158,8 @@ class _Learner:
 
     def begin(self, precision: Array | None, scatter: Array | None) -> None:
         B = len(self.w)
-        self.a = np.full((B, self.topology.n_groups), 0.3) if precision is None else precision
+        first = 1.0 if is_sparse(self.x) else 0.3
+        self.a = np.full((B, self.topology.n_groups), first) if precision is None else precision
         # Of targets without a variance, a thousandth of their spread until the noise is told.
         unknown = 1e-6 if not self.variance.any() else 0.0
         self.tau2 = np.full(B, unknown) if scatter is None else scatter
@@ -183,7 +201,7 @@ class _Learner:
         leverage = np.diagonal(np.linalg.inv(self._normal()), axis1=1, axis2=2)
         effective = np.maximum(self.sizes - self.a * (leverage @ self.kinds.T), 1e-3)
         squares = np.maximum((self.w * self.w) @ self.kinds.T, 1e-12)
-        self.a = np.sqrt(self.a * np.clip(effective / squares, _LEAST, _MOST))
+        self.a = np.sqrt(self.a * followed(effective, squares, self.x))
         if allow_scatter:
             gamma = self.topology.n_weights - (self.prior * leverage).sum(axis=1)
             self._follow_scatter(np.maximum(self.count - gamma, 0.05 * self.count))
@@ -195,7 +213,7 @@ class _Learner:
         total = self.variance + self.tau2[:, None]
         ratio = (squares / total).sum(axis=1) / freedom
         known = self.variance.any()
-        least = 1e-4 * float(np.median(self.variance)) if known else 1e-12
+        least = 1e-4 * float(np.median(self.variance)) if known else 1e-8
         seed = np.where(self.tau2 > 0, self.tau2, np.median(self.variance) * np.maximum(ratio - 1, 0))
         self.tau2 = seed * np.clip(ratio, 0.1, 10.0)
         self.tau2 = np.where(self.tau2 < least, 0.0 if known else least, self.tau2)
