@@ -45,8 +45,8 @@ def columns(lens: LensPoints) -> dict[str, np.ndarray]:
 
 def test_a_smooth_lens_is_known_between_its_settings() -> None:
     evaluation = evaluate_lens(smooth(), seen("c", between(5, 3), seed=2))
-    assert evaluation.rmse_px < 1.05 * FLOOR
-    assert evaluation.rmse_px < evaluation.rivals["lookup_joint"]
+    assert evaluation.rmse_px < 1.12 * FLOOR  # 15 settings are few
+    assert evaluation.rmse_px < 0.5 * evaluation.rivals["lookup_joint"]
     assert smooth().converged
     assert smooth().rmse_px == pytest.approx(FLOOR, rel=0.05)
     assert not smooth().rejected
@@ -100,7 +100,7 @@ def test_distortion_is_chosen_and_follows_the_zoom() -> None:
     true = -0.25 + 0.32 * (between(5, 3)[:, 0] - LOW[0]) / (HIGH[0] - LOW[0])
     np.testing.assert_allclose(k1, true, atol=0.03)
     evaluation = evaluate_lens(lens, seen("c", between(5, 3), seed=10, bends=True))
-    assert evaluation.rmse_px < 1.06 * FLOOR
+    assert evaluation.rmse_px < 1.12 * FLOOR
 
 
 def test_no_distortion_is_chosen_where_there_is_none() -> None:
@@ -116,7 +116,7 @@ def test_a_setting_with_wrong_pixels_is_left_out() -> None:
     lens = fit_lens(spoilt, distortion="none", topologies=FEW)
     assert [r.setting for r in lens.rejected] == [tuple(points.settings[7])]
     assert any("left out" in warning for warning in lens.warnings)
-    assert evaluate_lens(lens, seen("c", between(5, 3), seed=13)).rmse_px < 1.1 * FLOOR
+    assert evaluate_lens(lens, seen("c", between(5, 3), seed=13)).rmse_px < 1.15 * FLOOR
     kept = fit_lens(spoilt, distortion="none", topologies=((0, 2),), outliers="keep")
     assert not kept.rejected
     assert kept.rmse_px > 3 * lens.rmse_px

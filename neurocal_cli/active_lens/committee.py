@@ -22,7 +22,7 @@ from neurocal_cli.active_lens.blocks import Normal
 from neurocal_cli.active_lens.mlfn import Topology
 from neurocal_cli.active_lens.nets import SCALES, LensNets, ParameterNet, to_scale
 from neurocal_cli.active_lens.static import scaled_solve
-from neurocal_cli.active_lens.training import Schedule, is_sparse, train
+from neurocal_cli.active_lens.training import Schedule, sparse_controls, train
 from neurocal_cli.geometry import Array
 
 __all__ = ["TOPOLOGIES", "Budget", "fit_committee", "suitable_topologies"]
@@ -134,7 +134,7 @@ def fit_committee(
 def suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
     """Topologies that are worth trying on settings (S, D): hardly more weights than settings."""
     limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
-    choices = _SPARSE if is_sparse(x) else TOPOLOGIES
+    choices = _SPARSE if sparse_controls(x).any() else TOPOLOGIES
     return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
 
 

@@ -20,6 +20,7 @@ __all__ = ["LensCameras", "fit_lens_cameras"]
 
 _INTRINSIC = ("alpha_u", "alpha_v", "u0", "v0")
 _MEMBERS = 4
+_EXACT = 1e-6  # share of itself to which a parameter counts as given, if it does not scatter at all
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +148,10 @@ def fit_lens_cameras(
 def _scatter_normal(members: tuple[LensNets, ...], local: Array) -> Normal:
     """Inverse covariances of the given parameters, from the scatter about the networks."""
     scatter = np.median([[net.scatter for net in nets.nets] for nets in members], axis=0)
-    _, by_local = local_to_outputs(members[0].scale, local)
+    outputs, by_local = local_to_outputs(members[0].scale, local)
+    size = np.abs(np.median(outputs, axis=0))
+    size[1] = 1.0  # log(alpha_v / alpha_u): a ratio of 1 is 0
+    scatter = np.maximum(scatter, (_EXACT * size) ** 2)
     H = np.swapaxes(by_local, 1, 2) @ (by_local / scatter[:, None])
     H = np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2)  # exactly symmetric, as a file of it will be
     S, L = local.shape

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from neurocal_cli.active_lens.mlfn import Topology, respond_with_jacobian
 from neurocal_cli.geometry import Array
 
-__all__ = ["Schedule", "Trained", "followed", "is_sparse", "prior_precision", "train"]
+__all__ = ["Schedule", "Trained", "followed", "prior_precision", "sparse_controls", "train"]
 
 _FLAT = 1e-4  # precision of the weights that are free: a std of 100 spreads of the targets
 _MOST = 1e4  # precision of a prior
@@ -72,18 +72,20 @@ class Trained:
     evidence: Array
 
 
-def is_sparse(x: Array) -> bool:
-    """Whether a control has too few different values in the settings (S, D) to tell how it bends."""
-    return min(len(np.unique(column)) for column in x.T) < _ENOUGH_VALUES
+def sparse_controls(x: Array) -> NDArray[np.bool_]:
+    """(D,) which controls have too few different values in the settings (S, D) to tell how they bend."""
+    return np.array([len(np.unique(column)) < _ENOUGH_VALUES for column in x.T])
 
 
 def followed(effective: Array, squares: Array, x: Array) -> Array:
-    """Precision that MacKay's rule gives a prior, within limits.
+    """Precision that MacKay's rule gives each prior (..., G), within limits.
 
     Data that leave a direction open do not shrink weights along it. So priors stay narrower than 6
-    standard units, and than 1 where a unit could turn between two of three values, seen by nobody.
+    standard units; and those of weights from a control of three values than 1, or a unit could turn
+    between two of them, seen by nobody.
     """
-    least = _LEAST_SPARSE if is_sparse(x) else _LEAST
+    least = np.full(effective.shape[-1], _LEAST)
+    least[2 : 2 + x.shape[1]][sparse_controls(x)] = _LEAST_SPARSE
     return np.clip(effective / squares, least, _MOST)
 
 
@@ -158,8 +160,7 @@ class _Learner:
 
     def begin(self, precision: Array | None, scatter: Array | None) -> None:
         B = len(self.w)
-        first = 1.0 if is_sparse(self.x) else 0.3
-        self.a = np.full((B, self.topology.n_groups), first) if precision is None else precision
+        self.a = np.full((B, self.topology.n_groups), 0.3) if precision is None else precision
         # Of targets without a variance, a thousandth of their spread until the noise is told.
         unknown = 1e-6 if not self.variance.any() else 0.0
         self.tau2 = np.full(B, unknown) if scatter is None else scatter
