@@ -94,7 +94,7 @@ def test_settings_need_no_grid() -> None:
 
 
 def test_distortion_is_chosen_and_follows_the_zoom() -> None:
-    lens = fit_lens(seen("c", grid(5, 3), seed=9, bends=True), topologies=FEW)
+    lens = fit_lens(seen("c", grid(5, 3), seed=9, bends=True), topologies=((0, 2),))
     assert lens.model == "k1"
     k1 = lens.predict(between(5, 3)).local[:, -1]
     true = -0.25 + 0.32 * (between(5, 3)[:, 0] - LOW[0]) / (HIGH[0] - LOW[0])
@@ -133,6 +133,7 @@ def test_a_setting_under_a_wrong_name_is_left_out() -> None:
     assert "standard deviations" in lens.rejected[0].reason
 
 
+@pytest.mark.slow
 def test_nothing_is_left_out_of_a_lens_that_bends_sharply() -> None:
     lens = fit_lens(seen("a", grid(7, 5), seed=15, side=5), distortion="none", topologies=((1, 2), (2, 2)))
     assert not lens.rejected
@@ -223,7 +224,7 @@ def test_known_cameras_are_followed_and_their_noise_is_told() -> None:
         "u0": 640 + rng.normal(size=30),
         "v0": np.full(30, 480.0),
     }
-    lens = fit_lens_cameras(LensCameras.of(table))
+    lens = fit_lens_cameras(LensCameras.of(table), topologies=((1, 0), (1, 1)))
     assert lens.known
     prediction = lens.predict(zoom[:, None])
     assert np.sqrt(np.mean((prediction.local[:, 0] / (100 * zoom) - 1) ** 2)) < 0.012

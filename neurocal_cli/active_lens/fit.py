@@ -35,8 +35,8 @@ __all__ = ["CAMERAS", "DISTORTIONS", "OUTLIERS", "TRAININGS", "fit_lens"]
 TRAININGS = ("joint", "alternating")
 OUTLIERS = ("reject", "keep")
 CAMERAS = ("auto", "still", "moving")
-DISTORTIONS = (*MODELS, "auto")
-LADDER = ("none", "k1", "k1k2", "plumb_bob")  # what auto chooses from
+DISTORTIONS = ("auto", *MODELS)
+LADDER = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")  # what auto chooses from
 
 _QUICK = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
 _WORTH = 0.98  # a richer lens model must lower the held-out error to this share of it ...
@@ -95,9 +95,9 @@ def fit_lens(
     points : LensPoints
         One camera that stands still before a target that is not flat, or a board in several views at
         each setting.
-    distortion : {"auto", "none", "k1", "k1k2", "plumb_bob", "rational", "fisheye"}
+    distortion : {"auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye"}
         The lens model; each coefficient gets a network. "auto" takes the first of none, k1, k1k2,
-        plumb_bob on which a richer one does not improve at settings that are held out.
+        k1k2p1p2, plumb_bob on which a richer one does not improve at settings that are held out.
     training : {"joint", "alternating"}
         The last step: all weights at once, or the networks and the calibrating net in turns.
     outliers : {"reject", "keep"}

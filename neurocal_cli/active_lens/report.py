@@ -35,8 +35,8 @@ def lens_report(lens: ActiveLens) -> str:
         tail.append(f"scatter of the cameras about the networks: {_scatter_text(lens, scatter)}")
     else:
         tail.append(
-            f"error: rms {lens.rmse_px:.4f} px; noise explains {np.sqrt(2 * lens.variance):.4f} px; "
-            f"each setting left out in turn: {lens.left_out_px:.4f} px"
+            f"error: rms {lens.rmse_px:.3f} px; noise explains {np.sqrt(2 * lens.variance):.3f} px; "
+            f"each setting left out in turn: {lens.left_out_px:.3f} px"
         )
     tail.append(
         f"committee of {len(lens.members)}, alpha on a {_scale_text(lens)} scale, trained {_training(lens)}"
@@ -152,4 +152,4 @@ def _or_zero(value: float) -> float:
 
 
 def _pixels(value: float) -> str:
-    return f"{value:.4f}" if math.isfinite(value) else "-"
+    return f"{value:.3f}" if math.isfinite(value) else "-"

@@ -78,7 +78,7 @@ def lens() -> None:
 )
 @click.option(
     "--distortion",
-    type=click.Choice(["auto", "none", "k1", "k1k2", "plumb_bob", "rational", "fisheye"]),
+    type=click.Choice(["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye"]),
     default="auto",
     help="Lens model, a network for each coefficient; auto takes the simplest that settings held out "
     "do not deny.",
