@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rendered import condition, picture
 
-from neurocal_cli.detection import Grid
+from neurocal_cli.detection import Grid, find_levels
 from neurocal_cli.detection.finding import find_grids
 from neurocal_cli.geometry import Array
 from neurocal_cli.rendering import PlaneTruth, Rectangle, render, scene_bound
@@ -287,3 +287,10 @@ def test_a_board_in_two_halves_is_one_grid(seed: int) -> None:
     assert wrong == 0
     assert (hit | ~visible).all()
     assert len(grids) == 1
+
+
+def test_noise_of_large_pictures_is_found_in_bands(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = picture("noise 5", FIRST).image.astype(np.float32)
+    whole = find_levels.Level(image, 1).noise
+    monkeypatch.setattr(find_levels, "_LARGE", 0)
+    assert find_levels.Level(image, 1).noise == pytest.approx(whole, rel=0.1)

@@ -20,6 +20,8 @@ Image = NDArray[np.float32]
 
 _SMOOTHING = 1.0  # px; of the picture that is looked at, against noise and jagged edges
 _SMALLEST = 100  # px; the shorter side of the smallest level
+_LARGE = 30_000_000  # pixels of a picture whose noise is looked for in bands only ...
+_BANDS, _BAND = 24, 64  # ... of so many rows
 _LEAST_NOISE = 0.12  # DN of a second derivative; what rounding to 8 bits leaves
 
 
@@ -55,8 +57,14 @@ class Level:
     @cached_property
     def noise(self) -> float:
         """Standard deviation of the second derivatives where nothing is [DN/px^2]."""
-        sparse = np.abs(self.curvature[1][::4, ::4])
-        return max(float(np.median(sparse)) / 0.6745, _LEAST_NOISE)
+        if self.image.size <= _LARGE:
+            sparse = self.curvature[1][::4, ::4]
+        else:
+            # Bands tell as much, and the derivatives of such a picture would fill the memory.
+            first = np.linspace(0, len(self.image) - _BAND, _BANDS).astype(int)
+            bands = [Level(self.image[v : v + _BAND], self.scale).curvature[1] for v in first]
+            sparse = np.concatenate([band[4:-4:4, ::4] for band in bands])
+        return max(float(np.median(np.abs(sparse))) / 0.6745, _LEAST_NOISE)
 
 
 def levels_of(image: NDArray[np.generic]) -> list[Level]:
