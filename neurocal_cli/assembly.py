@@ -13,6 +13,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.job import Solution
 from neurocal_cli.lens import Lens
 from neurocal_cli.observability import refuse_undetermined
+from neurocal_cli.odd_views import seen_from_behind
 from neurocal_cli.parameters import parameter_covariance, parameter_warnings, pose_std
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, intrinsic_matrix
@@ -41,7 +42,24 @@ def assemble(fit: Fit, rejected: Rejected, *, method: str, trainer: str, seed: i
         rejected=rejected,
         lens_choice=fit.lens_choice or {},
         straight_lines=fit.straight_lines,
-        warnings=(*found.warnings, *_rejection_warnings(rejected, len(fit.points))),
+        warnings=(
+            *found.warnings,
+            *_mirrored_warning(seen_from_behind(job.views, fit.solution.refined.state)),
+            *_rejection_warnings(rejected, len(fit.points)),
+        ),
+    )
+
+
+def _mirrored_warning(views: list[str]) -> tuple[str, ...]:
+    """A flat target that is mirrored gives the right camera, but a wrong pose."""
+    if not views:
+        return ()
+    names = ", ".join(map(repr, views[:_NAMED])) + (
+        f" and {len(views) - _NAMED} more" * (len(views) > _NAMED)
+    )
+    return (
+        f"the target is seen from its other side in {names}, as if mirrored: the poses of these views are "
+        "wrong; check the order of their points",
     )
 
 

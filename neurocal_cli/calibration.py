@@ -12,7 +12,7 @@ from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Calibration", "NetworkRecord", "Rejected", "StopReason", "StraightLines", "ViewResult"]
+__all__ = ["Calibration", "NetworkRecord", "Rejected", "StopReason", "StraightLines", "Verdict", "ViewResult"]
 
 
 class StopReason(str, Enum):
@@ -131,6 +131,28 @@ class Rejected:
         return len(self.error_px)
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """One word on a calibration, and why.
+
+    Attributes
+    ----------
+    word : str
+        "good", "usable" or "poor".
+    reasons : tuple of str
+        What speaks against it, the worst first; none when it is good.
+    advice : tuple of str
+        What to do next.
+    measures : dict of float
+        What it rests on (`judgement.Evidence`); nan for what cannot be told.
+    """
+
+    word: str
+    reasons: tuple[str, ...]
+    advice: tuple[str, ...]
+    measures: Mapping[str, float]
+
+
 @dataclass(frozen=True, eq=False)
 class Calibration:
     """A calibrated camera.
@@ -146,6 +168,8 @@ class Calibration:
     points : Correspondences
         What it was calibrated from, without what was rejected.
     rejected : Rejected
+    verdict : Verdict or None
+        Of `judgement.judged`, where it was asked for.
     lens_choice : dict of float by lens model [px]
         The models that ``distortion="auto"`` chose from and their rms error on data left out.
     covariance : (n, n) array
@@ -178,6 +202,7 @@ class Calibration:
     warnings: tuple[str, ...] = ()
     rejected: Rejected = field(default_factory=Rejected)
     lens_choice: Mapping[str, float] = field(default_factory=dict)
+    verdict: Verdict | None = None
 
     @property
     def n_rejected(self) -> int:

@@ -91,6 +91,8 @@ class _Search:
         self.scale = np.full(K, np.inf)
         self.near = np.zeros((K, n), dtype=bool)
         self.agreed = np.zeros(K, dtype=np.int64)
+        seen = np.where(self.real[..., None], self.patterns.targets[..., :2], np.nan)
+        self.spread = np.sqrt(np.nanvar(seen, axis=1).sum(axis=1))
 
     def run(self) -> None:
         open_views = np.arange(len(self.members))
@@ -149,7 +151,8 @@ class _Search:
     def _enter(self, which: NDArray[np.intp], product: Array, scale: Array, near: NDArray[np.bool_]) -> None:
         """Enter one start of each view: the one with the lowest median stays."""
         same = ((near == self.near[which]) | ~self.real[which]).sum(1) >= _AGREED * near.shape[1]
-        same &= np.isfinite(self.scale[which])
+        # Starts that lost their way may agree too: that everything is near.
+        same &= self.scale[which] < _TIGHT * self.spread[which]
         better = scale < self.scale[which]
         self.agreed[which] = np.where(same, self.agreed[which] + 1, np.where(better, 1, self.agreed[which]))
         won = which[better]

@@ -44,6 +44,8 @@ class Fit:
         What `auto` chose from.
     straight_lines : StraightLines or None
         Of `plumb-line`.
+    refusal : str
+        Why this is no answer, if so.
     """
 
     job: Job
@@ -52,6 +54,7 @@ class Fit:
     share: float = 0.0
     lens_choice: dict[str, float] | None = None
     straight_lines: StraightLines | None = None
+    refusal: str = ""
 
     @property
     def seen(self) -> Seen:
@@ -119,14 +122,14 @@ class Fitter:
 
     def _finished(self, job: Job, solution: Solution, points: Correspondences) -> Fit:
         """With its lens, and weights that the residuals bear out."""
-        choice = None
+        choice, refusal = None, ""
         if self.lens == "auto":
             found = choose_lens(job, solution, points, lambda: self._bent_start(job.views))
-            job, solution, choice = found.job, found.solution, found.held_out_px
+            job, solution, choice, refusal = found.job, found.solution, found.held_out_px, found.refusal
         job, solution, share = reweighted(job, solution, points)
         if self.lens != "auto":
             job, solution = check_lens(job, solution, points)
-        return Fit(job, solution, points, share, choice)
+        return Fit(job, solution, points, share, choice, refusal=refusal)
 
     def _with_first_lens(self, views: Views) -> Job | None:
         known = supported(self.known, _FIRST_LENS, views)

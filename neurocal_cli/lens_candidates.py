@@ -23,9 +23,12 @@ from neurocal_cli.views import Views
 __all__ = ["Candidate", "fit_candidates", "supported"]
 
 _MODELS = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye")
-_FISHEYE_TAIL = frozenset({"k3", "k4"})  # of use only when the view is wide and the points many
+# A fisheye's coefficients beyond the first few are of use only when the points reach far out.
+_FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
 # What each model has more than a simpler one.
 _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
+_CHAIN = ("k1", "k1k2", "k1k2p1p2", "plumb_bob")  # each with coefficients that the one before lacks
+_BEHIND = 1.5  # times the squared error
 _PAYS = 0.99  # of the squared error that more coefficients must be below
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
 _SPARE = 1.3  # equations for each unknown
@@ -100,25 +103,54 @@ def fit_candidates(
         known = supported(job.known, model, job.views)
         if known is None or (model == "fisheye" and reach < _WIDE):
             continue
-        start = replace(state, lens=model, k=_coefficients(state, model, reach))
-        candidate = _fit(job, known, start, points, by_views, reach)
         if model == "fisheye":
-            shorter = replace(known, fixed=known.fixed | _FISHEYE_TAIL)
-            start = replace(start, k=_coefficients(state, model, reach, 2))
-            candidate = _simpler(_fit(job, shorter, start, points, by_views, reach), candidate)
+            candidate = _fit_fisheye(job, known, state, points, by_views, reach)
+        else:
+            start = replace(state, lens=model, k=_coefficients(state, model, reach))
+            candidate = _fit(job, known, start, points, by_views, reach)
         if candidate is None:
             continue
         fitted[model] = candidate
         if model != "none" and candidate.folds is None:
             state = candidate.refined.state
+    for simple, more in zip(_CHAIN[-2::-1], _CHAIN[:0:-1], strict=True):
+        _fit_again(job, simple, more, fitted, points, by_views, reach)
     return fitted
 
 
-def _simpler(short: Candidate | None, whole: Candidate | None) -> Candidate | None:
-    """The one with fewer coefficients, unless the other is sound and predicts better."""
-    if short is None or whole is None:
-        return short or whole
-    return whole if whole.sound and whole.lost.sum() < _PAYS * short.lost.sum() else short
+def _fit_again(
+    job: Job,
+    simple: str,
+    more: str,
+    fitted: dict[str, Candidate],
+    points: Correspondences,
+    by_views: bool,
+    reach: float,
+) -> None:
+    """A model that is far behind one with more coefficients may have lost its way: begin there."""
+    if simple not in fitted or more not in fitted or fitted[simple].cost < _BEHIND * fitted[more].cost:
+        return
+    known, state = fitted[simple].known, fitted[more].refined.state
+    start = replace(state, lens=simple, k=_coefficients(state, simple, reach))
+    candidate = _fit(job, known, start, points, by_views, reach)
+    if candidate is not None and candidate.cost < fitted[simple].cost:
+        fitted[simple] = candidate
+
+
+def _fit_fisheye(
+    job: Job, known: Known, state: CameraState, points: Correspondences, by_views: bool, reach: float
+) -> Candidate | None:
+    """With as few coefficients as predict well."""
+    best: Candidate | None = None
+    for count, tail in _FISHEYES:
+        some = replace(known, fixed=known.fixed | tail)
+        start = replace(state, lens="fisheye", k=_coefficients(state, "fisheye", reach, count))
+        candidate = _fit(job, some, start, points, by_views, reach)
+        if candidate is None or (best is not None and best.sound and not candidate.sound):
+            continue
+        if best is None or not best.sound or candidate.lost.sum() < _PAYS * best.lost.sum():
+            best = candidate
+    return best
 
 
 def _fit(

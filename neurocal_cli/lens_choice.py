@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.leave_out import held_out_views
 from neurocal_cli.lens_candidates import Candidate, fit_candidates
@@ -46,11 +45,14 @@ class LensChoice:
     solution : Solution
     held_out_px : dict of float by model [px]
         Rms error on data left out; of the models that could be fitted.
+    refusal : str
+        Why there is no answer, if so.
     """
 
     job: Job
     solution: Solution
     held_out_px: dict[str, float]
+    refusal: str = ""
 
 
 def choose_lens(
@@ -69,10 +71,10 @@ def choose_lens(
     more_starts : callable
         Other states to begin with, where the first leads to nothing that explains the points.
 
-    Raises
-    ------
-    DegenerateGeometryError
-        The lens bends strongly, and what fits folds back inside the image.
+    Returns
+    -------
+    LensChoice
+        With a refusal where the lens bends strongly, and what fits folds back inside the image.
     """
     views, by_views = job.views, _views_can_spare_any(job, solution)
     fitted = fit_candidates(job, solution.refined.state, points, by_views)
@@ -86,11 +88,11 @@ def choose_lens(
     if "none" in fitted and not fitted["none"].determined and not _falls_short(views, {"": fitted["none"]}):
         fitted = {"none": fitted["none"]}  # a lens would only hide that the points leave the camera open
     chosen = fitted[_best(fitted, views)]
-    _refuse_fold(fitted, chosen)
     job.tally.refinements += chosen.refined.iterations
     n, px = len(views.index), views.pixel_scale
     table = {name: float(np.sqrt(c.lost.sum() / n)) * px for name, c in fitted.items()}
-    return LensChoice(replace(job, known=chosen.known), Solution(chosen.refined, job.tally), table)
+    refined = Solution(chosen.refined, job.tally)
+    return LensChoice(replace(job, known=chosen.known), refined, table, _refusal(fitted, chosen))
 
 
 def _views_can_spare_any(job: Job, solution: Solution) -> bool:
@@ -141,12 +143,13 @@ def _criterion(candidate: Candidate, n: float) -> float:
     return float(n * np.log(max(candidate.cost, 1e-300)) + penalty)
 
 
-def _refuse_fold(fitted: dict[str, Candidate], chosen: Candidate) -> None:
-    """Refuse to take a simpler model where only one that folds back fits."""
+def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
+    """Say so where a simpler model was taken only because the one that fits folds back."""
     for model, candidate in fitted.items():
         folds = candidate.folds is not None and not candidate.noise
         if folds and chosen.lost.sum() > _FAR_WORSE**2 * candidate.lost.sum():
-            raise DegenerateGeometryError(
+            return (
                 f"the lens bends strongly, and the distortion {model} that fits the points folds back inside "
                 f"the {candidate.folds}; give points nearer to the image's corners, or choose a --distortion"
             )
+    return ""

@@ -115,6 +115,8 @@ def calibrate(
             fit, rejected = fit_robustly(points, fitter)
         else:
             fit, rejected = fitter.fit(points), Rejected()
+        if fit.refusal:
+            raise DegenerateGeometryError(fit.refusal)
         found = assemble(fit, rejected, trainer=trainer, method=method, seed=seed, name=camera_name)
         _refuse_misfit(found)
         return found

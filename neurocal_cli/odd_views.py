@@ -91,12 +91,11 @@ def free_networks(views: Views, state: CameraState) -> Array:
     return refine(views.tiles, own, free, True, _STEPS).cost
 
 
-def seen_from_behind(job: Job, solution: Solution) -> list[str]:
+def seen_from_behind(views: Views, state: CameraState) -> list[str]:
     """Views that show a flat target from the side that the other views do not show.
 
     Nobody sees through a board: its points are mirrored in those views (or in the others).
     """
-    views, state = job.views, solution.refined.state
     if views.n_views < _FEWEST or not views.nearly_flat.all():
         return []
     normal = views.basis[:, :, 2] * np.sign(views.basis[:, :, 2] @ views.basis[0, :, 2])[:, None]

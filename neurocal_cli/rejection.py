@@ -23,7 +23,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.fitting import Fit, Fitter
 from neurocal_cli.geometry import Array
 from neurocal_cli.noise import with_common_share
-from neurocal_cli.odd_views import find_odd_view, seen_from_behind
+from neurocal_cli.odd_views import find_odd_view
 from neurocal_cli.points import Correspondences
 from neurocal_cli.views import arrange
 
@@ -109,6 +109,11 @@ class _Search:
             return
         if failure is not None:
             raise failure
+        if len(self.wrong_views) == self.points.n_views:
+            raise DegenerateGeometryError(
+                "in no view do points and pixels belong together, as far as their noise lets one tell; check "
+                "that each pixel belongs to its point, and the order of the columns"
+            )
         raise DegenerateGeometryError(
             f"{100 * (1 - share):.0f} % of the points contradict the others"
             + (f" ({', '.join(map(repr, self.wrong_views))} as whole views)" if self.wrong_views else "")
@@ -118,8 +123,6 @@ class _Search:
     def without_odd_views(self) -> None:
         """Set aside views that are of another camera, or of another target than their points say."""
         most = (self.points.n_views - 1) // 3
-        for name in seen_from_behind(self.fit.job, self.fit.solution)[:most]:
-            self._drop(name, "it shows the target from the other side than the other views, as if mirrored")
         if self.wrong_views:
             self._enough()
             self.fit = self.fitter.fit(self.points.select(self.kept))
@@ -204,6 +207,8 @@ def _limits(error: Array, kept: NDArray[np.bool_], points: Correspondences) -> A
 
 def _suspicious(fit: Fit) -> bool:
     """Whether anything in a calibration is not as normal noise would have it."""
+    if fit.refusal:
+        return True
     points, seen = fit.points, fit.seen
     place = {name: k for k, name in enumerate(fit.job.views.names)}
     view = np.array([place[name] for name in points.view_names])[points.view_index]
@@ -217,4 +222,4 @@ def _suspicious(fit: Fit) -> bool:
     spread = np.sqrt(points.pixels.var(axis=0).sum())
     if np.sqrt((error**2).mean()) > _ROUGH * spread:
         return True
-    return bool(seen_from_behind(fit.job, fit.solution)) or find_odd_view(fit.job, fit.solution) is not None
+    return find_odd_view(fit.job, fit.solution) is not None

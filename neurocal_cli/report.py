@@ -10,10 +10,11 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, ViewResult
+from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, Verdict, ViewResult
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.evaluation import CameraEvaluation
 from neurocal_cli.lens import coefficient_names
+from neurocal_cli.verdict_report import verdict_json, verdict_lines
 
 __all__ = [
     "align",
@@ -67,7 +68,7 @@ def align(rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def calibration_report(calibration: Calibration) -> str:
-    """Summary of a calibration: parameters, views, fit and how the training went.
+    """Summary of a calibration: parameters, views, fit, how the training went, the verdict.
 
     Warnings are not in it.
     """
@@ -76,13 +77,17 @@ def calibration_report(calibration: Calibration) -> str:
         align(_parameter_rows(calibration)),
         _view_lines(calibration.views),
         _training_lines(calibration),
+        [] if calibration.verdict is None else verdict_lines(calibration.verdict),
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
-def evaluation_report(evaluation: CameraEvaluation) -> str:
+def evaluation_report(evaluation: CameraEvaluation, verdict: Verdict | None = None) -> str:
     """Summary of an evaluation as aligned text."""
-    return "\n\n".join("\n".join(align(table)) for table in evaluation_tables(evaluation))
+    blocks = [align(table) for table in evaluation_tables(evaluation)]
+    if verdict is not None:
+        blocks.append(verdict_lines(verdict))
+    return "\n\n".join("\n".join(block) for block in blocks)
 
 
 def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], list[list[str]]]:
@@ -101,7 +106,7 @@ def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], li
     return overall, views
 
 
-def evaluation_json(evaluation: CameraEvaluation) -> dict[str, Any]:
+def evaluation_json(evaluation: CameraEvaluation, verdict: Verdict | None = None) -> dict[str, Any]:
     """Turn an evaluation into values that JSON can hold; a number that does not exist is None."""
     names = ("rmse_px", "max_px", "rms_u", "rms_v", "bias_u", "bias_v")
     return {
@@ -110,6 +115,7 @@ def evaluation_json(evaluation: CameraEvaluation) -> dict[str, Any]:
         **{name: _number(getattr(evaluation, name)) for name in names},
         "views": {name: _number(view.rmse_px) for name, view in evaluation.views.items()},
         "fitted_views": list(evaluation.fitted_views),
+        **({} if verdict is None else {"verdict": verdict_json(verdict)}),
     }
 
 

@@ -77,12 +77,12 @@ def mismatched(
     return replace(points, pixels=pixels, world=world)
 
 
-def farthest(spoilt: Calibration, clean: Calibration) -> float:
-    """Most standard deviations of the clean result by which a parameter or pose differs."""
+def farthest(spoilt: Calibration, clean: Calibration, but: str = "") -> float:
+    """Most standard deviations of the clean result by which a parameter or a pose (but one) differs."""
     far = []
     for name in ("alpha_u", "alpha_v", "u0", "v0"):
         far.append(abs(getattr(spoilt.intrinsics, name) - getattr(clean.intrinsics, name)) / clean.std[name])
-    for name in clean.views.keys() & spoilt.views.keys():
+    for name in (clean.views.keys() & spoilt.views.keys()) - {but}:
         one, two, std = clean.views[name].pose, spoilt.views[name].pose, clean.views[name].std
         far += (np.abs(one.t - two.t) / [std["t_x"], std["t_y"], std["t_z"]]).tolist()
         turn = two.R @ one.R.T

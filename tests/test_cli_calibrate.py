@@ -48,9 +48,13 @@ def test_the_calibration_goes_to_stdout_and_the_summary_to_stderr(points: Path) 
 
 
 def test_the_command_gives_what_the_library_gives(points: Path) -> None:
-    from neurocal_cli import calibrate
+    from dataclasses import replace
 
-    assert run("calibrate", points).stdout == format_calibration(calibrate(read_points(str(points))))
+    from neurocal_cli import calibrate
+    from neurocal_cli.judgement import judged
+
+    found = calibrate(read_points(str(points)))
+    assert run("calibrate", points).stdout == format_calibration(replace(found, verdict=judged(found)))
 
 
 def test_the_file_of_o_is_what_would_go_to_stdout(points: Path, tmp_path: Path) -> None:

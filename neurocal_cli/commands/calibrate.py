@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -55,7 +56,8 @@ def calibrate(
     board will do.
 
     The calibration, a YAML file that ROS reads as camera_info, goes to standard output or to -o.
-    A summary with standard deviations goes to standard error.
+    A summary with standard deviations and a verdict (good, usable or poor, with the reasons and what
+    to do next) goes to standard error.
 
     \b
     Examples:
@@ -88,10 +90,12 @@ def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) 
     note(notes)
     points, arguments = estimation.prepare(points)
 
+    from neurocal_cli.judgement import judged
     from neurocal_cli.methods import calibrate as learn
 
     with ProgressBar() as progress:
-        return learn(points, **arguments, camera_name=camera_name, progress=progress)
+        calibration = learn(points, **arguments, camera_name=camera_name, progress=progress)
+    return replace(calibration, verdict=judged(calibration))
 
 
 def _write(calibration: Calibration, output: str, plot: str | None) -> None:

@@ -15,6 +15,7 @@ from neurocal_cli.commands.tables import show
 from neurocal_cli.errors import FormatError
 
 if TYPE_CHECKING:
+    from neurocal_cli.calibration import Verdict
     from neurocal_cli.evaluation import CameraEvaluation
     from neurocal_cli.points import Correspondences
 
@@ -67,6 +68,10 @@ def camera(calibration: str, points: str | None, as_json: bool) -> None:
     views that the calibration knows keep their calibrated pose. Points behind the camera are counted
     and kept out of all averages.
 
+    A calibration is also given a verdict, from the points it was calibrated from: the error on data
+    left out, the points' own precision, whether halves of the data agree, how much of the image they
+    cover and how far predicted pixels can be trusted.
+
     \b
     Examples:
       neurocal evaluate camera camera.yaml
@@ -74,9 +79,9 @@ def camera(calibration: str, points: str | None, as_json: bool) -> None:
       cat points.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
     check_one_stdin(calibration, points)
-    evaluation = _evaluate(calibration, _read_points(points))
+    evaluation, verdict = _evaluate(calibration, _read_points(points))
     _tell(evaluation)
-    _show(evaluation, as_json)
+    _show(evaluation, verdict, as_json)
 
 
 def _read_points(name: str | None) -> Correspondences | None:
@@ -90,13 +95,15 @@ def _read_points(name: str | None) -> Correspondences | None:
     return points
 
 
-def _evaluate(name: str, points: Correspondences | None) -> CameraEvaluation:
+def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluation, Verdict | None]:
     """Evaluate a calibration or, given points, any camera file: then all poses are fitted."""
     from neurocal_cli.evaluation import evaluate_camera
     from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.judgement import judged
 
     try:
-        return evaluate_camera(read_calibration(name), points)
+        calibration = read_calibration(name)
+        return evaluate_camera(calibration, points), judged(calibration)
     except FormatError as error:
         if points is None or name == "-":
             raise
@@ -105,7 +112,7 @@ def _evaluate(name: str, points: Correspondences | None) -> CameraEvaluation:
         except FormatError:
             raise error from None  # no camera file of any kind: tell why it is no calibration
         note([f"only the intrinsic parameters and the lens are used: {error}"])
-    return evaluate_camera(camera, points)
+    return evaluate_camera(camera, points), None
 
 
 def _tell(evaluation: CameraEvaluation) -> None:
@@ -116,10 +123,12 @@ def _tell(evaluation: CameraEvaluation) -> None:
     warn(evaluation.warnings)
 
 
-def _show(evaluation: CameraEvaluation, as_json: bool) -> None:
+def _show(evaluation: CameraEvaluation, verdict: Verdict | None, as_json: bool) -> None:
     from neurocal_cli.report import evaluation_json, evaluation_report, evaluation_tables
+    from neurocal_cli.verdict_report import verdict_lines
 
     if as_json:
-        click.echo(json.dumps(evaluation_json(evaluation), indent=2, allow_nan=False))
+        click.echo(json.dumps(evaluation_json(evaluation, verdict), indent=2, allow_nan=False))
     else:
-        show(evaluation_report(evaluation), evaluation_tables(evaluation))
+        below = [] if verdict is None else verdict_lines(verdict)
+        show(evaluation_report(evaluation, verdict), evaluation_tables(evaluation), below)

@@ -12,8 +12,8 @@ from neurocal_cli.commands.streams import is_terminal
 __all__ = ["show"]
 
 
-def show(report: str, tables: Sequence[Sequence[Sequence[str]]]) -> None:
-    """Print a report on stdout: its tables, drawn, when somebody is looking, or its plain text."""
+def show(report: str, tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str] = ()) -> None:
+    """Print a report on stdout: plain text, or its tables, drawn, and lines below them on a terminal."""
     if not is_terminal(sys.stdout):
         click.echo(report)
         return
@@ -29,3 +29,5 @@ def show(report: str, tables: Sequence[Sequence[Sequence[str]]]) -> None:
         for row in rows[1:]:
             table.add_row(*(Text(cell) for cell in row))
         console.print(table)
+    for line in below:
+        console.print(Text(line))

@@ -16,6 +16,7 @@ from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
 from neurocal_cli.io.camera_info import camera_info_lines
 from neurocal_cli.io.rejected_yaml import rejected_lines
+from neurocal_cli.io.verdict_yaml import verdict_lines
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.lens import coefficient_names
 from neurocal_cli.points import Correspondences
@@ -43,6 +44,7 @@ def calibration_lines(cal: Calibration, rectified: tuple[Array, Array] | None = 
         _parameter_lines(cal),
         _view_lines(cal),
         _network_lines(cal.network),
+        verdict_lines(cal.verdict),
         rejected_lines(cal.rejected),
     ):
         yield from (f"  {line}" for line in lines)

@@ -1,0 +1,41 @@
+"""The verdict on a calibration as a block of its file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from neurocal_cli.calibration import Verdict
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import mapping, number, quoted, text
+
+__all__ = ["read_verdict", "verdict_lines"]
+
+
+def verdict_lines(verdict: Verdict | None) -> Iterator[str]:
+    """Lines of the block ``verdict``; none where it was not asked for."""
+    if verdict is None:
+        return
+    yield "verdict:"
+    yield f"  word: {text(verdict.word)}"
+    yield f"  reasons: [{', '.join(map(quoted, verdict.reasons))}]"
+    yield f"  advice: [{', '.join(map(quoted, verdict.advice))}]"
+    yield f"  measures: {mapping(**{name: number(value) for name, value in verdict.measures.items()})}"
+
+
+def read_verdict(field: Field | None) -> Verdict | None:
+    """Read the block ``verdict`` back.
+
+    Raises
+    ------
+    FormatError
+        A key that is missing or wrong.
+    """
+    if field is None:
+        return None
+    measures = field["measures"]
+    return Verdict(
+        field["word"].text(),
+        tuple(entry.text() for entry in field["reasons"].items()),
+        tuple(entry.text() for entry in field["advice"].items()),
+        {name: measures[name].number_or_nan() for name in measures.keys()},  # noqa: SIM118
+    )

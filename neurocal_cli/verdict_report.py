@@ -1,0 +1,46 @@
+"""A verdict as plain text and as JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from neurocal_cli.calibration import Verdict
+
+__all__ = ["verdict_json", "verdict_lines"]
+
+
+def verdict_lines(verdict: Verdict) -> list[str]:
+    """The word, what it rests on, what speaks against it and what to do next."""
+    lines = [f"verdict: {verdict.word}"]
+    facts = _facts(verdict)
+    if facts:
+        lines.append(f"  {', '.join(facts)}")
+    lines += [f"  - {reason}" for reason in verdict.reasons]
+    lines += [f"  > {advice}" for advice in verdict.advice]
+    return lines
+
+
+def verdict_json(verdict: Verdict) -> dict[str, Any]:
+    """Turn a verdict into values that JSON can hold; a number that does not exist is None."""
+    measures = {name: value if math.isfinite(value) else None for name, value in verdict.measures.items()}
+    return {
+        "word": verdict.word,
+        "reasons": list(verdict.reasons),
+        "advice": list(verdict.advice),
+        "measures": measures,
+    }
+
+
+def _facts(verdict: Verdict) -> list[str]:
+    m = verdict.measures
+    texts = (
+        ("held_out_px", "{:.3g} px on data left out"),
+        ("precision_px", "the points' own precision {:.3g} px"),
+        ("projection_px", "pixels predicted to {:.2g} px at worst"),
+    )
+    facts = [text.format(m[name]) for name, text in texts if math.isfinite(m.get(name, math.nan))]
+    coverage = m.get("coverage", math.nan)
+    if math.isfinite(coverage):
+        facts.append(f"{100 * coverage:.0f} % of the image covered")
+    return facts

@@ -1,0 +1,36 @@
+"""No wrong input ends quietly as good, and good ones do."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from wrong_inputs import FLAT, FOLDED, flat, folded, outcome
+
+from neurocal_cli import calibrate
+from neurocal_cli.judgement import judged
+
+README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
+ROWS = dict(re.findall(r"^\| ([^|]+?) \| (refused|poor|usable) \|", README, flags=re.MULTILINE))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("scene", [flat, folded])
+def test_the_points_that_are_spoilt_are_good(scene, seed: int) -> None:
+    found = calibrate(scene(10 + seed))
+    assert judged(found).word == "good", judged(found).reasons
+    assert found.n_rejected == 0
+
+
+@pytest.mark.parametrize("name", [*FLAT, *FOLDED])
+def test_no_wrong_input_ends_as_good(name: str) -> None:
+    word, reason = outcome(name)
+    assert word in ("refused", "poor", "usable")
+    assert reason
+    assert ROWS[name] == word
+
+
+def test_the_table_in_the_readme_has_every_wrong_input() -> None:
+    assert set(ROWS) == {*FLAT, *FOLDED}
+    assert len(ROWS) >= 40
