@@ -21,8 +21,8 @@ from neurocal_cli.problems import Known, intrinsic_matrix
 
 __all__ = ["check_lens", "folds_back", "straighten"]
 
-_BORDER = 33  # points along each side of the image at which the lens is checked
-_FARTHEST = 500  # points looked at
+_BORDER = 17  # points along each side of the image at which the lens is checked
+_FARTHEST = 100  # points looked at
 
 
 def straighten(points: Correspondences, known: Known) -> Correspondences:
@@ -105,11 +105,14 @@ def folds_back(lens: Lens, A: Array, points: Correspondences) -> str | None:
         along, ends = np.linspace(0, 1, _BORDER), np.zeros(_BORDER)
         for u, v in ((along, ends), (along, ends + 1), (ends, along), (ends + 1, along)):
             places.append(np.column_stack([u * (width - 1), v * (height - 1)]))
-    for pixels, what in zip((places[0], np.concatenate(places)), ("points", "image"), strict=True):
-        straight = _straight_pixels(lens, A, pixels)
-        reached = np.isfinite(straight).all()
-        radius = np.hypot((straight[:, 0] - A[0, 2]) / A[0, 0], (straight[:, 1] - A[1, 2]) / A[1, 1])
-        largest = float(np.nanmax(radius, initial=0.0))
-        if not reached or fold_radius(lens.model, lens.coefficients, largest) <= largest:
-            return what
-    return None
+    if not _folds(lens, A, np.concatenate(places)):
+        return None
+    return "points" if len(places) == 1 or _folds(lens, A, places[0]) else "image"
+
+
+def _folds(lens: Lens, A: Array, pixels: Array) -> bool:
+    straight = _straight_pixels(lens, A, pixels)
+    radius = np.hypot((straight[:, 0] - A[0, 2]) / A[0, 0], (straight[:, 1] - A[1, 2]) / A[1, 1])
+    largest = float(np.nanmax(radius, initial=0.0))
+    reached = np.isfinite(straight).all()
+    return not reached or fold_radius(lens.model, lens.coefficients, largest) <= largest
