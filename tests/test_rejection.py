@@ -113,7 +113,8 @@ def test_a_view_left_out_is_named_with_the_reason() -> None:
 def test_points_of_which_most_are_wrong_are_refused() -> None:
     scene = table_1()
     bad, _ = with_outliers(scene, scene.points(0.2, np.random.default_rng(1)), 0.7, np.random.default_rng(2))
-    with pytest.raises(DegenerateGeometryError, match=r"contradict the others|no camera sees|belong together"):
+    words = r"contradict the others|no camera sees|belong together"
+    with pytest.raises(DegenerateGeometryError, match=words):
         calibrate(bad, distortion="none")
 
 
