@@ -7,6 +7,7 @@ and the exit code that the class names. A message says what is wrong, where, and
 from __future__ import annotations
 
 __all__ = [
+    "CoincidentCamerasError",
     "DegenerateGeometryError",
     "FormatError",
     "InputError",
@@ -48,6 +49,10 @@ class FormatError(NeurocalError, ValueError):
 
 class DegenerateGeometryError(NeurocalError):
     """Points that are well formed but cannot determine what is asked for."""
+
+
+class CoincidentCamerasError(DegenerateGeometryError):
+    """Two cameras at one place, as when one camera's points are given twice: nothing can be triangulated."""
 
 
 class UsageError(NeurocalError):

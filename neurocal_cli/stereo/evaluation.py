@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Pose
-from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.fitting import fit_rig, poses_on_rig
 from neurocal_cli.stereo.pairing import Pairs, ViewPairs, pair_points, pair_views
@@ -85,9 +85,9 @@ def evaluate_stereo(
     try:
         rig = fit_rig(left, right)
         warnings += rig.warnings
+    except CoincidentCamerasError:
+        raise
     except DegenerateGeometryError as error:
-        if "one place" in str(error):
-            raise
         rig = None
         warnings.append(f"there is no one rig: {error}")
     return _Judge((left, right), rig, points, method, warnings).evaluation()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Pose
-from neurocal_cli.errors import DegenerateGeometryError, UsageError
+from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
 from neurocal_cli.stereo.assembly import assemble_rig
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views
@@ -54,7 +54,9 @@ def fit_rig(
     InputError
         No pairs of views, or views without common points; see `pairing`.
     DegenerateGeometryError
-        Views that contradict each other, or cameras that stand at one place.
+        Views that contradict each other.
+    CoincidentCamerasError
+        Cameras at one place.
     UsageError
         An option that does not exist.
     """
@@ -127,7 +129,7 @@ def _contradiction(left_out: dict[tuple[str, str], str], n_pairs: int, outliers:
 def _refuse_one_place(rig: Rig) -> None:
     if rig.baseline > _TOLD_APART * rig.std["baseline"]:
         return
-    raise DegenerateGeometryError(
+    raise CoincidentCamerasError(
         f"both cameras stand at one place: the baseline is {rig.baseline:.3g} +- {rig.std['baseline']:.2g} "
         f"{rig.unit}; give the points (or calibrations) of two different cameras"
     )
