@@ -32,6 +32,7 @@ TOPOLOGIES = ((0, 0), (1, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
 # Three values of a control do not tell how it bends: no units of its own then.
 _SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
 _WEIGHTS_PER_SETTING = 1.5
+_CLEARLY = 5.0  # logarithm of the odds for another scale than the logarithmic, which fits any zoom's noise
 _GRID = 13  # places on each control where networks are compared
 
 
@@ -172,7 +173,8 @@ def _best_scale(
         ranked = _fit(x, targets, variance * derivative**2, rng, budget)
         # A density of targets, as one of alpha.
         fits[scale] = (ranked.evidence + float(np.log(np.abs(derivative)).sum()), ranked)
-    scale = max(fits, key=lambda name: fits[name][0])
+    best = max(fits, key=lambda name: fits[name][0])
+    scale = best if fits[best][0] > fits["log"][0] + _CLEARLY else "log"
     return scale, fits[scale][1]
 
 

@@ -41,7 +41,6 @@ LADDER = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")  # what auto chooses fr
 _QUICK = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
 _WORTH = 0.98  # a richer lens model must lower the held-out error to this share of it ...
 _CHANCE = 3.0  # ... and the residual variance by so many of its standard deviations
-_KEPT = 0.5  # share of the committee's members that is kept, those of highest evidence
 _POOR_FIT = 1.5  # error of the lens over that of the tables from which on it is warned of
 
 Progress = Callable[[str, float], None]
@@ -282,7 +281,7 @@ def _learn(start: _Start, options: Options, reject: bool, report: Progress) -> t
 
 
 def _train(start: _Start, options: Options, budget: Budget, report: Progress) -> list[Joint]:
-    """Steps 2 and 3; the members of highest evidence first, the worse half left out."""
+    """Steps 2 and 3; the members of highest evidence first."""
     x, rng = _scaled(start.lens), np.random.default_rng(options.seed)
     members = fit_committee(
         x,
@@ -308,7 +307,7 @@ def _train(start: _Start, options: Options, budget: Budget, report: Progress) ->
     if not joints:
         raise DegenerateGeometryError(f"{start.lens.points.source}: no network could follow the lens")
     joints.sort(key=lambda joint: -joint.evidence)
-    return joints[: max(1, round(_KEPT * len(joints)))]
+    return joints
 
 
 def _scatter(nets: LensNets, tables: Tables) -> Array:
