@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.active_lens.blocks import Constants, Normal, PixelData
-from neurocal_cli.active_lens.joint import Joint, JointLearner
+from neurocal_cli.active_lens.joint import NEARLY, Joint, JointLearner
 from neurocal_cli.active_lens.nets import LensNets, outputs_to_local
 from neurocal_cli.active_lens.static import scaled_solve
 from neurocal_cli.geometry import Array
@@ -54,8 +54,8 @@ def train_alternating(
             learner.follow_priors()
         nets, shared, after = _take_turns(learner)
         learner.accept(nets, shared)
+        converged = before - after < NEARLY * after
         if before - after < _SETTLED and round_ >= 4:
-            converged = True
             break
     learner.linearise()
     return learner.result(converged)

@@ -25,6 +25,7 @@ __all__ = ["Joint", "JointLearner", "gauss_newton", "loosened", "posterior", "tr
 _ROUNDS = 16  # of normal matrices
 _STEPS = 25  # of Levenberg-Marquardt on one set of them
 _SETTLED = 0.5  # of 2 E, a quarter of a standard deviation: a round that gains less is the last
+NEARLY = 1e-3  # share of 2 E: what gains less than this in the last round has converged
 _SMALL = 0.02  # of 2 E: a step that gains less is the last on a set of matrices
 _FIRST = 4  # rounds in which the priors follow the data
 
@@ -108,8 +109,8 @@ def train_joint(
         if round_ < _FIRST:
             learner.follow_priors()
         after = learner.descend()
+        converged = before - after < NEARLY * after
         if before - after < _SETTLED and round_ >= _FIRST:
-            converged = True
             break
     learner.linearise()
     return learner.result(converged)
