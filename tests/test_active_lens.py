@@ -280,6 +280,16 @@ def flat(points: LensPoints) -> LensPoints:
     )
 
 
+def test_a_setting_with_few_points_rests_on_the_others() -> None:
+    points = seen("c", grid(5, 3), seed=22, side=5)
+    keep = (points.point_setting != 4) | (np.arange(len(points.points)) % 12 == 0)
+    few = LensPoints.grouped(points.points.select(keep), {n: c[keep] for n, c in columns(points).items()})
+    assert 3 <= (few.point_setting == 4).sum() <= 5
+    lens = fit_lens(few, distortion="none", topologies=((0, 2),))
+    assert any("rest on the others" in warning for warning in lens.warnings)
+    assert lens.rmse[4] < 3 * FLOOR
+
+
 def test_a_camera_that_moved_is_told() -> None:
     points = seen("c", grid(4, 3), seed=20, side=4)
     world = points.points.world.copy()

@@ -384,9 +384,13 @@ def _assemble(start: _Start, joints: list[Joint], options: Options, points: Lens
 
 def _warnings(lens: ActiveLens, start: _Start, tables_rms: float) -> tuple[str, ...]:
     warnings = []
-    for s, reason in start.static.reasons.items():
-        if s < lens.settings.shape[0] and not start.static.good[min(s, len(start.static.good) - 1)]:
-            warnings.append(f"a setting could not be calibrated by itself and rests on the others: {reason}")
+    alone = int((~start.static.good).sum())
+    if alone:
+        first = next(iter(start.static.reasons.values()))
+        warnings.append(
+            f"{alone} of {len(start.static.good)} settings cannot be calibrated by themselves and rest on "
+            f"the others: {first}"
+        )
     for rejected in lens.rejected:
         where = describe(lens.controls, np.array(rejected.setting))
         warnings.append(f"the setting {where} is left out: {rejected.reason}")
