@@ -1,8 +1,8 @@
 """``auto``: the simplest lens model that the data supports.
 
 Every model is fitted, each from the one before it. A model's held-out error decides: five folds of
-the views, or of the points of a single view. Models whose held-out rms error is within 0.5 % of the
-lowest, or within what chance does to their difference, are as good as each other; among them the
+the views, or of the points of a single view. Models whose held-out rms error is within 0.9 % of the
+lowest (for a single view also within two standard errors) are as good as each other; among them the
 Bayesian information criterion (Schwarz 1978) chooses, n log E + p log n, n being what the number of
 residuals is worth when neighbours are alike. Models that fold the image back, that did not settle
 or that there are too few points for do not take part, and models whose coefficients are noise only
@@ -27,7 +27,7 @@ from neurocal_cli.whiteness import correlation, effective_number, of_points
 
 __all__ = ["LensChoice", "choose_lens"]
 
-_TIE = 0.005  # of the rms error
+_TIE = 0.009  # of the rms error
 _FAR_WORSE = 2.0  # times the rms error of a model that folds back
 _WORTH = 1.05  # times the rms error: what coefficients that cancel each other must be better by
 _LEAST_PENALTY = 6.6  # chi-squared of one superfluous coefficient in a hundred
@@ -119,8 +119,8 @@ def _best(fitted: dict[str, Candidate], views: Views) -> str:
         if not np.isfinite(candidate.lost).all():
             continue
         excess = candidate.lost - best.lost
-        # Two standard errors of the sum of the parts' differences.
-        chance = 2 * np.sqrt(len(excess)) * excess.std()
+        # Two standard errors of the sum of the folds' differences.
+        chance = 0.0 if views.n_views > 1 else 2 * np.sqrt(len(excess)) * excess.std()
         if excess.sum() <= max(2 * _TIE * best.lost.sum(), chance):
             tied[name] = _criterion(candidate, n)
     if not tied:

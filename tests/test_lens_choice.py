@@ -16,28 +16,31 @@ def chosen(scene: Scene, seed: int, **more: object) -> Calibration:
     return calibrate(points, skew=False, **more)
 
 
-def is_right(model: str, seed: int) -> bool:
-    """Whether the choice has no more than two coefficients too many, and predicts as well as the best."""
+def judged(model: str, seed: int) -> tuple[bool, bool, bool]:
+    """Whether the choice is the truth, has two coefficients too many at most, predicts as well as any."""
     scene, _ = bent_set(model, seed)
     found = chosen(scene, seed)
-    best = min(found.lens_choice.values())
-    assert found.lens_choice[found.distortion_model] < 1.01 * best, (model, seed, found.lens_choice)
-    if found.distortion_model != "fisheye" or model == "fisheye":
-        assert len(MODELS[found.distortion_model]) <= len(MODELS[model]) + 2, (model, seed)
     assert found.rmse_px < 1.15 * np.sqrt(2) * SIGMA
-    return found.distortion_model == model
+    name, errors = found.distortion_model, found.lens_choice
+    told = len(MODELS[name]) - sum(f"k{n}" in found.fixed for n in range(1, 5))
+    return name == model, told <= len(MODELS[model]) + 2, errors[name] < 1.01 * min(errors.values())
 
 
 @pytest.mark.parametrize("model", BENT)
 def test_the_choice_predicts_as_well_as_any_model(model: str) -> None:
-    assert sum(is_right(model, 7000 + seed) for seed in range(4)) >= 3
+    results = [judged(model, 7000 + seed) for seed in range(4)]
+    assert sum(right for right, _, _ in results) >= 3
+    assert all(few and well for _, few, well in results)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", BENT)
 def test_the_choice_is_right_for_200_lenses(model: str) -> None:
-    share = sum(is_right(model, seed) for seed in range(200)) / 200
-    assert share > (0.95 if model == "none" else 0.85)
+    right, few, well = np.mean([judged(model, seed) for seed in range(200)], axis=0)
+    assert right > (0.95 if model == "none" else 0.85)
+    assert few >= 0.98
+    # Models that fold back in the unseen corners may predict better, and are not taken.
+    assert well >= (0.9 if model == "fisheye" else 0.96)
 
 
 @pytest.mark.parametrize("seed", range(12))
