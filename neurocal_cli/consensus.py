@@ -37,6 +37,7 @@ _MOST_SEEN = 512  # points of a view that take part in the search
 _AGREED = 0.97  # share of points on which two starts have to agree
 # A view is wrong as a whole when fewer points than this share agree, or only to this share of its size.
 _MAJORITY, _TIGHT = 0.5, 0.05
+_LOOSE, _LOOSER = 0.01, 10.0  # or to this share, and so many times worse than most views
 _NETWORKS_AT_ONCE = 20_000
 
 
@@ -68,6 +69,7 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
     """
     kept = np.ones(len(views.index), dtype=bool)
     hopeless = np.zeros(views.n_views, dtype=bool)
+    loose = np.full(views.n_views, np.nan)
     for kind in (True, False):
         members = np.flatnonzero((flat == kind) & (views.distinct >= _FEWEST[kind]))
         at_once = max(1, _NETWORKS_AT_ONCE // _STARTS)
@@ -76,6 +78,12 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
             search = _Search(views, some, kind, rng)
             search.run()
             hopeless[some] = search.judge(kept)
+            loose[some] = search.scale / search.spread
+    # A lens may loosen all views, but one view far more than the others is another matter.
+    told = loose[~np.isnan(loose)]
+    if len(told) > 2:
+        with np.errstate(invalid="ignore"):
+            hopeless |= (loose > _LOOSE) & (loose > _LOOSER * np.median(told))
     return Consensus(kept, hopeless)
 
 

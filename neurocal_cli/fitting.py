@@ -124,7 +124,7 @@ class Fitter:
         """With its lens, and weights that the residuals bear out."""
         choice, refusal = None, ""
         if self.lens == "auto":
-            found = choose_lens(job, solution, points, lambda: self._bent_start(job.views))
+            found = choose_lens(job, solution, points, lambda: self._bent_starts(job.views, points))
             job, solution, choice, refusal = found.job, found.solution, found.held_out_px, found.refusal
         job, solution, share = reweighted(job, solution, points)
         if self.lens != "auto":
@@ -135,12 +135,21 @@ class Fitter:
         known = supported(self.known, _FIRST_LENS, views)
         return None if known is None else self._job(views, known)
 
-    def _bent_start(self, views: Views) -> Iterator[CameraState]:
-        """Another camera to begin with, that has a lens from early on."""
+    def _bent_starts(self, views: Views, points: Correspondences) -> Iterator[CameraState]:
+        """Other cameras to begin with, that have a lens from early on; the last with the image's middle."""
         job = self._with_first_lens(views)
-        if job is not None:
-            with suppress(DegenerateGeometryError):
-                yield solve(job).refined.state
+        if job is None:
+            return
+        with suppress(DegenerateGeometryError):
+            yield solve(job).refined.state
+        if points.image_size is None or not job.known.free[3:].all():
+            return
+        known = job.known
+        entries, free = known.entries.copy(), known.free.copy()
+        entries[3:], free[3:] = (np.array(points.image_size) - 1) / 2, False
+        held = replace(known, entries=entries, free=free, fixed=known.fixed | {"u0", "v0"})
+        with suppress(DegenerateGeometryError):
+            yield solve(self._job(views, held)).refined.state
 
     def _lines_first(self, points: Correspondences) -> Fit:
         """The lens from straight lines, then the pinhole camera, then both together."""

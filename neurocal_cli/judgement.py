@@ -97,8 +97,10 @@ def judge(calibration: Calibration) -> Evidence:
     return _Court(calibration).evidence()
 
 
-def judged(calibration: Calibration) -> Verdict:
-    """Good, usable or poor, with the reasons."""
+def judged(calibration: Calibration) -> Verdict | None:
+    """Good, usable or poor, with the reasons; None for a calibration that holds no points of its own."""
+    if not calibration.views or set(calibration.points.view_names) != set(calibration.views):
+        return None
     return pronounce(calibration, judge(calibration))
 
 

@@ -2,11 +2,11 @@
 
 Every model is fitted, each from the one before it. A model's held-out error decides: five folds of
 the views, or of the points of a single view. Models whose held-out rms error is within 0.9 % of the
-lowest (for a single view also within two standard errors) are as good as each other; among them the
+lowest (for a single view also within what chance does to five folds) are as good as each other; among them the
 Bayesian information criterion (Schwarz 1978) chooses, n log E + p log n, n being what the number of
 residuals is worth when neighbours are alike. Models that fold the image back, that did not settle
 or that there are too few points for do not take part, and models whose coefficients are noise only
-where their error is 5 % below that of the others.
+where their error over several views is 5 % below that of the others.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ __all__ = ["LensChoice", "choose_lens"]
 _TIE = 0.009  # of the rms error
 _FAR_WORSE = 2.0  # times the rms error of a model that folds back
 _WORTH = 1.05  # times the rms error: what coefficients that cancel each other must be better by
+_CHANCE = 4.6  # standard errors, of five folds, that chance exceeds in one case of a hundred
 _LEAST_PENALTY = 6.6  # chi-squared of one superfluous coefficient in a hundred
 _SHORT = 1.4  # times the rms error of free networks: the camera may be a wrong one
 
@@ -111,7 +112,7 @@ def _falls_short(views: Views, fitted: dict[str, Candidate]) -> bool:
 
 def _best(fitted: dict[str, Candidate], views: Views) -> str:
     """Of the models whose held-out error is as low as any, the one with the lowest criterion."""
-    sound = _eligible(fitted)
+    sound = _eligible(fitted, views.n_views > 1)
     best = min(sound.values(), key=lambda c: float(c.lost.sum()))
     n = 2 * effective_number(len(views.index), correlation(views, of_points(views, best.refined.state)))
     tied = {}
@@ -119,8 +120,8 @@ def _best(fitted: dict[str, Candidate], views: Views) -> str:
         if not np.isfinite(candidate.lost).all():
             continue
         excess = candidate.lost - best.lost
-        # Two standard errors of the sum of the folds' differences.
-        chance = 0.0 if views.n_views > 1 else 2 * np.sqrt(len(excess)) * excess.std()
+        # Of the sum of the folds' differences; views tell models apart without it.
+        chance = 0.0 if views.n_views > 1 else _CHANCE * np.sqrt(len(excess)) * excess.std()
         if excess.sum() <= max(2 * _TIE * best.lost.sum(), chance):
             tied[name] = _criterion(candidate, n)
     if not tied:
@@ -128,12 +129,15 @@ def _best(fitted: dict[str, Candidate], views: Views) -> str:
     return min(tied, key=lambda name: tied[name])
 
 
-def _eligible(fitted: dict[str, Candidate]) -> dict[str, Candidate]:
-    """Sound models; the others too when they alone predict."""
+def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidate]:
+    """Sound models; the others too when they alone predict, which a single view cannot tell.
+
+    What is wrong with the target is alike in all the folds of one view.
+    """
     unfolded = {name: c for name, c in fitted.items() if c.folds is None} or fitted
     sound = {name: c for name, c in unfolded.items() if c.sound}
-    if not sound:
-        return unfolded
+    if not sound or not several:
+        return sound or unfolded
     lowest = [min(float(c.lost.sum()) for c in some.values()) for some in (sound, unfolded)]
     return sound if lowest[0] < _WORTH**2 * lowest[1] else unfolded
 
