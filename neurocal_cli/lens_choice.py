@@ -2,9 +2,9 @@
 
 Every model is fitted, each from the one before it. A model's held-out error decides: five folds of
 the views, or of the points of a single view. Models whose held-out rms error is within 0.9 % of the
-lowest (for a single view also within what chance does to five folds) are as good as each other; among them the
-Bayesian information criterion (Schwarz 1978) chooses, n log E + p log n, n being what the number of
-residuals is worth when neighbours are alike. Models that fold the image back, that did not settle
+lowest (for a single view also within what chance does to five folds) are as good as each other; among
+them the Bayesian information criterion (Schwarz 1978) chooses, n log E + p log n, n being what the
+number of residuals is worth when neighbours are alike. Models that fold the image back, that did not settle
 or that there are too few points for do not take part, and models whose coefficients are noise only
 where their error over several views is 5 % below that of the others.
 """

@@ -14,6 +14,8 @@ good data is the same with and without this. Otherwise
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -121,17 +123,33 @@ class _Search:
         )
 
     def without_odd_views(self) -> None:
-        """Set aside views that are of another camera, or of another target than their points say."""
+        """Set aside views that are of another camera, or of another target than their points say.
+
+        A lens that is chosen for wrong views with the others hides them: a pinhole looks for them first.
+        """
+        if self.fitter.lens == "auto":
+            before = len(self.wrong_views)
+            self._drop_odd_views(replace(self.fitter, lens=""))
+            if len(self.wrong_views) > before:
+                self.fit = self.fitter.fit(self.points.select(self.kept))
+        self._drop_odd_views(self.fitter)
+
+    def _drop_odd_views(self, fitter: Fitter) -> None:
         most = (self.points.n_views - 1) // 3
-        if self.wrong_views:
-            self._enough()
-            self.fit = self.fitter.fit(self.points.select(self.kept))
+        fit = self.fit
+        if fitter is not self.fitter:
+            try:
+                fit = fitter.fit(self.points.select(self.kept))
+            except DegenerateGeometryError:
+                return
         while len(self.wrong_views) < most:
-            odd = find_odd_view(self.fit.job, self.fit.solution)
+            odd = find_odd_view(fit.job, fit.solution)
             if odd is None:
                 return
             self._drop(odd, "it contradicts the camera of the other views")
-            self.fit = self.fitter.fit(self.points.select(self.kept))
+            fit = fitter.fit(self.points.select(self.kept))
+            if fitter is self.fitter:
+                self.fit = fit
 
     def judge_all_points(self) -> None:
         """Keep what the camera explains, of all points of the views that are kept."""
