@@ -103,9 +103,7 @@ def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluati
 
     try:
         calibration = read_calibration(name)
-        # A camera that a lens gave has no points of its own to be judged by.
-        verdict = judged(calibration) if len(calibration.points) else None
-        return evaluate_camera(calibration, points), verdict
+        return evaluate_camera(calibration, points), judged(calibration)
     except FormatError as error:
         if points is None or name == "-":
             raise

@@ -1,6 +1,6 @@
 """Detection beside OpenCV's finders, on the same rendered pictures, a board there or not.
 
-Run with ``pytest tests/benchmarks/test_detection_speed.py --benchmark-enable``.
+Run with ``pytest tests/benchmarks/test_detection_speed.py -n 0 --benchmark-enable``.
 """
 
 import sys

@@ -1,6 +1,6 @@
 """Speed, beside OpenCV in the same run; nothing is asserted about time.
 
-Run with ``pytest tests/benchmarks --benchmark-enable --benchmark-group-by=param:n_views``.
+Run with ``pytest tests/benchmarks -n 0 --benchmark-enable --benchmark-group-by=param:n_views``.
 """
 
 import subprocess

@@ -1,6 +1,6 @@
 """Stereo calibration and triangulation beside OpenCV's, same unknowns, in the same run.
 
-Run with ``pytest tests/benchmarks/test_stereo_speed.py --benchmark-enable --benchmark-group-by=group``.
+Run with ``pytest tests/benchmarks/test_stereo_speed.py -n 0 --benchmark-enable --benchmark-group-by=group``.
 """
 
 import sys
