@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import table_1
+from scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
@@ -98,7 +98,7 @@ def test_given_parameters_come_back_to_the_last_bit(type: int, skew: bool) -> No
     centre = (0.1 + 0.2, 1 / 3 * 361)
     pose = Pose.from_euler(0.1 / 3, 0.8, -0.03, np.array([-27.0, -28.0, 701.0]) / 3 * 3.0000001)
     given = {2: {"image_center": centre}, 3: {"intrinsics": CAMERA}, 4: {"extrinsics": {"view": pose}}}[type]
-    cal = calibrate(SCENE.points(0.1, np.random.default_rng(0)), type=type, skew=skew, **given)
+    cal = pinhole(SCENE.points(0.1, np.random.default_rng(0)), type=type, skew=skew, **given)
     if type == 2:
         assert (cal.intrinsics.u0, cal.intrinsics.v0) == centre
         assert cal.K[:2, 2].tolist() == list(centre)
