@@ -36,7 +36,9 @@ def assemble(fit: Fit, rejected: Rejected, *, method: str, trainer: str, seed: i
         The points leave the answer open.
     """
     job = fit.job
-    found = _Assembly(fit.points, job.views, job.known, fit.solution).calibration(method, trainer, seed, name)
+    found = _Assembly(
+        fit.points, job.views, job.known, fit.solution, fit.lens_choice is not None
+    ).calibration(method, trainer, seed, name)
     return replace(
         found,
         rejected=rejected,
@@ -89,6 +91,7 @@ class _Assembly:
     views: Views
     known: Known
     solution: Solution
+    lens_chosen: bool
 
     def calibration(self, method: str, trainer: str, seed: int, name: str) -> Calibration:
         views, known, solution = self.views, self.known, self.solution
@@ -129,7 +132,9 @@ class _Assembly:
             distortion=refined.state.k,
             network=self._network(rmse),
             camera_name=name,
-            warnings=parameter_warnings(intrinsics, Lens(known.lens.model, refined.state.k), std),
+            warnings=parameter_warnings(
+                intrinsics, Lens(known.lens.model, refined.state.k), std, self.lens_chosen
+            ),
         )
 
     def _camera_covariance(self, intrinsics: Intrinsics, cov: Covariance) -> tuple[Array, dict[str, float]]:

@@ -74,9 +74,14 @@ def pose_std(R: Array, centre: Array, scale: Array, covariance: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(np.diagonal(block, axis1=1, axis2=2), 0.0)))
 
 
-def parameter_warnings(intrinsics: Intrinsics, lens: Lens, std: Mapping[str, float]) -> tuple[str, ...]:
-    """Parameters that exist but are badly determined, and coefficients that the data does not tell from 0."""
-    return (*_poor(intrinsics, std), *_noise_coefficients(lens, std))
+def parameter_warnings(
+    intrinsics: Intrinsics, lens: Lens, std: Mapping[str, float], lens_chosen: bool
+) -> tuple[str, ...]:
+    """Parameters that exist but are badly determined, and coefficients that the data does not tell from 0.
+
+    A lens model that was chosen for what it predicts may well have one of those.
+    """
+    return (*_poor(intrinsics, std), *(() if lens_chosen else _noise_coefficients(lens, std)))
 
 
 def _poor(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:

@@ -189,9 +189,11 @@ class _RigAssembly:
                 "corners"
             )
         before: tuple[str, ...] = ()
+        chosen = bool(given.lens_choice)
         if given.std.keys() >= std.keys():
-            before = parameter_warnings(given.intrinsics, Lens(camera.lens, given.distortion), given.std)
-        now = parameter_warnings(intrinsics, lens, std)
+            alone = Lens(camera.lens, given.distortion)
+            before = parameter_warnings(given.intrinsics, alone, given.std, chosen)
+        now = parameter_warnings(intrinsics, lens, std, chosen)
         return {
             "intrinsics": intrinsics,
             "std": std,
