@@ -24,6 +24,7 @@ from neurocal_cli.lens import Lens, coefficient_names
 from neurocal_cli.noise import common_share, measured, with_common_share
 from neurocal_cli.odd_views import free_networks, seen_from_behind
 from neurocal_cli.pixel_error import ENTRIES
+from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known
 from neurocal_cli.projection_uncertainty import ProjectionUncertainty, image_grid, projection_uncertainty
 from neurocal_cli.refine import refine
@@ -109,14 +110,14 @@ class _Court:
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.points = calibration, calibration.points
-        self.views, self.known = _views(calibration), _known(calibration)
-        views = [calibration.views[name] for name in self.views.names]
+        views = [calibration.views[name] for name in self.points.view_names]
         self.seen = Seen(
             calibration.K,
             Lens(calibration.distortion_model, calibration.distortion),
             np.stack([view.pose.R for view in views]),
             np.stack([view.pose.t for view in views]),
         )
+        self.views, self.known = _weighed(self.points, self.seen), _known(calibration)
         self.free = self.known.free_camera
         self.free_poses = not all(view.fixed for view in views)
         state = normalised(self.seen, self.views)
@@ -176,9 +177,7 @@ class _Court:
         if self.points.image_size is None:
             return None
         view = self.points.view_index
-        names = {name: k for k, name in enumerate(self.views.names)}
-        place = np.array([names[name] for name in self.points.view_names])[view]
-        depth = (self.seen.R[place, 2] * self.points.world).sum(axis=1) + self.seen.t[place, 2]
+        depth = (self.seen.R[view, 2] * self.points.world).sum(axis=1) + self.seen.t[view, 2]
         depths = np.append(np.quantile(depth, [0.0, 0.5, 1.0]), _DISTANT * depth.max())
         return projection_uncertainty(
             self.views, self.state, self.seen, self.normal, self.free, self.free_poses,
@@ -186,21 +185,13 @@ class _Court:
         )  # fmt: skip
 
 
-def _views(calibration: Calibration) -> Views:
-    """Arranged and weighed as when it was calibrated."""
-    points = calibration.points
+def _weighed(points: Correspondences, seen: Seen) -> Views:
+    """Arranged, and weighed as when they were calibrated; see `reweighting`."""
     views = arrange(points)
     if points.covariance is None or not measured(points.covariance):
         return views
     order = slice(None) if views.order is None else views.order
     stated = points.covariance[order]
-    place = [calibration.views[name].pose for name in points.view_names]
-    seen = Seen(
-        calibration.K,
-        Lens(calibration.distortion_model, calibration.distortion),
-        np.stack([pose.R for pose in place]),
-        np.stack([pose.t for pose in place]),
-    )
     predicted, _ = seen.predict(points.world, points.view_index)
     share = common_share(stated, (points.pixels - predicted)[order])
     return replace(views, whitening=noise_model(with_common_share(stated, share))[1])

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.arrowhead import solve_scaled
 from neurocal_cli.geometry import Array
 from neurocal_cli.pixel_error import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.tiles import tile
@@ -85,9 +86,8 @@ def _poses_by_camera(normal: Array, shared: NDArray[np.intp]) -> Array:
     """B^-1 [C^T, h]: how the poses follow the shared parameters, and their own step; (..., 6, f + 1)."""
     right = np.concatenate([np.swapaxes(normal[..., shared, POSE], -1, -2), normal[..., POSE, -1:]], axis=-1)
     B = normal[..., POSE, POSE]
-    scale = 1.0 / np.sqrt(np.diagonal(B, axis1=-2, axis2=-1) + 1e-300)
-    scaled = B * scale[..., :, None] * scale[..., None, :] + 1e-13 * np.eye(6)
-    return np.asarray(scale[..., None] * np.linalg.solve(scaled, scale[..., None] * right))
+    # A little more on the diagonal: one view's pose that nothing holds must not spoil the others.
+    return solve_scaled(B + 1e-13 * B * np.eye(6), right)
 
 
 @_quietly

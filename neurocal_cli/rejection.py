@@ -14,6 +14,7 @@ good data is the same with and without this. Otherwise
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -128,28 +129,25 @@ class _Search:
         A lens that is chosen for wrong views with the others hides them: a pinhole looks for them first.
         """
         if self.fitter.lens == "auto":
+            pinhole = replace(self.fitter, lens="")
             before = len(self.wrong_views)
-            self._drop_odd_views(replace(self.fitter, lens=""))
+            # A lens may bend so strongly that there is no pinhole: then nothing is learnt from it.
+            with suppress(DegenerateGeometryError):
+                self._drop_odd_views(pinhole, pinhole.fit(self.points.select(self.kept)))
             if len(self.wrong_views) > before:
                 self.fit = self.fitter.fit(self.points.select(self.kept))
-        self._drop_odd_views(self.fitter)
+        self.fit = self._drop_odd_views(self.fitter, self.fit)
 
-    def _drop_odd_views(self, fitter: Fitter) -> None:
+    def _drop_odd_views(self, fitter: Fitter, fit: Fit) -> Fit:
+        """Set odd views aside one by one; the calibration without them."""
         most = (self.points.n_views - 1) // 3
-        fit = self.fit
-        if fitter is not self.fitter:
-            try:
-                fit = fitter.fit(self.points.select(self.kept))
-            except DegenerateGeometryError:
-                return
         while len(self.wrong_views) < most:
             odd = find_odd_view(fit.job, fit.solution)
             if odd is None:
-                return
+                break
             self._drop(odd, "it contradicts the camera of the other views")
             fit = fitter.fit(self.points.select(self.kept))
-            if fitter is self.fitter:
-                self.fit = fit
+        return fit
 
     def judge_all_points(self) -> None:
         """Keep what the camera explains, of all points of the views that are kept."""
@@ -167,7 +165,7 @@ class _Search:
             known.add(state)
 
     def _explained(self) -> NDArray[np.bool_]:
-        error, index = self._errors(), self.points.view_index
+        error, index = _errors(self.fit, self.points), self.points.view_index
         near = error < _limits(error, self.kept, self.points)[index]
         share = np.bincount(index, near, self.points.n_views) / np.bincount(index)
         for view in np.flatnonzero(share <= _MAJORITY):
@@ -175,23 +173,27 @@ class _Search:
             self.wrong_views.setdefault(name, "most of its points contradict the camera")
         return np.asarray(near & (share > _MAJORITY)[index])
 
-    def _errors(self) -> Array:
-        """(N,) length of each point's error [px], weighted; infinite in views that are set aside."""
-        seen, names = self.fit.seen, self.fit.job.views.names
-        place = {name: k for k, name in enumerate(names)}
-        view = np.array([place.get(name, -1) for name in self.points.view_names])[self.points.view_index]
-        predicted, in_front = seen.predict(self.points.world, np.maximum(view, 0))
-        error = _lengths(predicted - self.points.pixels, self.points, self.fit.share)
-        return np.where(in_front & (view >= 0) & np.isfinite(error), error, np.inf)
-
     def rejected(self) -> Rejected:
         """What was set aside."""
-        error = self._errors()
+        error = _errors(self.fit, self.points)
         rows = np.flatnonzero(~self.kept)
         if not rows.size:
             return Rejected(views=dict(self.wrong_views))
         known = np.where(np.isfinite(error), error, np.nan)[rows]
         return Rejected(self.points.select(rows), known, dict(self.wrong_views))
+
+
+def _errors(fit: Fit, points: Correspondences) -> Array:
+    """(N,) length of each point's error [px], weighted; infinite where the fit does not see the point.
+
+    It sees none behind the camera, and none of views that it leaves out.
+    """
+    seen = fit.seen
+    place = {name: k for k, name in enumerate(fit.job.views.names)}
+    view = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
+    predicted, in_front = seen.predict(points.world, np.maximum(view, 0))
+    error = _lengths(predicted - points.pixels, points, fit.share)
+    return np.where(in_front & (view >= 0) & np.isfinite(error), error, np.inf)
 
 
 def _lengths(residuals: Array, points: Correspondences, share: float) -> Array:
@@ -227,12 +229,9 @@ def _suspicious(fit: Fit) -> bool:
     """Whether anything in a calibration is not as normal noise would have it."""
     if fit.refusal:
         return True
-    points, seen = fit.points, fit.seen
-    place = {name: k for k, name in enumerate(fit.job.views.names)}
-    view = np.array([place[name] for name in points.view_names])[points.view_index]
-    predicted, in_front = seen.predict(points.world, view)
-    error = _lengths(predicted - points.pixels, points, fit.share)
-    if not in_front.all() or not np.isfinite(error).all():
+    points = fit.points
+    error = _errors(fit, points)
+    if not np.isfinite(error).all():
         return True
     everything = np.ones(len(points), dtype=bool)
     if (error >= _limits(error, everything, points)[points.view_index]).any():

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.arrowhead import inverse_scaled
+from neurocal_cli.arrowhead import arrowhead_covariance, inverse_scaled
 from neurocal_cli.geometry import Array
 from neurocal_cli.pixel_error import POSE, camera_columns
 
@@ -59,21 +59,16 @@ def covariance(
     V = len(normal)
     unknowns = len(f) + (6 * V if free_pose else 0)
     variance = float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
-    U = normal[:, f[:, None], f].sum(axis=0)
     if not free_pose:
         if shared is not None:
             return Covariance(shared, np.zeros((V, 6, 6)), 1.0)
+        U = normal[:, f[:, None], f].sum(axis=0)
         inverse, smallest = inverse_scaled(U, U)
         return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
+    if shared is None:
+        found = arrowhead_covariance(normal, f, np.arange(POSE.start, POSE.stop))
+        return Covariance(variance * found.shared, variance * found.own, found.smallest)
     B = normal[:, POSE, POSE]
     B_inverse, smallest = inverse_scaled(B, B)
-    if not f.size:
-        return Covariance(np.zeros((0, 0)), variance * B_inverse, smallest)
-    C = normal[:, f, POSE]  # (V, f, 6)
-    gain = C @ B_inverse
-    if shared is not None:
-        return Covariance(shared, variance * B_inverse + np.swapaxes(gain, 1, 2) @ shared @ gain, smallest)
-    S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
-    S_inverse, smallest_shared = inverse_scaled(S, U)
-    poses = B_inverse + np.swapaxes(gain, 1, 2) @ S_inverse @ gain
-    return Covariance(variance * S_inverse, variance * poses, min(smallest, smallest_shared))
+    gain = normal[:, f, POSE] @ B_inverse
+    return Covariance(shared, variance * B_inverse + np.swapaxes(gain, 1, 2) @ shared @ gain, smallest)

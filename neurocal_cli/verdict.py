@@ -112,7 +112,8 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
         )
         yield (
             _CORRELATION.grade(e.correlation) if e.rmse_px > 1e-4 * spread else 0,
-            f"neighbouring points err alike (correlation {e.correlation:.2f}): lens or target are otherwise",
+            f"neighbouring points err alike (correlation {e.correlation:.2f}): the lens or the target is not "
+            "as modelled",
             "try another --distortion, or measure the target",
         )
 
