@@ -9,10 +9,10 @@ import numpy as np
 
 from neurocal_cli.active_lens.blocks import Constants, Normal
 from neurocal_cli.active_lens.committee import Budget, fit_committee
-from neurocal_cli.active_lens.fit import check_settings
 from neurocal_cli.active_lens.lens_model import ActiveLens, Member, TableRecord
 from neurocal_cli.active_lens.nets import LensNets, local_to_outputs
 from neurocal_cli.active_lens.settings import CONTROLS
+from neurocal_cli.active_lens.start import check_settings
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
