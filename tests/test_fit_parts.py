@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from test_fit_models import some_map
 
+from neurocal_cli.detection.fit_forms import choose_map
 from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fit_newton import BLUR, Fit, Linear, Part, Prior, gauss_newton
 from neurocal_cli.detection.fit_noise import BoardBlur
-from neurocal_cli.detection.fit_robust import Rows, choose_map, fit_map, median
+from neurocal_cli.detection.fit_robust import Rows, fit_map, median
 from neurocal_cli.detection.fit_shading import Levels, fit_shading
 from neurocal_cli.detection.fit_strips import gather, grid_lines
 from neurocal_cli.geometry import Array

@@ -10,13 +10,14 @@ from neurocal_cli.detection.find_grow import Lattice, cropped, framed, frontier
 from neurocal_cli.detection.find_predict import expected
 from neurocal_cli.geometry import Array
 
-__all__ = ["disputed", "distinct"]
+__all__ = ["disputed", "distinct", "touching"]
 
 _SAME = 0.25  # of a square's width; between vertices that are the same
 _MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on ...
 _MEETS_PARTLY = 0.22  # ... if few of its row are seen
 _MOSTLY = 0.6  # share of a row
 _COPY = 0.5  # share of vertices in another lattice
+_BESIDE = 2.0  # squares; farther from each other lattices have nothing in dispute
 
 
 def distinct(lattices: list[Lattice]) -> list[Lattice]:
@@ -28,6 +29,26 @@ def distinct(lattices: list[Lattice]) -> list[Lattice]:
         if not any((_distance(points, x.pixels[x.seen]) < reach).mean() > _COPY for x in kept):
             kept.append(lattice)
     return kept
+
+
+def touching(lattices: list[Lattice]) -> bool:
+    """Whether any two lattices come so near each other that they may claim the same vertices."""
+    boxes = []
+    for lattice in lattices:
+        points, room = lattice.pixels[lattice.seen], _BESIDE * _longest(lattice)
+        boxes.append((points.min(axis=0) - room, points.max(axis=0) + room))
+    return any(
+        bool(((low <= other_high) & (other_low <= high)).all())
+        for k, (low, high) in enumerate(boxes)
+        for other_low, other_high in boxes[:k]
+    )
+
+
+def _longest(lattice: Lattice) -> float:
+    """Longest side of a square [px]."""
+    p = lattice.pixels
+    sides = np.concatenate([np.diff(p, axis=0).reshape(-1, 2), np.diff(p, axis=1).reshape(-1, 2)])
+    return float(np.nanmax(np.hypot(*sides.T)))
 
 
 def disputed(lattices: list[Lattice]) -> list[Lattice]:

@@ -20,6 +20,8 @@ __all__ = ["Saddles", "find_saddles"]
 
 _THRESHOLD = 5.0  # standard deviations of the noise
 _BORDER = 4  # px
+_AROUND = 2  # px, within which a saddle is the steepest
+_BAND = 50_000  # pixels
 _RADII = (5.0, 3.0)  # px; of the rings, the better one first
 _RAYS = 32
 _MOST_BENT = np.radians(22)  # of a line on its way through the vertex
@@ -116,26 +118,39 @@ _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 
 def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:
     """Whole pixels where the saddle is steepest; (N, 2)."""
-    uu, uv, vv = level.curvature
-    steepness, largest = uv * uv, uu * vv
-    steepness -= largest
-    # The largest within two pixels, and above the noise. New memory would cost more than the sums.
-    cv2.dilate(steepness, np.ones((5, 5), np.uint8), dst=largest)
-    least = np.float32((_THRESHOLD * level.noise) ** 2)
-    np.maximum(largest, least, out=largest)
-    inner = slice(_BORDER, -_BORDER)
-    peak = steepness[inner, inner] >= largest[inner, inner]
-    v, u = np.divmod(np.flatnonzero(peak), peak.shape[1])
-    v, u = v + _BORDER, u + _BORDER
+    u, v, steepness = _peaks(level)
     if covered is not None:
         free = covered[v, u] == 0
-        v, u = v[free], u[free]
-    limit = max(_LEAST, round(_PER_MEGAPIXEL * steepness.size / 1e6))
+        u, v, steepness = u[free], v[free], steepness[free]
+    limit = max(_LEAST, round(_PER_MEGAPIXEL * level.image.size / 1e6))
     if len(u) > limit:
-        best = np.argpartition(-steepness[v, u], limit)[:limit]
+        best = np.argpartition(-steepness, limit)[:limit]
         best.sort()
         u, v = u[best], v[best]
     return np.stack([u, v], axis=-1).astype(float)
+
+
+def _peaks(level: Level) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Whole pixels u, v (N,) where the saddle is steeper than within two pixels, and above the noise."""
+    uu, uv, vv = level.curvature
+    height, width = uv.shape
+    least = np.float32((_THRESHOLD * level.noise) ** 2)
+    found = [(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.float32))]
+    rows = max(8, _BAND // width)
+    # Band by band, which stays in the processor's cache.
+    for top in range(_BORDER, height - _BORDER, rows):
+        bottom = min(top + rows, height - _BORDER)
+        band = slice(top - _AROUND, bottom + _AROUND)
+        steepness = uv[band] * uv[band]
+        steepness -= uu[band] * vv[band]
+        largest = cv2.dilate(steepness, np.ones((2 * _AROUND + 1,) * 2, np.uint8))
+        inner = np.s_[_AROUND:-_AROUND, _BORDER:-_BORDER]
+        steepness, largest = steepness[inner], largest[inner]
+        peak = np.flatnonzero((steepness >= largest) & (steepness >= least))
+        v, u = np.divmod(peak, steepness.shape[1])
+        found.append((u + _BORDER, v + top, steepness[v, u]))
+    us, vs, values = zip(*found, strict=True)
+    return np.concatenate(us), np.concatenate(vs), np.concatenate(values)
 
 
 def _ring(profile: Array, noise: float) -> tuple[Array, Array, NDArray[np.bool_]]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.find_accept import edges_seen, has_block, is_smooth
-from neurocal_cli.detection.find_claims import disputed, distinct
+from neurocal_cli.detection.find_claims import disputed, distinct, touching
 from neurocal_cli.detection.find_fold import joined, unfolded
 from neurocal_cli.detection.find_grow import Lattice, cleaned, grown, smoothing
 from neurocal_cli.detection.find_levels import Level, levels_of
@@ -73,7 +73,7 @@ def _separated(level: Level, lattices: list[Lattice]) -> list[Lattice]:
     """Grids of one plane each."""
     result = []
     several = distinct(lattices)
-    if len(several) > 1:
+    if touching(several):
         several = [part for x in disputed(several) for part in _boards(cleaned(level, x))]
     for lattice in several:
         planes = [part for part in unfolded(lattice) if has_block(part)]

@@ -11,18 +11,19 @@ from neurocal_cli.detection.fit_box import half_widths
 from neurocal_cli.detection.fit_edges import (
     OFFSET,
     EdgeData,
-    edge_data,
     fit_edges,
     light_at,
     moments,
     with_weight,
 )
+from neurocal_cli.detection.fit_forms import choose_map
+from neurocal_cli.detection.fit_free import fit_freely
 from neurocal_cli.detection.fit_gate import believable, smooth
-from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
-from neurocal_cli.detection.fit_newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
+from neurocal_cli.detection.fit_map import LENS, Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fit_newton import CONTRAST, MEAN, Fit, Shape
 from neurocal_cli.detection.fit_noise import BoardBlur, Noise, level_prior, profile_shape
-from neurocal_cli.detection.fit_profile import RESPONSE_TERMS, box_kurtosis
-from neurocal_cli.detection.fit_robust import MapFit, Rows, choose_map, fit_map, median
+from neurocal_cli.detection.fit_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fit_robust import MapFit, Rows, fit_map, median
 from neurocal_cli.detection.fit_shading import Levels, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fit_strips import Lines, gather, grid_lines
 from neurocal_cli.detection.fit_vertices import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
@@ -38,23 +39,12 @@ _GOOD_START = 1.3  # chi2 per coordinate of the found vertices at which their ma
 _ANCHOR = 2.0  # px; later they only hold what the edges leave open
 _ENOUGH = 60  # edges that need no anchors
 _MOMENT_SIGMA = 0.05  # px, of offsets from moments
-_REACH = 4.0  # sigma on both sides of an edge
-_SLACK = 0.5  # px, for starts that are off
-_NEAREST = 0.5  # sigma from the crossing lines
 _STEPS = 6  # of Gauss and Newton, at most
 _LEAST_VARIANCE = 1e-12  # px^2
 _NORMAL = 1.4826  # standard deviations in a median of absolute values
 _LEAST_SCALE = 0.1  # of the noise by the final residuals; less cannot be, the rounding being known
 _WIDEST = 12.0  # px, of the strips for moments
-_SHARP = 0.45  # px; blur below which the pixel's box is taken exactly
-_NEAREST_FIRST, _ENDS = 2.0, 0.12  # sigma, but no more than so much of the length, before the last fit
-_NEAREST_SHARP = 0.75  # px from the crossing lines, beyond which no pixel reaches over them
 _PRECISE = 0.003  # sigma; standard deviation of offsets
-_CLEARLY = 0.97  # of chi2, with which another profile than the pixel's box is believed
-_WORSE = 1.2  # of chi2, with which another blur is not
-_COLUMNS = 40  # of pixels along an edge, before the last fit
-_BLUR_OFF = 0.1  # relative error of the blur that makes the first fit be done again
-_LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations before anything is known
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,7 +181,7 @@ def _by_moments(board: Board, found: MapFit, shading: Shading) -> tuple[MapFit, 
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
     half = np.clip(half, 2.0, _WIDEST)
-    strips = gather(board.image, lines, half, 0.2 * lines.length[:, None], _stride(lines))
+    strips = gather(board.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
     offset, _, blur = moments(strips, half, *shading.at(lines.middle))
     sigma = float(np.clip(median(blur), 0.33, 0.25 * median(lines.width)))
     rows = board.rows(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
@@ -202,71 +192,17 @@ def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noi
     """Edges fitted with free levels, and the map through them."""
     lines = board.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
-    free = _free_fit(board, lines, offset, sigma, shading, noise)
-    found = free.blur(sigma)
-    # The blur decides what the lines that cross do to the pixels.
-    if abs(found - sigma) > _BLUR_OFF * sigma or (found < _SHARP) != (sigma < _SHARP):
-        again = _free_fit(board, lines, offset, found, shading, noise)
-        free = again if again.rough < _WORSE * free.rough else free
+    free = fit_freely(board.image, lines, offset, sigma, shading, noise)
     data, fit, shape = free.data, free.fit, free.shape
     good = smooth(fit)
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
     variance = np.where(good, variance, _ANCHOR**2)
-    chosen = choose_map(mapped.map, board.rows(lines, fit.values[:, OFFSET], variance), mapped.shift)
+    rows = board.rows(lines, fit.values[:, OFFSET], variance)
+    # What the vertices' map needs, that of the edges needs as well; a board's own unevenness is for later.
+    chosen = choose_map(mapped.map, rows, mapped.shift, least=mapped.form, most=max(mapped.form, LENS))
     good &= chosen.weight[: len(good)] > 0
     return Fitted(lines, fit, data, chosen, shading, shape, Noise(noise, noise, noise), good)
-
-
-@dataclass(frozen=True, eq=False)
-class _Free:
-    """Fits with free levels."""
-
-    data: EdgeData
-    fit: Fit
-    shape: Shape
-
-    @property
-    def rough(self) -> float:
-        """Typical chi2 per pixel."""
-        return median(self.fit.chi2 / np.maximum(self.fit.count, 1))
-
-    def blur(self, otherwise: float) -> float:
-        """Typical blur [px]."""
-        good = smooth(self.fit)
-        return median(self.fit.values[good, BLUR]) if good.any() else otherwise
-
-
-def _free_fit(
-    board: Board, lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
-) -> _Free:
-    mean, contrast = shading.at(lines.middle)
-    blur = np.full(len(mean), sigma)
-    data = _pixels(board, lines, blur, shading, _REACH * blur + _SLACK, _stride(lines))
-    data = with_weight(data, np.full_like(data.weight, 1 / noise))
-    known = np.stack([mean, contrast, blur], axis=-1)
-    spread = known * [0.0, 0.0, _LOOSE_BLUR] + contrast[:, None] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
-    prior = Prior(known, (1 / spread**2)[:, :, None] * np.eye(3))
-    start = np.concatenate([offset[:, None], np.zeros((len(mean), 1)), known], axis=1)
-    results = []
-    for shape in _blurred(lines, sigma):
-        fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, _STEPS)
-        shape = profile_shape(data, fit, shape, smooth(fit))
-        fit = fit_edges(data, fit.values, prior, 0.5 * lines.length, shape, _STEPS)
-        results.append(_Free(data, fit, shape))
-    # Both say the same where all edges run along the pixels: then it is the pixels' box.
-    return results[0] if results[0].rough < _CLEARLY * results[-1].rough else results[-1]
-
-
-def _blurred(lines: Lines, sigma: float) -> list[Shape]:
-    """Profiles of nothing but blur."""
-    none = np.zeros(RESPONSE_TERMS)
-    tails = box_kurtosis(lines.normal, np.full(len(lines.normal), sigma))
-    shapes = [Shape(tails[:, None] * [1.0, 0.0], none)]
-    if sigma < _SHARP:
-        # Cameras that sharpen their pictures leave edges that are no pixel's box any more.
-        shapes.append(Shape(np.zeros((len(tails), 2)), none, half_widths(lines.normal)))
-    return shapes
 
 
 def _last_fit(board: Board, first: Fitted) -> Fitted:
@@ -301,38 +237,20 @@ def _fine_fit(
     noise = Noise.of(first.fit, first.data.weight, board.floor)
     blur = BoardBlur.of(first.fit, lines.normal, first.good)
     sigma = blur.along(lines.normal)
-    data = _pixels(board, lines, sigma, shading, _REACH * sigma, 1)
+    data = edge_pixels(board.image, lines, sigma, shading, REACH * sigma, 1)
     prior = level_prior(shading, lines.middle, sigma, blur.spread, noise.edge)
     offset = first.map.residual[:n] + first.map.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     data = with_weight(data, noise.weighted(light_at(data, start), data.weight))
     fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
     usual = median(sigma)
-    if usual < _SHARP or median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
+    if usual < SHARP or median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # So precise, or so sharp, that the profile from a share of the pixels is what is worst known.
         shape = profile_shape(data, fit, shape, first.good)
         noise = Noise.of(fit, data.weight, board.floor)
         data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
         fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
     return fit, data, shape, noise
-
-
-def _stride(lines: Lines) -> int:
-    """Only every so manieth column of pixels is taken until the last fit: enough for a start."""
-    return max(2, int(median(lines.length) / _COLUMNS))
-
-
-def _pixels(
-    board: Board, lines: Lines, sigma: Array, shading: Shading, reach: Array, stride: int
-) -> EdgeData:
-    half = np.minimum(reach, 0.5 * lines.width)
-    strips = gather(board.image, lines, half, np.zeros((len(half), 1)), stride)
-    contrast = shading.at(lines.middle)[1]
-    nearest = np.where(sigma < _SHARP, _NEAREST_SHARP / sigma, _NEAREST)
-    if stride > 1:
-        # The crossing lines are not well known yet.
-        nearest = np.maximum(nearest, np.minimum(_NEAREST_FIRST, _ENDS * lines.length / sigma))
-    return edge_data(strips, lines, sigma, shading.slopes(lines.middle), contrast, nearest)
 
 
 def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Lines], NDArray[np.bool_]]:
@@ -345,7 +263,7 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     sigma = 0.5 * (blur.along(lines[0].normal) + blur.along(lines[1].normal))
     contrast = fitted.shading.at(place)[1]
     slopes = fitted.shading.slopes(place)
-    data = vertex_data(board.image, lines, light, sigma, _REACH, slopes, contrast, _ends(board.grid.seen))
+    data = vertex_data(board.image, lines, light, sigma, REACH, slopes, contrast, _ends(board.grid.seen))
     tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
     shape = Shape(tails, fitted.shape.bend)
     if fitted.shape.half is not None:

@@ -23,6 +23,7 @@ from neurocal_cli.detection.fit_newton import (
     BLUR,
     CONTRAST,
     MEAN,
+    MORE_STEPS,
     Fit,
     Linear,
     Part,
@@ -163,7 +164,13 @@ def edge_data(
 
 
 def fit_edges(
-    data: EdgeData, start: Array, prior: Prior, half_length: Array, shape: Shape, steps: int
+    data: EdgeData,
+    start: Array,
+    prior: Prior,
+    half_length: Array,
+    shape: Shape,
+    steps: int,
+    more: int = MORE_STEPS,
 ) -> Fit:
     """Gauss-Newton steps of all edges at once.
 
@@ -175,7 +182,8 @@ def fit_edges(
     prior : Prior
     half_length : (E,) array [px]
     shape : Shape
-    steps : int
+    steps, more : int
+        See `gauss_newton`.
     """
     lever = data.s / half_length.astype(np.float32)[:, None]
 
@@ -183,7 +191,7 @@ def fit_edges(
         pixels, levers, form = data.part(part), lever[part], shape.part(part)
         return lambda values: linearised(pixels, levers, values, form)
 
-    return gauss_newton(model_of, start, prior, data.weight, steps)
+    return gauss_newton(model_of, start, prior, data.weight, steps, more)
 
 
 def light_at(data: EdgeData, values: Array) -> Single:

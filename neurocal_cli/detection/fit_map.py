@@ -19,7 +19,11 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["Frame", "Places", "SmoothMap", "homography_start"]
+__all__ = ["FORMS", "LENS", "Frame", "Places", "SmoothMap", "homography_start"]
+
+# Forms of the map from the simplest on: (radial parameters, degree of the polynomial rest).
+FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
+LENS = 3  # index of the richest form without a polynomial
 
 _HOMOGRAPHY, _LENS = 8, 6
 _REST = _HOMOGRAPHY + _LENS

@@ -10,7 +10,18 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["BLUR", "CONTRAST", "MEAN", "Fit", "Linear", "Part", "Prior", "Shape", "gauss_newton"]
+__all__ = [
+    "BLUR",
+    "CONTRAST",
+    "MEAN",
+    "MORE_STEPS",
+    "Fit",
+    "Linear",
+    "Part",
+    "Prior",
+    "Shape",
+    "gauss_newton",
+]
 
 Single = NDArray[np.float32]
 Part = NDArray[np.intp] | slice  # of the fits
@@ -19,7 +30,7 @@ Part = NDArray[np.intp] | slice  # of the fits
 MEAN, CONTRAST, BLUR = -3, -2, -1
 _LEAST_BLUR = 0.2905  # px; the pixel's box alone has 0.2887
 _MOST, _SETTLED = 0.9, 0.5  # share of the fits whose last step was less, in standard deviations
-_MORE_STEPS = 20  # of those that have not settled with the others
+MORE_STEPS = 20  # of those that have not settled with the others
 _DAMPING, _LEAST_DAMPING = 1.0, 0.01
 _SINGLE = 1e-6  # relative error of sums
 _NOTHING = 1e-9  # information that keeps fits without pixels from dividing by 0
@@ -149,6 +160,7 @@ def gauss_newton(
     prior: Prior,
     weight: Single,
     steps: int,
+    more: int = MORE_STEPS,
 ) -> Fit:
     """All fits at once, then those that have not settled by themselves.
 
@@ -161,17 +173,17 @@ def gauss_newton(
     prior : Prior
     weight : (E, N) array [1/DN^2]
         Of the pixels.
-    steps : int
-        Of all, at most.
+    steps, more : int
+        Of all, and then of those that have not settled, at most.
     """
     every = slice(None)
     state = _State.of(model_of(every), start, prior, weight)
     # What most fits still lack is little; those that cannot settle must not hold up the others.
     state.settle(model_of(every), prior, weight, steps, _MOST)
     restless = np.flatnonzero(state.size >= _SETTLED)
-    if len(restless):
+    if len(restless) and more:
         part = state.part(restless)
-        part.settle(model_of(restless), prior.part(restless), weight[restless], _MORE_STEPS, 1.0)
+        part.settle(model_of(restless), prior.part(restless), weight[restless], more, 1.0)
         state.put(restless, part)
     linear = state.linear
     information, _ = _normal(linear, weight)
@@ -251,10 +263,12 @@ class _State:
             information[sharpest, BLUR, BLUR] = 1.0
             step = _solved(information, gradient)
         self.size = np.sqrt(np.maximum((step * gradient).sum(axis=1), 0))
-        if not self.damping.any():
-            return step
-        information[:, diagonal, diagonal] *= 1 + self.damping[:, None]
-        return _solved(information, gradient)
+        damped = np.flatnonzero(self.damping)
+        if len(damped):
+            part = information[damped]
+            part[:, diagonal, diagonal] *= 1 + self.damping[damped, None]
+            step[damped] = _solved(part, gradient[damped])
+        return step
 
 
 def _cost(linear: Linear, weight: Single, values: Array, prior: Prior) -> Array:

@@ -1,4 +1,4 @@
-"""Fitting the smooth map to points known along directions, against outliers, and choosing its form."""
+"""Fitting the smooth map to points known along directions, against outliers."""
 
 from __future__ import annotations
 
@@ -7,15 +7,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_map import Places, SmoothMap
+from neurocal_cli.detection.fit_map import FORMS, Places, SmoothMap
 from neurocal_cli.geometry import Array
 
-__all__ = ["FORMS", "MapFit", "Rows", "choose_map", "fit_map", "median"]
+__all__ = [
+    "STEPS",
+    "MapFit",
+    "Rows",
+    "Settled",
+    "finished_map",
+    "fit_map",
+    "loss_of",
+    "median",
+    "settled_map",
+    "usual_scale",
+]
 
-# Forms of the map from the simplest on: (radial parameters, degree of the polynomial rest).
-FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
-
-_STEPS = 25
+STEPS = 25  # at most
 _SHIFT_PRIOR = 1e-2  # 1/px^2
 _TINY = 1e-300
 _BELIEF = 20  # rows' worth of belief that variances are what they claim to be
@@ -23,11 +31,6 @@ _CREEPING = 5e-3  # of chi2; what is gained so slowly is not worth the steps
 _SETTLED = 0.2  # of chi2
 _DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
 _TUKEY = 6.0  # standard deviations beyond which a row counts as an outlier
-# A richer form must lower the chi2 by so much for each of its parameters; chance alone gives 1. Residuals far
-# above the noise are those of a board that is uneven by itself: its form is not smooth, and not for a
-# polynomial to follow, so that more is asked.
-_PRICE, _UNEVEN_PRICE = 2.25, 3.0
-_BARREN = 2  # richer forms without gain after which the search ends
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +113,7 @@ class MapFit:
         return FORMS.index((self.map.radial, self.map.degree))
 
 
-def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> MapFit:
+def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = STEPS) -> MapFit:
     """Levenberg-Marquardt steps with Tukey's weights, from a start that is nearly right.
 
     Parameters
@@ -123,6 +126,21 @@ def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> 
     steps : int
         At most.
     """
+    return finished_map(settled_map(start, rows, shift, steps), rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """A map after its last step: shifts, residuals (N,) and derivatives (P, N) of what they compare with."""
+
+    map: SmoothMap
+    shift: Array
+    residual: Array
+    jacobian: Array
+
+
+def settled_map(start: SmoothMap, rows: Rows, shift: Array, steps: int, worth: float = 0.0) -> Settled:
+    """Steps to the best map of a form, but only one if that gains less chi2 than would be worth more."""
     free, m = start.free, len(start.free)
     prior = np.concatenate([start.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
     values = np.concatenate([start.parameters[free], shift])
@@ -147,52 +165,15 @@ def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = _STEPS) -> 
             continue
         start, values, residual, jacobian = tried, moved, ahead, slopes
         damping = max(0.1 * damping, least)
+        if before - after < worth:
+            break
+        worth = 0.0
         z = residual * rows_there.steep
-        scale = _scale(z[telling])
+        scale = usual_scale(z[telling])
         weight = _tukey(z / scale) * precision
-        if before - after < max(_SETTLED * scale**2, _CREEPING * after) and damping <= _DAMPING:
+        if before - after < max(_SETTLED * scale**2, _CREEPING * after) and damping <= max(_DAMPING, least):
             break
-    return _finished(start, rows, telling, values[m:], residual, jacobian)
-
-
-def choose_map(start: SmoothMap, rows: Rows, shift: Array, enough: float = 0.0, least: int = 0) -> MapFit:
-    """The map of the simplest form that the rows do not contradict.
-
-    Parameters
-    ----------
-    start : SmoothMap
-        Of any form.
-    rows : Rows
-    shift : (K,) array [px]
-    enough : float
-        Chi2 per row with which no richer form is tried.
-    least : int
-        Index of the simplest form that is tried.
-    """
-    best: MapFit | None = None
-    barren, now, paid = 0, start, 0
-    telling, precision = rows.telling, 1 / np.sqrt(rows.variance)
-    n_telling = int(telling.sum())
-    for radial, degree in FORMS[least:]:
-        now = now.shaped(radial, degree)
-        if best is not None and len(now.free) + len(shift) > 0.5 * n_telling:
-            break
-        fit = fit_map(now, rows, shift)
-        now, shift = fit.map, fit.shift
-        z, count = fit.residual * precision, len(now.free)
-        scale = _scale(z[telling])
-        loss = _loss(z / scale)
-        excess = max(1.0, loss / max(n_telling - count, 1))
-        chance = _PRICE / scale**2
-        price = max(chance, _UNEVEN_PRICE - chance) * excess * (count - paid)
-        if best is None or _loss(best.residual * precision / scale) - loss > price:
-            best, paid, barren = fit, count, 0
-        else:
-            barren += 1
-        if barren >= _BARREN or loss * scale**2 + _PRICE * count < enough * len(rows.value):
-            break
-    assert best is not None
-    return best
+    return Settled(start, values[m:], residual, jacobian)
 
 
 def median(x: Array) -> float:
@@ -201,7 +182,7 @@ def median(x: Array) -> float:
     return float(flat[len(flat) // 2]) if len(flat) else float("nan")
 
 
-def _loss(z: Array) -> float:
+def loss_of(z: Array) -> float:
     """Chi2 that grows no more beyond what no good row reaches."""
     return float(np.minimum(z * z, 100.0).sum())
 
@@ -210,7 +191,7 @@ def _tukey(z: Array) -> Array:
     return np.asarray(np.clip(1 - (z / _TUKEY) ** 2, 0, None) ** 2)
 
 
-def _scale(z: Array) -> float:
+def usual_scale(z: Array) -> float:
     """How much larger than claimed the residuals of most rows are; at least 1.
 
     What the map cannot follow must not count as outliers as long as most rows have their share in it.
@@ -247,17 +228,12 @@ def _solved(normal: Array, gradient: Array, damping: float) -> Array:
     return np.asarray(size * np.linalg.solve(scaled, gradient * size))
 
 
-def _finished(
-    now: SmoothMap,
-    rows: Rows,
-    telling: NDArray[np.bool_],
-    shift: Array,
-    residual: Array,
-    jacobian: Array,
-) -> MapFit:
-    free = now.free
+def finished_map(settled: Settled, rows: Rows) -> MapFit:
+    """A settled map with its covariance, and what its residuals tell of the rows."""
+    now, shift, residual, jacobian = settled.map, settled.shift, settled.residual, settled.jacobian
+    free, telling = now.free, rows.telling
     z = residual / np.sqrt(rows.variance)
-    weight = _tukey(z / _scale(z[telling]))
+    weight = _tukey(z / usual_scale(z[telling]))
     good = weight > 0
     normal = (jacobian * (good / rows.variance)) @ jacobian.T
     normal[np.diag_indices_from(normal)] += np.concatenate(

@@ -1,4 +1,4 @@
-"""Detection beside OpenCV's finders, on the same rendered pictures, a board there or not.
+"""Detection beside OpenCV's finders: rendered pictures, a board there or not, and photographs.
 
 Run with ``pytest tests/benchmarks/test_detection_speed.py -n 0 --benchmark-enable``.
 """
@@ -14,18 +14,33 @@ from pytest_benchmark.fixture import BenchmarkFixture
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from rendered import picture
 
+from neurocal_cli.board import Board
+from neurocal_cli.detection.batch import keep_memory
+from neurocal_cli.detection.detect import detect_points
 from neurocal_cli.detection.finding import find_grids
 from neurocal_cli.detection.measuring import measure
 
 cv2 = pytest.importorskip("cv2")
 CONDITIONS = ["base", "2 Mpx", "5 Mpx", "clutter only"]
+PHOTOS = Path(__file__).resolve().parents[3] / "shared" / "data" / "opencv_stereo"
+# One board in view; three of them, of which one is asked for.
+PHOTOGRAPHS = ["right01.jpg", "left02.jpg"]
 
 
 def seen(condition: str) -> NDArray[np.uint8]:
     cv2.setNumThreads(1)
+    keep_memory()
     image = picture(condition, 900).image
     assert image.dtype == np.uint8
     return image
+
+
+def classic(image: NDArray[np.uint8]) -> bool:
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.001)
+    found, corners = cv2.findChessboardCorners(image, (9, 6))
+    if found:
+        cv2.cornerSubPix(image, corners.reshape(-1, 1, 2), (11, 11), (-1, -1), criteria)
+    return bool(found)
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
@@ -40,15 +55,7 @@ def test_neurocal_finds_and_measures(benchmark: BenchmarkFixture, condition: str
 def test_opencv_classic_and_subpix(benchmark: BenchmarkFixture, condition: str) -> None:
     image = seen(condition)
     benchmark.group = f"{condition}, {image.size / 1e6:.1f} Mpx"
-    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 30, 0.001)
-
-    def find() -> bool:
-        found, corners = cv2.findChessboardCorners(image, (9, 6))
-        if found:
-            cv2.cornerSubPix(image, corners.reshape(-1, 1, 2), (11, 11), (-1, -1), criteria)
-        return bool(found)
-
-    assert benchmark(find) == (condition != "clutter only")
+    assert benchmark(lambda: classic(image)) == (condition != "clutter only")
 
 
 @pytest.mark.parametrize("condition", CONDITIONS)
@@ -57,3 +64,33 @@ def test_opencv_sector_based(benchmark: BenchmarkFixture, condition: str) -> Non
     benchmark.group = f"{condition}, {image.size / 1e6:.1f} Mpx"
     found = benchmark(lambda: cv2.findChessboardCornersSB(image, (9, 6))[0])
     assert bool(found) == (condition != "clutter only")
+
+
+def photograph(name: str) -> NDArray[np.uint8]:
+    cv2.setNumThreads(1)
+    keep_memory()
+    image = cv2.imread(str(PHOTOS / name), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        pytest.skip("no photographs here")
+    return np.asarray(image, dtype=np.uint8)
+
+
+@pytest.mark.parametrize("name", PHOTOGRAPHS)
+def test_neurocal_on_photographs(benchmark: BenchmarkFixture, name: str) -> None:
+    image, board = photograph(name), Board.single(9, 6, 25.0)
+    benchmark.group = f"photograph {name}, {image.size / 1e6:.1f} Mpx"
+    assert len(benchmark(lambda: detect_points(image, board)).ids) == 93
+
+
+@pytest.mark.parametrize("name", PHOTOGRAPHS)
+def test_opencv_classic_and_subpix_on_photographs(benchmark: BenchmarkFixture, name: str) -> None:
+    image = photograph(name)
+    benchmark.group = f"photograph {name}, {image.size / 1e6:.1f} Mpx"
+    assert benchmark(lambda: classic(image))
+
+
+@pytest.mark.parametrize("name", PHOTOGRAPHS)
+def test_opencv_sector_based_on_photographs(benchmark: BenchmarkFixture, name: str) -> None:
+    image = photograph(name)
+    benchmark.group = f"photograph {name}, {image.size / 1e6:.1f} Mpx"
+    assert benchmark(lambda: cv2.findChessboardCornersSB(image, (9, 6))[0])
