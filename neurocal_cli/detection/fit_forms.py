@@ -24,7 +24,8 @@ __all__ = ["choose_map"]
 # polynomial to follow, so that more is asked.
 _PRICE, _UNEVEN_PRICE = 2.25, 3.0
 _FIRST_SHARE = 0.3  # of that price, which the first step must save for there to be more
-_BARREN = 2  # richer forms without gain after which the search ends
+_BARREN = 2  # richer forms without gain, of lenses or of polynomials, after which no more are tried
+_UNEVEN = 4.0  # times the noise; residuals from which on a polynomial is tried when no lens has gained
 
 
 def choose_map(
@@ -49,10 +50,12 @@ def choose_map(
         Indices of the simplest and the richest form that is tried.
     """
     best: Settled | None = None
-    barren, now, paid = 0, start, 0
+    now, paid, barren = start, 0, [0, 0]  # the latter of lenses, and of polynomials
     telling, precision = rows.telling, 1 / np.sqrt(rows.variance)
     n_telling, scale = int(telling.sum()), 0.0
     for radial, degree in FORMS[least : most + 1]:
+        if barren[degree > 0] >= _BARREN:
+            continue
         now = now.shaped(radial, degree)
         if best is not None and len(now.free) + len(shift) > 0.5 * n_telling:
             break
@@ -65,10 +68,13 @@ def choose_map(
         excess = max(1.0, loss / max(n_telling - count, 1))
         price = _price(scale) * excess * (count - paid)
         if best is None or loss_of(best.residual * precision / scale) - loss > price:
-            best, paid, barren = fit, count, 0
+            best, paid, barren = fit, count, [0, 0]
         else:
-            barren += 1
-        if barren >= _BARREN or loss * scale**2 + _PRICE * count < enough * len(rows.value):
+            barren[degree > 0] += 1
+        if loss * scale**2 + _PRICE * count < enough * len(rows.value):
+            break
+        # Where no lens bends the board so, it may still be bent itself.
+        if barren[0] >= _BARREN and scale < _UNEVEN:
             break
     assert best is not None
     return finished_map(best, rows)
