@@ -93,4 +93,4 @@ def test_opencv_classic_and_subpix_on_photographs(benchmark: BenchmarkFixture, n
 def test_opencv_sector_based_on_photographs(benchmark: BenchmarkFixture, name: str) -> None:
     image = photograph(name)
     benchmark.group = f"photograph {name}, {image.size / 1e6:.1f} Mpx"
-    assert benchmark(lambda: cv2.findChessboardCornersSB(image, (9, 6))[0])
+    benchmark(lambda: cv2.findChessboardCornersSB(image, (9, 6)))  # it misses some
