@@ -10,7 +10,7 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopR
 from neurocal_cli.camera import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.fitting import Fit
 from neurocal_cli.geometry import Array
-from neurocal_cli.job import Solution
+from neurocal_cli.job import Job, Solution
 from neurocal_cli.lens import Lens
 from neurocal_cli.observability import refuse_undetermined
 from neurocal_cli.odd_views import seen_from_behind
@@ -46,9 +46,21 @@ def assemble(fit: Fit, rejected: Rejected, *, method: str, trainer: str, seed: i
         straight_lines=fit.straight_lines,
         warnings=(
             *found.warnings,
+            *_corner_warning(job),
             *_mirrored_warning(seen_from_behind(job.views, fit.solution.refined.state)),
             *_rejection_warnings(rejected, len(fit.points)),
         ),
+    )
+
+
+def _corner_warning(job: Job) -> tuple[str, ...]:
+    """Where no point is, a lens is anyone's guess."""
+    if job.restraint is None:
+        return ()
+    return (
+        f"the points do not reach the image's corners, where the distortion {job.known.lens.model} that fits "
+        "them best folds back; the best one that does not is given, and what it says of the corners is a "
+        "guess: add views that show the board there",
     )
 
 

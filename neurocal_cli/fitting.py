@@ -113,7 +113,7 @@ class Fitter:
         seen, tally = fit.seen, fit.job.tally
         state = normalised(replace(seen, R=seen.R[place], t=seen.t[place]), views)
         own = Tally(**{**vars(tally), "agreed": tally.agreed[place]})
-        job = replace(fit.job, views=views, tally=own)
+        job = replace(fit.job, views=views, tally=own, restraint=None)
         return self._finished(job, Solution(job.refine(state), own), points)
 
     def _job(self, views: Views, known: Known) -> Job:
@@ -127,7 +127,7 @@ class Fitter:
             found = choose_lens(job, solution, points, lambda: self._bent_starts(job.views, points))
             job, solution, choice, refusal = found.job, found.solution, found.held_out_px, found.refusal
         job, solution, share = reweighted(job, solution, points)
-        if self.lens != "auto":
+        if self.lens != "auto" or points.covariance is not None:  # weighed anew, it may have moved
             job, solution = check_lens(job, solution, points)
         return Fit(job, solution, points, share, choice, refusal=refusal)
 

@@ -12,17 +12,14 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.errors import DegenerateGeometryError, InputError
-from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Solution
-from neurocal_cli.lens import Lens, fold_radius, undistort
-from neurocal_cli.pixel_error import ENTRIES
+from neurocal_cli.lens import Lens
+from neurocal_cli.lens_domain import straight_pixels
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known, intrinsic_matrix
+from neurocal_cli.unfolding import folds_back, unfolded
 
-__all__ = ["check_lens", "folds_back", "straighten"]
-
-_BORDER = 17  # points along each side of the image at which the lens is checked
-_FARTHEST = 100  # points looked at
+__all__ = ["check_lens", "straighten"]
 
 
 def straighten(points: Correspondences, known: Known) -> Correspondences:
@@ -35,7 +32,7 @@ def straighten(points: Correspondences, known: Known) -> Correspondences:
     """
     if known.free_lens or not known.lens.bends:
         return points
-    straight = _straight_pixels(known.lens, intrinsic_matrix(known.entries), points.pixels)
+    straight = straight_pixels(known.lens, intrinsic_matrix(known.entries), points.pixels)
     lost = ~np.isfinite(straight[:, 0])
     if lost.any():
         row = int(np.argmax(lost))
@@ -50,6 +47,8 @@ def straighten(points: Correspondences, known: Known) -> Correspondences:
 def check_lens(job: Job, solution: Solution, points: Correspondences) -> tuple[Job, Solution]:
     """Take the last step on the pixels as they were seen, if the lens was given, and check the lens.
 
+    One that folds back where no point is seen is fitted so that it does not, unless the points deny it.
+
     Parameters
     ----------
     job, solution
@@ -60,7 +59,7 @@ def check_lens(job: Job, solution: Solution, points: Correspondences) -> tuple[J
     Raises
     ------
     DegenerateGeometryError
-        A lens that folds the image back onto itself inside the image or the points.
+        A lens that folds the image back onto itself inside the points, or inside the image whatever one does.
     """
     known, lens = job.known, job.known.lens
     if lens.model == "none":
@@ -73,46 +72,14 @@ def check_lens(job: Job, solution: Solution, points: Correspondences) -> tuple[J
         solution = Solution(job.refine(state), job.tally)
     state = solution.refined.state
     where = folds_back(Lens(lens.model, state.k), known.matrix(state.entries[0], job.views), points)
-    if where is not None:
-        raise DegenerateGeometryError(
-            f"the distortion {lens.model} folds back inside the {where}; choose a simpler model, or "
-            "give points nearer to the image's corners"
-        )
-    return job, solution
-
-
-def _straight_pixels(lens: Lens, A: Array, pixels: Array) -> Array:
-    """Pixels without the lens, (N, 2); nan where there are none."""
-    a, s, b, u0, v0 = A[ENTRIES]
-    y = (pixels[:, 1] - v0) / b
-    x = (pixels[:, 0] - u0 - s * y) / a
-    x, y = undistort(lens.model, lens.coefficients, x, y)
-    return np.column_stack([a * x + s * y + u0, b * y + v0])
-
-
-def folds_back(lens: Lens, A: Array, points: Correspondences) -> str | None:
-    """Where a lens folds back: within the points, within the rest of the image, or nowhere.
-
-    The image is looked at along its border, where its size is known.
-    """
-    if lens.model == "none":
-        return None
-    # The farthest points say it all.
-    away = np.hypot(points.pixels[:, 0] - A[0, 2], points.pixels[:, 1] - A[1, 2])
-    places = [points.pixels[np.argsort(-away, kind="stable")[:_FARTHEST]]]
-    if points.image_size is not None:
-        width, height = points.image_size
-        along, ends = np.linspace(0, 1, _BORDER), np.zeros(_BORDER)
-        for u, v in ((along, ends), (along, ends + 1), (ends, along), (ends + 1, along)):
-            places.append(np.column_stack([u * (width - 1), v * (height - 1)]))
-    if not _folds(lens, A, np.concatenate(places)):
-        return None
-    return "points" if len(places) == 1 or _folds(lens, A, places[0]) else "image"
-
-
-def _folds(lens: Lens, A: Array, pixels: Array) -> bool:
-    straight = _straight_pixels(lens, A, pixels)
-    radius = np.hypot((straight[:, 0] - A[0, 2]) / A[0, 0], (straight[:, 1] - A[1, 2]) / A[1, 1])
-    largest = float(np.nanmax(radius, initial=0.0))
-    reached = np.isfinite(straight).all()
-    return not reached or fold_radius(lens.model, lens.coefficients, largest) <= largest
+    if where is None:
+        return job, solution
+    if where == "image" and known.free_lens and solution.shared is None:
+        found = unfolded(job.views, known, solution.refined, points)
+        if found is not None:
+            job.tally.refinements += found[0].iterations
+            return replace(job, restraint=found[1]), Solution(found[0], job.tally)
+    raise DegenerateGeometryError(
+        f"the distortion {lens.model} folds back inside the {where}; choose another model, or "
+        "give points nearer to the image's corners"
+    )

@@ -12,7 +12,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.lens import pinhole_coefficients
 from neurocal_cli.pixel_error import CameraState
 from neurocal_cli.problems import Known
-from neurocal_cli.refine import Refined, refine
+from neurocal_cli.refine import Refined, Restraint, refine
 from neurocal_cli.starts import Agreement
 from neurocal_cli.training import Task, Trained, Trainer
 from neurocal_cli.views import Views
@@ -122,6 +122,8 @@ class Job:
         Called with the stage's name and the share of it that is done.
     tally : Tally, optional
         A new one, unless the job goes on from another.
+    restraint : callable, optional
+        What the lens has to obey beside the points.
     """
 
     views: Views
@@ -130,6 +132,7 @@ class Job:
     rng: np.random.Generator
     progress: Callable[[str, float], None]
     tally: Tally = field(default_factory=lambda: Tally(np.zeros(0, dtype=np.int64)))
+    restraint: Restraint | None = None
 
     def __post_init__(self) -> None:
         if not self.tally.agreed.size:
@@ -153,8 +156,10 @@ class Job:
         return self._count(self._refined(state, max_iterations))
 
     def _refined(self, state: CameraState, steps: int) -> Refined:
-        free = self.known.free if state.lens == "none" else self.known.free_camera
-        return refine(self.views.tiles, state, free, self.known.free_poses, steps)
+        known = self.known
+        if state.lens == "none":
+            return refine(self.views.tiles, state, known.free, known.free_poses, steps)
+        return refine(self.views.tiles, state, known.free_camera, known.free_poses, steps, self.restraint)
 
     def _count(self, refined: Refined) -> Refined:
         self.tally.refinements += refined.iterations

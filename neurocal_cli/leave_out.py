@@ -121,18 +121,37 @@ def held_out(
 
 
 @_quietly
-def held_out_views(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Array:
-    """Squared error of each view when it is left out; (V,), nan where the others cannot do without it."""
+def held_out_views(
+    normal: Array,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    held: tuple[Array, Array] | None = None,
+) -> Array:
+    """Squared error of each view when it is left out; (V,), nan where the others cannot do without it.
+
+    Parameters
+    ----------
+    normal, free, free_poses
+        As for `reduced`.
+    held : (f, f) array and (f,) array, optional
+        What a restraint adds to the normal matrix of the shared parameters and to its right side.
+    """
     q = reduced(normal, free, free_poses)
     G = len(q.cost)
     fold = np.arange(G) % FOLDS if G > FOLDS else np.arange(G)
     member = (fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float)
-    step = _steps(q, 1.0 - member)[fold]
+    step = _steps(q, 1.0 - member, held)[fold]
     return np.asarray(q.cost - 2 * (q.g * step).sum(-1) + (step * (q.S @ step[..., None])[..., 0]).sum(-1))
 
 
 @_quietly
-def held_out_points(views: Views, state: CameraState, free: NDArray[np.bool_], free_poses: bool) -> Array:
+def held_out_points(
+    views: Views,
+    state: CameraState,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    held: tuple[Array, Array] | None = None,
+) -> Array:
     """Squared error of the folds of each view's points when they are left out; (V * folds,).
 
     The folds are wedges of each view's image: what is wrong with a target shows up in neighbouring
@@ -140,7 +159,7 @@ def held_out_points(views: Views, state: CameraState, free: NDArray[np.bool_], f
     """
     normal = _by_fold(views, state, _wedges(views))  # (V, F, W, W)
     rest = normal.sum(axis=1, keepdims=True) - normal
-    step = _whole_steps(rest, free, free_poses)
+    step = _whole_steps(rest, free, free_poses, held)
     lost = normal[..., -1, -1] - 2 * (normal[..., :-1, -1] * step).sum(axis=-1)
     lost += (step * (normal[..., :-1, :-1] @ step[..., None])[..., 0]).sum(axis=-1)
     return np.asarray(lost.reshape(-1))
@@ -180,12 +199,15 @@ def _by_fold(views: Views, state: CameraState, fold: NDArray[np.intp]) -> Array:
     return blocks.reshape(views.n_views, FOLDS, *found.shape[1:])
 
 
-def _whole_steps(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Array:
+def _whole_steps(
+    normal: Array, free: NDArray[np.bool_], free_poses: bool, held: tuple[Array, Array] | None
+) -> Array:
     """Steps to the minimum of each fold's normal matrices (V, F, W, W), poses included; (V, F, W - 1)."""
     shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     step = np.zeros((*normal.shape[:2], normal.shape[-1] - 1))
     q = reduced(normal, free, free_poses)
-    camera = _solved(q.S.sum(axis=0), q.g.sum(axis=0))  # (F, f)
+    S, g = q.S.sum(axis=0), q.g.sum(axis=0)
+    camera = _solved(S, g) if held is None else _solved(S + held[0], g + held[1])  # (F, f)
     step[..., shared] = camera
     if free_poses:
         solved = _poses_by_camera(normal, shared)
@@ -237,9 +259,10 @@ def disagreement(
     return step[0] - step[1], inverse(S).sum(axis=0)
 
 
-def _steps(q: Quadratics, member: Array) -> Array:
+def _steps(q: Quadratics, member: Array, held: tuple[Array, Array] | None = None) -> Array:
     """Steps of the shared parameters to the minimum over some views; (F, G) -> (F, f)."""
-    return _solved(np.einsum("fg,gij->fij", member, q.S), member @ q.g)
+    S, g = np.einsum("fg,gij->fij", member, q.S), member @ q.g
+    return _solved(S, g) if held is None else _solved(S + held[0], g + held[1])
 
 
 @_quietly

@@ -30,7 +30,6 @@ __all__ = [
     "bend",
     "coefficient_names",
     "distort",
-    "fold_radius",
     "pinhole_coefficients",
     "undistort",
 ]
@@ -223,27 +222,3 @@ def undistort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, A
     from neurocal_cli.lens_domain import straightened  # which is made of the models here
 
     return straightened(Lens(model, np.asarray(k, dtype=float)), x, y)
-
-
-def fold_radius(model: str, k: Coefficients, largest: float) -> float:
-    """Radius of straight points from which on the lens maps back inwards.
-
-    Parameters
-    ----------
-    model : str
-    k : sequence of float
-    largest : float
-        Radius up to which to look.
-
-    Returns
-    -------
-    radius : float
-        infinity when the image grows monotonically up to `largest`; tangential terms are left out.
-    """
-    names = coefficient_names(model)
-    radial = [0.0 if name in ("p1", "p2") else float(c) for name, c in zip(names, k, strict=True)]
-    r = np.linspace(0.0, largest, 2001)[1:]
-    _, (xx, _, _, yy), _ = bend(model, radial, r, np.zeros_like(r))
-    # Along a ray the image must grow, and across it must not pass through 0.
-    folded = ~((xx > 0) & (yy > 0))
-    return float(r[np.argmax(folded)]) if folded.any() else float("inf")

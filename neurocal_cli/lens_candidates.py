@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from neurocal_cli.camera import INTRINSIC_NAMES
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
-from neurocal_cli.given_lens import folds_back
 from neurocal_cli.job import Job
 from neurocal_cli.leave_out import held_out_points, held_out_views
 from neurocal_cli.lens import Lens, bend, coefficient_names, pinhole_coefficients
@@ -18,6 +18,7 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known
 from neurocal_cli.refine import Refined, refine
 from neurocal_cli.uncertainty import Covariance, covariance
+from neurocal_cli.unfolding import Unfolded, folds_back, unfolded
 from neurocal_cli.views import Views
 
 __all__ = ["Candidate", "fit_candidates", "supported"]
@@ -54,6 +55,8 @@ class Candidate:
         Where it folds back, within the points or within the image.
     determined : bool
         Whether the points leave no parameter open.
+    restraint : Unfolded or None
+        What keeps it from folding back.
     """
 
     known: Known
@@ -62,11 +65,17 @@ class Candidate:
     noise: bool
     folds: str | None
     determined: bool
+    restraint: Unfolded | None = None
 
     @property
     def sound(self) -> bool:
         """Whether it may be chosen."""
         return not self.noise and self.folds is None and self.determined
+
+    @property
+    def coefficients(self) -> int:
+        """How many of the lens's coefficients were estimated."""
+        return int(self.known.free_camera[5:].sum())
 
     @property
     def cost(self) -> float:
@@ -76,7 +85,9 @@ class Candidate:
 
 def supported(known: Known, model: str, views: Views) -> Known | None:
     """What is known with this model to be estimated; None when there are too few points for it."""
-    with_lens = replace(known, lens=Lens(model), free_lens=model != "none")
+    # Coefficients that stay as they are belong to another model.
+    fixed = known.fixed & set(INTRINSIC_NAMES)
+    with_lens = replace(known, lens=Lens(model), free_lens=model != "none", fixed=fixed)
     equations = 2 * int(views.distinct.sum())
     if model != "none" and equations < _SPARE * parameter_count(with_lens, views.n_views) + 4:
         return None
@@ -97,84 +108,103 @@ def fit_candidates(
     by_views : bool
         Whether views are left out, or points.
     """
-    fitted: dict[str, Candidate] = {}
-    reach = _reach(job.views, state)
-    for model in _MODELS:
-        known = supported(job.known, model, job.views)
-        if known is None or (model == "fisheye" and reach < _WIDE):
-            continue
-        if model == "fisheye":
-            candidate = _fit_fisheye(job, known, state, points, by_views, reach)
-        else:
-            start = replace(state, lens=model, k=_coefficients(state, model, reach))
-            candidate = _fit(job, known, start, points, by_views, reach)
-        if candidate is None:
-            continue
-        fitted[model] = candidate
-        if model != "none" and candidate.folds is None:
-            state = candidate.refined.state
-    for simple, more in zip(_CHAIN[-2::-1], _CHAIN[:0:-1], strict=True):
-        _fit_again(job, simple, more, fitted, points, by_views, reach)
-    return fitted
+    return _Bench(job, points, by_views, _reach(job.views, state)).all_from(state)
 
 
-def _fit_again(
-    job: Job,
-    simple: str,
-    more: str,
-    fitted: dict[str, Candidate],
-    points: Correspondences,
-    by_views: bool,
-    reach: float,
-) -> None:
-    """A model that is far behind one with more coefficients may have lost its way: begin there."""
-    if simple not in fitted or more not in fitted or fitted[simple].cost < _BEHIND * fitted[more].cost:
-        return
-    known, state = fitted[simple].known, fitted[more].refined.state
-    start = replace(state, lens=simple, k=_coefficients(state, simple, reach))
-    candidate = _fit(job, known, start, points, by_views, reach)
-    if candidate is not None and candidate.cost < fitted[simple].cost:
-        fitted[simple] = candidate
+@dataclass(frozen=True, eq=False)
+class _Bench:
+    """What all fits have in common.
 
+    Attributes
+    ----------
+    job : Job
+    points : Correspondences
+    by_views : bool
+    reach : float
+        Of the points.
+    """
 
-def _fit_fisheye(
-    job: Job, known: Known, state: CameraState, points: Correspondences, by_views: bool, reach: float
-) -> Candidate | None:
-    """With as few coefficients as predict well."""
-    best: Candidate | None = None
-    for count, tail in _FISHEYES:
-        some = replace(known, fixed=known.fixed | tail)
-        start = replace(state, lens="fisheye", k=_coefficients(state, "fisheye", reach, count))
-        candidate = _fit(job, some, start, points, by_views, reach)
-        if candidate is None or (best is not None and best.sound and not candidate.sound):
-            continue
-        if best is None or not best.sound or candidate.lost.sum() < _PAYS * best.lost.sum():
-            best = candidate
-    return best
+    job: Job
+    points: Correspondences
+    by_views: bool
+    reach: float
 
+    def all_from(self, state: CameraState) -> dict[str, Candidate]:
+        fitted: dict[str, Candidate] = {}
+        for model in _MODELS:
+            known = supported(self.job.known, model, self.job.views)
+            if known is None or (model == "fisheye" and self.reach < _WIDE):
+                continue
+            flat = model != "fisheye"
+            candidate = self._fit(known, state) if flat else self._fisheye(known, state, fitted)
+            if candidate is None:
+                continue
+            fitted[model] = candidate
+            if model != "none" and candidate.folds is None:
+                state = candidate.refined.state
+        for simple, more in zip(_CHAIN[-2::-1], _CHAIN[:0:-1], strict=True):
+            self._fit_again(simple, more, fitted)
+        lowest = min((c.cost for c in fitted.values()), default=0.0)
+        return {m: c if m == "fisheye" else self._unfolded(c, lowest) for m, c in fitted.items()}
 
-def _fit(
-    job: Job, known: Known, start: CameraState, points: Correspondences, by_views: bool, reach: float
-) -> Candidate | None:
-    """None when it did not settle, or too little is left for it without a part of the data."""
-    views = job.views
-    steps = _RATIONAL_STEPS if start.lens == "rational" else _STEPS
-    refined = refine(views.tiles, start, known.free_camera, known.free_poses, steps)
-    state = refined.state
-    if not refined.converged and state.lens != "none":
-        return None
-    if by_views:
-        lost = held_out_views(refined.normal, known.free_camera, known.free_poses)
-    else:
-        lost = held_out_points(views, state, known.free_camera, known.free_poses)
-    if not np.isfinite(lost).all():
-        if state.lens != "none":
+    def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
+        """A model that is far behind one with more coefficients may have lost its way: begin there."""
+        if simple not in fitted or more not in fitted or fitted[simple].cost < _BEHIND * fitted[more].cost:
+            return
+        candidate = self._fit(fitted[simple].known, fitted[more].refined.state)
+        if candidate is not None and candidate.cost < fitted[simple].cost:
+            fitted[simple] = candidate
+
+    def _fisheye(self, known: Known, state: CameraState, others: dict[str, Candidate]) -> Candidate | None:
+        """With as few coefficients as predict well."""
+        some = [
+            candidate
+            for count, tail in _FISHEYES
+            if (candidate := self._fit(replace(known, fixed=known.fixed | tail), state, count)) is not None
+        ]
+        lowest = min((c.cost for c in [*others.values(), *some]), default=0.0)
+        best: Candidate | None = None
+        for folding in some:
+            candidate = self._unfolded(folding, lowest)
+            if best is not None and best.sound and not candidate.sound:
+                continue
+            if best is None or not best.sound or candidate.lost.sum() < _PAYS * best.lost.sum():
+                best = candidate
+        return best
+
+    def _fit(self, known: Known, state: CameraState, most: int = 4) -> Candidate | None:
+        """None when it did not settle, or too little is left for it without a part of the data."""
+        model = known.lens.model
+        start = replace(state, lens=model, k=_coefficients(state, model, self.reach, most))
+        steps = _RATIONAL_STEPS if model == "rational" else _STEPS
+        refined = refine(self.job.views.tiles, start, known.free_camera, known.free_poses, steps)
+        if not refined.converged and model != "none":
             return None
-        lost = np.full_like(lost, np.inf)
-    cov = covariance(refined.normal, known.free_camera, known.free_poses, 2 * len(views.index))
-    noise = _noise(known, state, reach, cov.entries)
-    folds = folds_back(Lens(state.lens, state.k), known.matrix(state.entries[0], views), points)
-    return Candidate(known, refined, lost, noise, folds, _determined(views, known, state, cov))
+        return self._judged(known, refined)
+
+    def _unfolded(self, candidate: Candidate, lowest: float) -> Candidate:
+        """The same model without its fold, where that is but in a corner that the points do not reach."""
+        if candidate.folds != "image" or candidate.noise or candidate.cost > _BEHIND * lowest:
+            return candidate
+        found = unfolded(self.job.views, candidate.known, candidate.refined, self.points)
+        return candidate if found is None else self._judged(candidate.known, *found) or candidate
+
+    def _judged(self, known: Known, refined: Refined, restraint: Unfolded | None = None) -> Candidate | None:
+        views, state = self.job.views, refined.state
+        held = None if restraint is None else restraint.held(state, known.free_camera)
+        if self.by_views:
+            lost = held_out_views(refined.normal, known.free_camera, known.free_poses, held)
+        else:
+            lost = held_out_points(views, state, known.free_camera, known.free_poses, held)
+        if not np.isfinite(lost).all():
+            if state.lens != "none":
+                return None
+            lost = np.full_like(lost, np.inf)
+        cov = covariance(refined.normal, known.free_camera, known.free_poses, 2 * len(views.index))
+        noise = _noise(known, state, self.reach, cov.entries)
+        folds = folds_back(Lens(state.lens, state.k), known.matrix(state.entries[0], views), self.points)
+        determined = _determined(views, known, state, cov)
+        return Candidate(known, refined, lost, noise, folds, determined, restraint)
 
 
 def _determined(views: Views, known: Known, state: CameraState, cov: Covariance) -> bool:

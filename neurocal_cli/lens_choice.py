@@ -93,7 +93,8 @@ def choose_lens(
     n, px = len(views.index), views.pixel_scale
     table = {name: float(np.sqrt(c.lost.sum() / n)) * px for name, c in fitted.items()}
     refined = Solution(chosen.refined, job.tally)
-    return LensChoice(replace(job, known=chosen.known), refined, table, _refusal(fitted, chosen))
+    job = replace(job, known=chosen.known, restraint=chosen.restraint)
+    return LensChoice(job, refined, table, _refusal(fitted, chosen))
 
 
 def _views_can_spare_any(job: Job, solution: Solution) -> bool:

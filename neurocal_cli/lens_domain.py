@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import Lens, bend, coefficient_names, distort
 
-__all__ = ["first_fold", "is_seen", "straightened"]
+__all__ = ["first_fold", "is_seen", "radial_slope", "straight_pixels", "straightened"]
 
 _FARTHEST = 1e3  # radius of straight points that no image reaches
 _TABLE = 4096
@@ -38,6 +38,40 @@ def first_fold(lens: Lens) -> float:
     # With s = r^2: d/dr (r top / bottom) is 0 where (top + 2 s top') bottom = 2 s top bottom'.
     slope = np.convolve(top + _twice_s_slope(top), bottom) - np.convolve(top, _twice_s_slope(bottom))
     return float(np.sqrt(min(_first_root(slope), _first_root(bottom))))
+
+
+def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
+    """How fast the bent radius grows with the straight one, or a fisheye's with the angle.
+
+    Parameters
+    ----------
+    model : str
+    k : (K,) array
+    r : (m,) array
+        Straight radii, or a fisheye's angles.
+
+    Returns
+    -------
+    slope : (m,) array
+        Without the tangential terms; not positive from the first fold on.
+    by_k : (m, K) array
+    """
+    s = r[:, None] ** 2
+    if model == "fisheye":
+        n = np.arange(1, 5)
+        by_k = (2 * n + 1) * s**n
+        return 1.0 + by_k @ k, by_k
+    k1, k2, _, _, k3, k4, k5, k6 = np.r_[k, np.zeros(8 - len(k))]
+    n = np.arange(1, 4)
+    powers, growths = s**n, 2 * n * s**n  # and 2 s d/ds of them
+    top, top_growth = 1.0 + powers @ [k1, k2, k3], growths @ [k1, k2, k3]
+    bottom, bottom_growth = 1.0 + powers @ [k4, k5, k6], growths @ [k4, k5, k6]
+    slope = (top + top_growth) / bottom - top * bottom_growth / bottom**2
+    u, up, v, vp = (values[:, None] for values in (top, top_growth, bottom, bottom_growth))
+    by_top = (powers + growths) / v - powers * vp / v**2
+    by_bottom = -((u + up) * powers + u * growths) / v**2 + 2 * u * vp * powers / v**3
+    none = np.zeros((len(r), 2))
+    return slope, np.column_stack([by_top[:, :2], none, by_top[:, 2:], by_bottom])[:, : len(k)]
 
 
 def _twice_s_slope(p: Array) -> Array:
@@ -105,3 +139,12 @@ def _radially(lens: Lens, x: Array, y: Array) -> tuple[Array, Array]:
         straight = np.interp(seen, bent, r)
         stretch = np.where(seen > 0, straight / seen, 1.0)
     return x * stretch, y * stretch
+
+
+def straight_pixels(lens: Lens, A: Array, pixels: Array) -> Array:
+    """Pixels without the lens, (N, 2); nan where the lens cannot have seen any."""
+    a, s, b, u0, v0 = A[0, 0], A[0, 1], A[1, 1], A[0, 2], A[1, 2]
+    y = (pixels[:, 1] - v0) / b
+    x = (pixels[:, 0] - u0 - s * y) / a
+    x, y = straightened(lens, x, y)
+    return np.column_stack([a * x + s * y + u0, b * y + v0])

@@ -9,6 +9,7 @@ are eliminated view by view (Schur complement), so the cost grows linearly with 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,12 +21,16 @@ from neurocal_cli.geometry import Array, orthonormalised
 from neurocal_cli.pixel_error import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.tiles import Tiles
 
-__all__ = ["Refined", "refine"]
+__all__ = ["Refined", "Restraint", "refine"]
 
 _TOLERANCE = 1e-9  # a step that would lower E by a smaller share is the last
 _FLOOR = 1e-13  # rms in normalised pixels that rounding alone accounts for
 _LARGEST_DAMPING = 1e10
 _FLAT_SHARE = 1e-6  # a rejected step that promised less than this share: the bottom
+
+
+# Equations on the camera beside those of the points: derivatives (m, 5 + K), and what is missing (m,).
+Restraint = Callable[[CameraState], tuple[Array, Array]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +67,7 @@ def refine(
     free: NDArray[np.bool_],
     free_pose: bool = True,
     max_iterations: int = 200,
+    restraint: Restraint | None = None,
 ) -> Refined:
     """Minimise the pixel error (3) from a start that is already near.
 
@@ -76,34 +82,55 @@ def refine(
     free_pose : bool
         Whether the poses move.
     max_iterations : int
+    restraint : callable, optional
+        Of a camera that is shared: squares to be added to those of the pixels; the result's `normal` and
+        `cost` are of the pixels alone.
     """
-    descent = _Descent(tiles, start, free, free_pose)
+    descent = _Descent(tiles, start, free, free_pose, restraint)
     iterations = 0
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
         while iterations < max_iterations and not descent.done.all():
             descent.step()
             iterations += 1
-    state = replace(descent.state, R=orthonormalised(descent.state.R))
-    return Refined(state, descent.normal, descent.normal[:, -1, -1].copy(), iterations, descent.settled)
+    state, normal = replace(descent.state, R=orthonormalised(descent.state.R)), descent.normal
+    if restraint is not None:
+        normal, _ = normal_blocks(tiles, descent.state)
+    return Refined(state, normal, normal[:, -1, -1].copy(), iterations, descent.settled)
 
 
 class _Descent:
     """Levenberg-Marquardt over groups: all views together when they share what is sought, else one each."""
 
-    def __init__(self, tiles: Tiles, start: CameraState, free: NDArray[np.bool_], free_pose: bool) -> None:
-        self.tiles, self.state = tiles, start
+    def __init__(
+        self,
+        tiles: Tiles,
+        start: CameraState,
+        free: NDArray[np.bool_],
+        free_pose: bool,
+        restraint: Restraint | None,
+    ) -> None:
+        self.tiles, self.state, self.restraint = tiles, start, restraint
         # Columns of the free camera parameters, and their places among all of them.
         self.camera = camera_columns(start.k.shape[-1])
         self.free, self.free_pose = np.flatnonzero(free), free_pose
         self.together = len(start.entries) == 1 and bool(self.free.size) and tiles.n_views > 1
         groups = 1 if self.together else tiles.n_views
-        self.normal, _ = normal_blocks(tiles, start)
+        self.normal, _ = self._blocks(start)
         self.cost = self._by_group(self.normal[:, -1, -1])
         self.damping = np.full(groups, 1e-4)
         self.growth = np.full(groups, 2.0)
         self.floor = self._by_group(tiles.counts * 2.0 * _FLOOR**2)
         self.settled = self.cost <= self.floor
         self.done = self.settled.copy()
+
+    def _blocks(self, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
+        normal, sensible = normal_blocks(self.tiles, state)
+        if self.restraint is not None:
+            by_camera, missing = self.restraint(state)
+            rows = np.zeros((len(missing), normal.shape[-1]))
+            rows[:, self.camera], rows[:, -1] = by_camera, missing
+            normal[0] += rows.T @ rows  # of any view: the camera is that of all
+        return normal, sensible
 
     def _by_group(self, by_view: NDArray[Any]) -> Array:
         return by_view.sum(keepdims=True) if self.together else by_view
@@ -112,7 +139,7 @@ class _Descent:
         """One step of every group that is not done; the others stay."""
         by_camera, by_pose, predicted = self._solve()
         trial = self.state.moved(by_camera, by_pose)
-        normal, by_view = normal_blocks(self.tiles, trial)
+        normal, by_view = self._blocks(trial)
         sensible = by_view.all(keepdims=True) if self.together else by_view
         sensible = sensible & (trial.entries[:, [0, 2]] > 0).all(axis=1)
         after = self._by_group(normal[:, -1, -1])

@@ -1,13 +1,23 @@
-"""Flat boards seen through lenses that bend, drawn at random, none of which folds back."""
+"""Flat boards seen through lenses that bend, drawn at random, none of which folds back; and new views."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scenes import Scene, random_flat_set
 
-from neurocal_cli.lens import distort, fold_radius
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera import Pose, project
+from neurocal_cli.geometry import Array
+from neurocal_cli.lens import Lens, distort
+from neurocal_cli.lens_domain import first_fold, is_seen
+from neurocal_cli.points import Correspondences
+from neurocal_cli.refine import refine
+from neurocal_cli.unfolding import folds_back
+from neurocal_cli.user_units import Seen, normalised
+from neurocal_cli.views import arrange
 
 BENT = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "fisheye")
 SIGMA = 0.2
@@ -25,8 +35,11 @@ def bent_set(model: str, seed: int) -> tuple[Scene, list[float]]:
         reach = float(np.hypot(*((corners - A[:2, 2]) / [A[0, 0], A[1, 1]]).T).max())
         k = coefficients(model, 0.6 * width / A[0, 0], rng)
         enough = len(scene.world) >= 25 * n_views
-        if enough and (model == "none" or fold_radius(model, k, 1.6 * reach) > 1.6 * reach):
-            return through(scene, model, k), k
+        if not enough or (model != "none" and first_fold(Lens(model, k)) < 1.6 * reach):
+            continue
+        bent = through(scene, model, k)
+        if sees(scene, model, k).all() and folds_back(Lens(model, k), A, bent.points()) is None:
+            return bent, k
 
 
 def coefficients(model: str, r: float, rng: np.random.Generator) -> list[float]:
@@ -41,13 +54,55 @@ def coefficients(model: str, r: float, rng: np.random.Generator) -> list[float]:
     return [float(k) for k in whole[: {"none": 0, "k1": 1, "k1k2": 2, "k1k2p1p2": 4, "plumb_bob": 5}[model]]]
 
 
+def sees(scene: Scene, model: str, k: list[float]) -> NDArray[np.bool_]:
+    """Whether the scene's points, as a pinhole has them, lie where the lens does not fold."""
+    x, y = without_camera(scene.intrinsics.A, scene.pixels)
+    return is_seen(Lens(model, k), x, y)
+
+
+def without_camera(A: Array, pixels: Array) -> tuple[Array, Array]:
+    y = (pixels[:, 1] - A[1, 2]) / A[1, 1]
+    return (pixels[:, 0] - A[0, 2] - A[0, 1] * y) / A[0, 0], y
+
+
+@dataclass(frozen=True, eq=False)
+class NewViews:
+    """Views that no calibration has seen, with their true poses in the order of the views."""
+
+    points: Correspondences
+    poses: list[Pose]
+
+    def error(self, camera: Calibration) -> float:
+        """Rms error [px] of a camera in them, each through the pose that suits the camera best."""
+        views, R = arrange(self.points), np.stack([pose.R for pose in self.poses])
+        lens = Lens(camera.distortion_model, camera.distortion)
+        start = normalised(Seen(camera.K, lens, R, np.stack([pose.t for pose in self.poses])), views)
+        found = refine(views.tiles, start, np.zeros(5 + len(start.k), dtype=bool))
+        return float(np.sqrt(found.cost.sum() / len(views.index))) * views.pixel_scale
+
+
+def new_views(scene: Scene, model: str, k: list[float], seed: int, n_views: int = 20) -> NewViews:
+    """Other boards anywhere in the image of the same camera, with noise."""
+    rng = np.random.default_rng([seed, 2])
+    K = scene.intrinsics
+    others = random_flat_set(rng, n_views, False, f=K.alpha_u, width=scene.image_size[0], cols=9, rows=7)
+    view = np.array(others.view)
+    pixels = np.concatenate([project(K.A, others.poses[v], others.world[view == v])[0] for v in others.poses])
+    pinhole = replace(others, pixels=pixels, intrinsics=K, image_size=scene.image_size)
+    points = through(pinhole, model, k).points(SIGMA, rng)
+    inside = ((points.pixels > 0) & (points.pixels < np.array(scene.image_size) - 1)).all(axis=1)
+    points = points.select(inside & sees(pinhole, model, k))
+    enough = np.bincount(points.view_index) >= 12
+    points = points.select(enough[points.view_index])
+    return NewViews(points, [others.poses[name] for name in points.view_names])
+
+
 def through(scene: Scene, model: str, k: list[float]) -> Scene:
     """The same scene through a lens."""
     if model == "none":
         return scene
     A = scene.intrinsics.A
-    y = (scene.pixels[:, 1] - A[1, 2]) / A[1, 1]
-    x = (scene.pixels[:, 0] - A[0, 2] - A[0, 1] * y) / A[0, 0]
+    x, y = without_camera(A, scene.pixels)
     x, y = distort(model, k, x, y)
     return replace(
         scene, pixels=np.column_stack([A[0, 0] * x + A[0, 1] * y + A[0, 2], A[1, 1] * y + A[1, 2]])

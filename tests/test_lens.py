@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.lens import MODELS, bend, coefficient_names, distort, fold_radius, undistort
+from neurocal_cli.lens import MODELS, bend, coefficient_names, distort, undistort
 
 # Coefficients of real lenses' sizes.
 LENSES = {
@@ -87,13 +87,6 @@ def test_what_no_point_bends_to_is_nan() -> None:
     x, _ = undistort("k1", [-1.0], np.array([0.3, 0.5]), np.zeros(2))
     assert np.isfinite(x[0])
     assert np.isnan(x[1])
-
-
-def test_the_fold_of_a_barrel_lens_is_found() -> None:
-    # d/dr (r + k1 r^3) = 0 at r = 1 / sqrt(-3 k1).
-    assert fold_radius("k1", [-0.3], 2.0) == pytest.approx(1 / np.sqrt(0.9), rel=1e-3)
-    assert fold_radius("k1", [-0.3], 1.0) == np.inf
-    assert fold_radius("fisheye", LENSES["fisheye"], 5.0) == np.inf
 
 
 def test_an_unknown_model_is_refused() -> None:

@@ -14,7 +14,6 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, Vie
 from neurocal_cli.camera import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, euler_jacobian
-from neurocal_cli.given_lens import folds_back
 from neurocal_cli.lens import Lens
 from neurocal_cli.parameters import parameter_covariance, parameter_warnings, pose_std
 from neurocal_cli.pixel_error import ENTRIES, POSE, CameraState, residuals
@@ -24,8 +23,9 @@ from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.refine import RefinedRig
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.tiles import Tiles
+from neurocal_cli.unfolding import folds_back
 
-__all__ = ["assemble_rig"]
+__all__ = ["assemble_rig", "folding_sides"]
 
 _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which rounding rules
 
@@ -45,6 +45,26 @@ def assemble_rig(
         The points leave the answer open.
     """
     return _RigAssembly(problem, calibrations, refined, free).rig(left_out)
+
+
+def folding_sides(
+    problem: RigProblem,
+    calibrations: tuple[Calibration, Calibration],
+    refined: RefinedRig,
+    free: NDArray[np.bool_],
+) -> list[int]:
+    """Cameras whose lens, as the common refinement has it, folds back inside the image."""
+    columns, shared = Columns.of(refined.state), np.flatnonzero(free)
+    found = []
+    for side, own in enumerate((columns.left, columns.right)):
+        camera, seen, given = refined.state.cameras[side], problem.sightings[side], calibrations[side]
+        estimated = np.isin(own, shared)
+        if not estimated.any():
+            continue
+        A = _intrinsics(given, camera, seen, estimated[:5]).A if estimated[:5].any() else given.K
+        if folds_back(Lens(camera.lens, camera.k), A, given.points) is not None:
+            found.append(side)
+    return found
 
 
 class _RigAssembly:
@@ -181,13 +201,6 @@ class _RigAssembly:
         names = list(std)
         free = [k for k, name in enumerate(names) if name not in given.fixed]
         lens = Lens(camera.lens, camera.k)
-        where = folds_back(lens, intrinsics.A, given.points)
-        if where is not None:
-            raise DegenerateGeometryError(
-                f"{given.points.source}: together with the other camera, the distortion {lens.model} folds "
-                f"back inside the {where}; choose a simpler model, or give points nearer to the image's "
-                "corners"
-            )
         before: tuple[str, ...] = ()
         chosen = bool(given.lens_choice)
         if given.std.keys() >= std.keys():

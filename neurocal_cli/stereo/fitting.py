@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
-from neurocal_cli.stereo.assembly import assemble_rig
+from neurocal_cli.stereo.assembly import assemble_rig, folding_sides
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views
 from neurocal_cli.stereo.pixel_error import Columns
@@ -64,16 +65,30 @@ def fit_rig(
         raise UsageError(f"outliers must be reject or keep, not {outliers!r}")
     views = pair_views(left.points.view_names, right.points.view_names)
     pair_points(left.points, right.points, views)
-    problem, refined, free, left_out = _agreed(left, right, views, refine_cameras)
+    moving = [refine_cameras, refine_cameras]
+    problem, refined, free, left_out = _agreed(left, right, views, moving)
+    while folding := folding_sides(problem, (left, right), refined, free):
+        for side in folding:
+            moving[side] = False
+        problem, refined, free, left_out = _agreed(left, right, views, moving)
     if left_out and (outliers == "keep" or 2 * len(left_out) >= len(views.both)):
         raise DegenerateGeometryError(_contradiction(left_out, len(views.both), outliers))
     rig = assemble_rig(problem, (left, right), refined, free, left_out)
     _refuse_one_place(rig)
-    return replace(rig, warnings=_warnings(rig))
+    kept = [name for name, moves in zip(("left", "right"), moving, strict=True) if moves != refine_cameras]
+    return replace(rig, warnings=(*_warnings(rig), *map(_kept_warning, kept)))
+
+
+def _kept_warning(name: str) -> str:
+    return (
+        f"refined together with the other one, the {name} camera's lens would fold back inside the image, "
+        "where there are no points; the camera stays as its own views give it: add views that show the "
+        "board in the image's corners"
+    )
 
 
 def _agreed(
-    left: Calibration, right: Calibration, views: ViewPairs, refine_cameras: bool
+    left: Calibration, right: Calibration, views: ViewPairs, moving: Sequence[bool]
 ) -> tuple[RigProblem, RefinedRig, NDArray[np.bool_], dict[tuple[str, str], str]]:
     """Refine on the pairs that agree; pairs that the result contradicts leave, the worst first."""
     problem = rig_problem(left, right, views)
@@ -87,7 +102,8 @@ def _agreed(
             problem = rig_problem(left, right, _without(views, left_out))
         start = problem.start(consensus.rig)
         free = np.concatenate(
-            [free_parameters(c) & refine_cameras for c in (left, right)] + [np.ones(6, dtype=bool)]
+            [free_parameters(c) & moves for c, moves in zip((left, right), moving, strict=True)]
+            + [np.ones(6, dtype=bool)]
         )
         refined = refine_rig(problem.frames, problem.sightings, start, free)
         alone = problem.own_cost[0][problem.paired] + problem.own_cost[1][problem.paired_right]
