@@ -2,11 +2,13 @@
 
 Every model is fitted, each from the one before it. A model's held-out error decides: five folds of
 the views, or of the points of a single view. Models whose held-out rms error is within 0.9 % of the
-lowest (for a single view also within what chance does to five folds) are as good as each other; among
-them the Bayesian information criterion (Schwarz 1978) chooses, n log E + p log n, n being what the
-number of residuals is worth when neighbours are alike. Models that fold the image back, that did not settle
-or that there are too few points for do not take part, and models whose coefficients are noise only
-where their error over several views is 5 % below that of the others.
+lowest are as good as each other; so are those within what chance does to five folds, for a single view
+or where the criterion is decidedly for them. Among them the Bayesian information criterion (Schwarz
+1978) chooses, n log E + p log n, n being what the number of residuals is worth when neighbours are
+alike; no model with more than two coefficients beyond what it alone would choose takes part. Neither do
+models that did not settle, that there are too few points for, or that fold the image back and cannot
+do without (`unfolding`), and models whose coefficients are noise only where their error over several
+views is 5 % below that of the others.
 """
 
 from __future__ import annotations
@@ -16,8 +18,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Solution
-from neurocal_cli.leave_out import held_out_views
+from neurocal_cli.leave_out import FOLDS, held_out_views
 from neurocal_cli.lens_candidates import Candidate, fit_candidates
 from neurocal_cli.odd_views import free_networks
 from neurocal_cli.pixel_error import CameraState
@@ -31,7 +34,9 @@ _TIE = 0.009  # of the rms error
 _FAR_WORSE = 2.0  # times the rms error of a model that folds back
 _WORTH = 1.05  # times the rms error: what coefficients that cancel each other must be better by
 _CHANCE = 4.6  # standard errors, of five folds, that chance exceeds in one case of a hundred
-_LEAST_PENALTY = 6.6  # chi-squared of one superfluous coefficient in a hundred
+_LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
+_MORE = 2  # coefficients
+_DECISIVE = 10.0  # of the criterion: odds of 150
 _SHORT = 1.4  # times the rms error of free networks: the camera may be a wrong one
 
 
@@ -112,22 +117,44 @@ def _falls_short(views: Views, fitted: dict[str, Candidate]) -> bool:
 
 
 def _best(fitted: dict[str, Candidate], views: Views) -> str:
-    """Of the models whose held-out error is as low as any, the one with the lowest criterion."""
+    """Of the models whose held-out error is as low as any, the one with the lowest criterion.
+
+    What is held out may ask for two coefficients more than the criterion does, but not for more: a few
+    folds tell the better of two models, but among many models one is better than it should be by chance.
+    """
     sound = _eligible(fitted, views.n_views > 1)
-    best = min(sound.values(), key=lambda c: float(c.lost.sum()))
-    n = 2 * effective_number(len(views.index), correlation(views, of_points(views, best.refined.state)))
-    tied = {}
-    for name, candidate in sound.items():
-        if not np.isfinite(candidate.lost).all():
-            continue
-        excess = candidate.lost - best.lost
-        # Of the sum of the folds' differences; views tell models apart without it.
-        chance = 0.0 if views.n_views > 1 else _CHANCE * np.sqrt(len(excess)) * excess.std()
-        if excess.sum() <= max(2 * _TIE * best.lost.sum(), chance):
-            tied[name] = _criterion(candidate, n)
-    if not tied:
+    lowest = min(sound.values(), key=_lost)
+    n = 2 * effective_number(len(views.index), correlation(views, of_points(views, lowest.refined.state)))
+    criterion = {name: _criterion(candidate, n) for name, candidate in sound.items()}
+    most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + _MORE
+    pool = {
+        name: candidate
+        for name, candidate in sound.items()
+        if candidate.coefficients <= most and np.isfinite(candidate.lost).all()
+    }
+    if not pool:
         return next(iter(sound))  # the simplest: nothing can be left out
-    return min(tied, key=lambda name: tied[name])
+    best = min(pool, key=lambda name: _lost(pool[name]))
+    tied = []
+    for name, candidate in pool.items():
+        excess = _by_fold(candidate.lost - pool[best].lost)
+        chance = _CHANCE * np.sqrt(len(excess)) * excess.std()
+        # Folds of views tell models apart, unless all the data are decidedly of another opinion.
+        close = views.n_views == 1 or criterion[name] < criterion[best] - _DECISIVE
+        if excess.sum() <= max(2 * _TIE * _lost(pool[best]), chance if close else 0.0):
+            tied.append(name)
+    return min(tied, key=lambda name: criterion[name])
+
+
+def _lost(candidate: Candidate) -> float:
+    return float(candidate.lost.sum())
+
+
+def _by_fold(lost: Array) -> Array:
+    """Sums of what each view or fold of points has lost, of those that were left out together."""
+    if len(lost) <= FOLDS:
+        return lost
+    return np.array([lost[fold::FOLDS].sum() for fold in range(FOLDS)])
 
 
 def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidate]:
@@ -144,7 +171,7 @@ def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidat
 
 
 def _criterion(candidate: Candidate, n: float) -> float:
-    penalty = max(np.log(n), _LEAST_PENALTY) * len(candidate.refined.state.k)
+    penalty = max(np.log(n), _LEAST_PENALTY) * candidate.coefficients
     return float(n * np.log(max(candidate.cost, 1e-300)) + penalty)
 
 
