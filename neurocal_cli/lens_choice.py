@@ -123,8 +123,9 @@ def _best(fitted: dict[str, Candidate], views: Views) -> str:
     folds tell the better of two models, but among many models one is better than it should be by chance.
     """
     sound = _eligible(fitted, views.n_views > 1)
-    lowest = min(sound.values(), key=_lost)
-    n = 2 * effective_number(len(views.index), correlation(views, of_points(views, lowest.refined.state)))
+    # What a lens that is too simple leaves is alike in neighbours too, but tells of the lens.
+    closest = min(sound.values(), key=lambda c: c.cost).refined.state
+    n = 2 * effective_number(len(views.index), correlation(views, of_points(views, closest)))
     criterion = {name: _criterion(candidate, n) for name, candidate in sound.items()}
     most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + _MORE
     pool = {
