@@ -91,7 +91,7 @@ def choose_lens(
                     fitted[model] = candidate
     if not fitted:  # not even the pinhole settled: as it is
         return LensChoice(job, solution, {})
-    if "none" in fitted and not fitted["none"].determined and not _falls_short(views, {"": fitted["none"]}):
+    if "none" in fitted and not fitted["none"].determined and _is_enough(fitted["none"], views, fitted):
         fitted = {"none": fitted["none"]}  # a lens would only hide that the points leave the camera open
     chosen = fitted[_best(fitted, views)]
     job.tally.refinements += chosen.refined.iterations
@@ -114,6 +114,12 @@ def _falls_short(views: Views, fitted: dict[str, Candidate]) -> bool:
     """Whether every view by itself fits far better than the best of the common cameras."""
     best = min(fitted.values(), key=lambda c: c.cost)
     return best.cost > _SHORT**2 * float(free_networks(views, best.refined.state).sum()) + 1e-20
+
+
+def _is_enough(pinhole: Candidate, views: Views, fitted: dict[str, Candidate]) -> bool:
+    """Whether neither a lens nor a camera for each view explains far more."""
+    lowest = min(candidate.cost for candidate in fitted.values())
+    return pinhole.cost <= _SHORT**2 * lowest + 1e-20 and not _falls_short(views, {"": pinhole})
 
 
 def _best(fitted: dict[str, Candidate], views: Views) -> str:

@@ -60,6 +60,12 @@ def test_no_lens_is_found_where_there_is_none_in_one_view(seed: int) -> None:
     assert chosen(scene, seed).distortion_model == "none"
 
 
+def test_a_strong_lens_whose_boards_leave_a_pinhole_open_is_chosen() -> None:
+    # Small boards far away: each one's own network follows them no better than the pinhole.
+    scene, _ = bent_set("k1k2", 20007)
+    assert chosen(scene, 20007).distortion_model == "k1k2"
+
+
 def test_the_alternatives_are_told() -> None:
     scene, _ = bent_set("k1k2", 3)
     choice = chosen(scene, 3).lens_choice
