@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from neurocal_cli.job import Job
 from neurocal_cli.leave_out import held_out_points, held_out_views
 from neurocal_cli.lens import Lens, bend, coefficient_names, pinhole_coefficients
 from neurocal_cli.observability import parameter_count, refuse_undetermined
+from neurocal_cli.odd_views import free_networks
 from neurocal_cli.pixel_error import CameraState
 from neurocal_cli.points import Correspondences
 from neurocal_cli.problems import Known
@@ -21,14 +23,15 @@ from neurocal_cli.uncertainty import Covariance, covariance
 from neurocal_cli.unfolding import Unfolded, folds_back, unfolded
 from neurocal_cli.views import Views
 
-__all__ = ["Candidate", "fit_candidates", "supported"]
+__all__ = ["Candidate", "falls_short", "fit_candidates", "supported"]
 
-_MODELS = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye")
 # A fisheye's coefficients beyond the first few are of use only when the points reach far out.
 _FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
 # What each model has more than a simpler one.
 _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
-_CHAIN = ("k1", "k1k2", "k1k2p1p2", "plumb_bob")  # each with coefficients that the one before lacks
+# Each with coefficients that the one before lacks.
+_CHAIN = ("k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")
+_SHORT = 1.4  # times the rms error of free networks: the camera may be a wrong one
 _BEHIND = 1.5  # times the squared error
 _PAYS = 0.99  # of the squared error that more coefficients must be below
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
@@ -131,12 +134,9 @@ class _Bench:
 
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
         fitted: dict[str, Candidate] = {}
-        for model in _MODELS:
+        for model in ("none", *_CHAIN):
             known = supported(self.job.known, model, self.job.views)
-            if known is None or (model == "fisheye" and self.reach < _WIDE):
-                continue
-            flat = model != "fisheye"
-            candidate = self._fit(known, state) if flat else self._fisheye(known, state, fitted)
+            candidate = None if known is None else self._fit(known, state)
             if candidate is None:
                 continue
             fitted[model] = candidate
@@ -144,33 +144,48 @@ class _Bench:
                 state = candidate.refined.state
         for simple, more in zip(_CHAIN[-2::-1], _CHAIN[:0:-1], strict=True):
             self._fit_again(simple, more, fitted)
-        lowest = min((c.cost for c in fitted.values()), default=0.0)
-        return {m: c if m == "fisheye" else self._unfolded(c, lowest) for m, c in fitted.items()}
+        fisheyes = self._fisheyes(state)
+        found = self._without_folds([*fitted.values(), *fisheyes])
+        fitted = dict(zip(fitted, found, strict=False))
+        best = _fewest_coefficients(found[len(fitted) :])
+        return fitted if best is None else fitted | {"fisheye": best}
 
     def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
-        """A model that is far behind one with more coefficients may have lost its way: begin there."""
-        if simple not in fitted or more not in fitted or fitted[simple].cost < _BEHIND * fitted[more].cost:
+        """A model that is missing, or far behind one with more coefficients, lost its way: begin there."""
+        known = supported(self.job.known, simple, self.job.views)
+        if known is None or more not in fitted:
             return
-        candidate = self._fit(fitted[simple].known, fitted[more].refined.state)
-        if candidate is not None and candidate.cost < fitted[simple].cost:
+        cost = fitted[simple].cost if simple in fitted else np.inf
+        if cost < _BEHIND * fitted[more].cost:
+            return
+        candidate = self._fit(known, fitted[more].refined.state)
+        if candidate is not None and candidate.cost < cost:
             fitted[simple] = candidate
 
-    def _fisheye(self, known: Known, state: CameraState, others: dict[str, Candidate]) -> Candidate | None:
-        """With as few coefficients as predict well."""
-        some = [
-            candidate
-            for count, tail in _FISHEYES
-            if (candidate := self._fit(replace(known, fixed=known.fixed | tail), state, count)) is not None
-        ]
-        lowest = min((c.cost for c in [*others.values(), *some]), default=0.0)
-        best: Candidate | None = None
-        for folding in some:
-            candidate = self._unfolded(folding, lowest)
-            if best is not None and best.sound and not candidate.sound:
-                continue
-            if best is None or not best.sound or candidate.lost.sum() < _PAYS * best.lost.sum():
-                best = candidate
-        return best
+    def _fisheyes(self, state: CameraState) -> list[Candidate]:
+        """With one, two and four coefficients, each from the one before it."""
+        known = supported(self.job.known, "fisheye", self.job.views)
+        if known is None or self.reach < _WIDE:
+            return []
+        found = []
+        for count, tail in _FISHEYES:
+            candidate = self._fit(replace(known, fixed=known.fixed | tail), state, count)
+            if candidate is not None:
+                found.append(candidate)
+                state = candidate.refined.state
+        return found
+
+    def _without_folds(self, fitted: list[Candidate]) -> list[Candidate]:
+        """The same models without folds that are but in corners which the points do not reach."""
+        lowest = min((c.cost for c in fitted), default=0.0)
+        near = [c.folds == "image" and not c.noise and c.cost <= _BEHIND * lowest for c in fitted]
+        if not any(near) or falls_short(self.job.views, fitted):
+            return fitted
+        return [self._unfolded(c) if folds else c for c, folds in zip(fitted, near, strict=True)]
+
+    def _unfolded(self, candidate: Candidate) -> Candidate:
+        found = unfolded(self.job.views, candidate.known, candidate.refined, self.points)
+        return candidate if found is None else self._judged(candidate.known, *found) or candidate
 
     def _fit(self, known: Known, state: CameraState, most: int = 4) -> Candidate | None:
         """None when it did not settle, or too little is left for it without a part of the data."""
@@ -181,13 +196,6 @@ class _Bench:
         if not refined.converged and model != "none":
             return None
         return self._judged(known, refined)
-
-    def _unfolded(self, candidate: Candidate, lowest: float) -> Candidate:
-        """The same model without its fold, where that is but in a corner that the points do not reach."""
-        if candidate.folds != "image" or candidate.noise or candidate.cost > _BEHIND * lowest:
-            return candidate
-        found = unfolded(self.job.views, candidate.known, candidate.refined, self.points)
-        return candidate if found is None else self._judged(candidate.known, *found) or candidate
 
     def _judged(self, known: Known, refined: Refined, restraint: Unfolded | None = None) -> Candidate | None:
         views, state = self.job.views, refined.state
@@ -205,6 +213,23 @@ class _Bench:
         folds = folds_back(Lens(state.lens, state.k), known.matrix(state.entries[0], views), self.points)
         determined = _determined(views, known, state, cov)
         return Candidate(known, refined, lost, noise, folds, determined, restraint)
+
+
+def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
+    """Whether every view by itself fits far better than the best of the common cameras."""
+    best = min(fitted, key=lambda c: c.cost)
+    return best.cost > _SHORT**2 * float(free_networks(views, best.refined.state).sum()) + 1e-20
+
+
+def _fewest_coefficients(fisheyes: list[Candidate]) -> Candidate | None:
+    """The fisheye with as few coefficients as predict well."""
+    best: Candidate | None = None
+    for candidate in fisheyes:
+        if best is not None and best.sound and not candidate.sound:
+            continue
+        if best is None or not best.sound or candidate.lost.sum() < _PAYS * best.lost.sum():
+            best = candidate
+    return best
 
 
 def _determined(views: Views, known: Known, state: CameraState, cov: Covariance) -> bool:
@@ -249,16 +274,21 @@ def _reach(views: Views, state: CameraState) -> float:
 def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -> Array:
     """Those of another model that bend nearly as this state's lens does, of a fisheye the first `most`."""
     names = coefficient_names(model)
-    if "fisheye" not in (model, state.lens):
-        old = dict(zip(coefficient_names(state.lens), state.k.tolist(), strict=True))
-        return np.array([old.get(name, 0.0) for name in names])
-    if model != "fisheye":
-        return np.zeros(len(names))
-    # As far out as the points reach: theta (1 + k1 theta^2 + ...) = r R(r), by least squares.
+    old = dict(zip(coefficient_names(state.lens), state.k.tolist(), strict=True))
+    fisheye, rational = model == "fisheye", state.lens == "rational" and model != "rational"
+    if not fisheye and not rational:
+        # Those of a fisheye mean something else.
+        return np.array([old.get(name, 0.0) if state.lens != "fisheye" else 0.0 for name in names])
+    # As far out as the points reach, by least squares: q (1 + k1 q^2 + k2 q^4 + ...) is the bent radius of
+    # the straight one r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
-    bent = bend(state.lens, state.k, r, np.zeros_like(r))[0][0]
-    theta = np.arctan(r)
-    k = np.zeros(4)
-    powers = theta[:, None] ** np.array([3, 5, 7, 9][:most])
-    k[:most] = np.linalg.lstsq(powers, bent - theta, rcond=1e-6)[0]
-    return k if np.isfinite(k).all() else pinhole_coefficients(model)
+    radial = [0.0 if name in ("p1", "p2") else k for name, k in old.items()]
+    bent = bend(state.lens, radial, r, np.zeros_like(r))[0][0]
+    q = np.arctan(r) if fisheye else r
+    of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][:most]
+    powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)
+    if not np.isfinite(bent).all():  # beyond a pole
+        return pinhole_coefficients(model)
+    found = np.linalg.lstsq(powers, bent - q, rcond=1e-6)[0]
+    new = {name: old[name] for name in ("p1", "p2") if rational} | dict(zip(of_radius, found, strict=True))
+    return np.array([new.get(name, 0.0) for name in names])

@@ -21,8 +21,8 @@ import numpy as np
 from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.leave_out import FOLDS, held_out_views
-from neurocal_cli.lens_candidates import Candidate, fit_candidates
-from neurocal_cli.odd_views import free_networks
+from neurocal_cli.lens import MODELS
+from neurocal_cli.lens_candidates import Candidate, falls_short, fit_candidates
 from neurocal_cli.pixel_error import CameraState
 from neurocal_cli.points import Correspondences
 from neurocal_cli.views import Views
@@ -37,7 +37,7 @@ _CHANCE = 4.6  # standard errors, of five folds, that chance exceeds in one case
 _LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
 _MORE = 2  # coefficients
 _DECISIVE = 10.0  # of the criterion: odds of 150
-_SHORT = 1.4  # times the rms error of free networks: the camera may be a wrong one
+_FAR_BELOW = 2.0  # times the squared error of the pinhole
 
 
 @dataclass(frozen=True)
@@ -84,13 +84,14 @@ def choose_lens(
     """
     views, by_views = job.views, _views_can_spare_any(job, solution)
     fitted = fit_candidates(job, solution.refined.state, points, by_views)
-    if not fitted or _falls_short(views, fitted):
+    if not fitted or falls_short(views, fitted.values()):
         for start in more_starts():
             for model, candidate in fit_candidates(job, start, points, by_views).items():
                 if model not in fitted or candidate.cost < fitted[model].cost:
                     fitted[model] = candidate
     if not fitted:  # not even the pinhole settled: as it is
         return LensChoice(job, solution, {})
+    fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
     if "none" in fitted and not fitted["none"].determined and _is_enough(fitted["none"], views, fitted):
         fitted = {"none": fitted["none"]}  # a lens would only hide that the points leave the camera open
     chosen = fitted[_best(fitted, views)]
@@ -110,16 +111,10 @@ def _views_can_spare_any(job: Job, solution: Solution) -> bool:
     return bool(np.isfinite(held_out_views(refined.normal, free, known.free_poses)).all())
 
 
-def _falls_short(views: Views, fitted: dict[str, Candidate]) -> bool:
-    """Whether every view by itself fits far better than the best of the common cameras."""
-    best = min(fitted.values(), key=lambda c: c.cost)
-    return best.cost > _SHORT**2 * float(free_networks(views, best.refined.state).sum()) + 1e-20
-
-
 def _is_enough(pinhole: Candidate, views: Views, fitted: dict[str, Candidate]) -> bool:
     """Whether neither a lens nor a camera for each view explains far more."""
     lowest = min(candidate.cost for candidate in fitted.values())
-    return pinhole.cost <= _SHORT**2 * lowest + 1e-20 and not _falls_short(views, {"": pinhole})
+    return pinhole.cost <= _FAR_BELOW * lowest + 1e-20 and not falls_short(views, [pinhole])
 
 
 def _best(fitted: dict[str, Candidate], views: Views) -> str:

@@ -36,11 +36,12 @@ __all__ = ["Unfolded", "folds_back", "unfolded"]
 
 _BORDER = 17  # points along each side of the image at which the lens is checked
 _FARTHEST = 100  # points looked at
-_LEAST_SLOPE = 0.1
 _SLACK = 0.005  # of a slope, that costs as much as one standard deviation of a residual
 _NODES = 48
-_BEYOND = 1.02  # times the distance of the farthest corner
-_GUESS = 0.5  # slope with which a corner's radius is guessed
+# The least slope, how far it is asked for in units of the farthest corner's distance, and the slope that the
+# corner's radius is guessed with: first as much as lenses have, then hardly any.
+_LEAST = ((0.1, 1.02, 0.5), (0.02, 1.0, 1.0))
+_GUESS = 0.5  # slope with which a corner's radius is corrected
 _ROUNDS, _STEPS = 12, 60
 _CHANCE = 10.8  # chi-squared that one condition exceeds in one case of a thousand
 _TIE = 0.009  # of the rms error, that makes no difference
@@ -60,16 +61,19 @@ class Unfolded:
         Straight radii, or a fisheye's angles.
     weight : float
         w, in normalised pixels.
+    least : float
+        s0.
     """
 
     radii: Array
     weight: float
+    least: float
 
     @_quietly
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
         """Derivatives (m, 5 + K) and what the slopes lack (m,)."""
         slope, by_k = radial_slope(state.lens, state.k, self.radii)
-        lacking = np.maximum(_LEAST_SLOPE - slope, 0.0)
+        lacking = np.maximum(self.least - slope, 0.0)
         rows = np.zeros((len(slope), 5 + len(state.k)))
         rows[:, 5:] = by_k * (lacking > 0)[:, None]
         return self.weight * rows, self.weight * lacking
@@ -138,21 +142,38 @@ def unfolded(
     cost, n = float(found.cost.sum()), len(views.index)
     effective = 2 * effective_number(n, correlation(views, of_points(views, found.state)))
     most = cost * (1 + max(2 * _TIE, _CHANCE / effective))
-    weight = float(np.sqrt(cost / (2 * n))) / _SLACK
-    corner = _BEYOND * _farthest(views, known, found.state, points)
+    for asked in _LEAST:
+        result = _with_slope(views, known, found, points, most, asked)
+        if result is not None:
+            return result
+    return None
+
+
+def _with_slope(
+    views: Views,
+    known: Known,
+    found: Refined,
+    points: Correspondences,
+    most: float,
+    asked: tuple[float, float, float],
+) -> tuple[Refined, Unfolded] | None:
+    """The best lens with some slope as far as the corners; None when it costs more than `most`."""
+    least, beyond, guess = asked
+    weight = float(np.sqrt(found.cost.sum() / (2 * len(views.index)))) / _SLACK
+    corner = beyond * _farthest(views, known, found.state, points)
     refined, last = found, min(_fold(found.state), corner)
-    last += max(corner - _bent(found.state, last), 0.0) / _GUESS
+    last += max(corner - _bent(found.state, last), 0.0) / guess
     for _ in range(_ROUNDS):
         if found.state.lens == "fisheye":
             last = min(last, np.pi / 2)
-        restraint = Unfolded(np.linspace(0, last, _NODES + 1)[1:], weight)
+        restraint = Unfolded(np.linspace(0, last, _NODES + 1)[1:], weight, least)
         refined = refine(views.tiles, refined.state, known.free_camera, known.free_poses, _STEPS, restraint)
         state = refined.state
         if not refined.cost.sum() <= most:
             return None
         if folds_back(Lens(state.lens, state.k), known.matrix(state.entries[0], views), points) is None:
             return (refined, restraint) if refined.converged else None
-        corner = _BEYOND * _farthest(views, known, state, points)
+        corner = beyond * _farthest(views, known, state, points)
         last += max(corner - _bent(state, last), 0.01 * corner) / _GUESS
     return None
 

@@ -52,7 +52,7 @@ def test_the_slope_and_its_derivatives_are_those_of_differences(model: str) -> N
 
 
 def test_a_lens_with_all_the_slope_that_is_asked_for_is_free() -> None:
-    restraint = Unfolded(np.linspace(0.1, 0.5, 5), 100.0)
+    restraint = Unfolded(np.linspace(0.1, 0.5, 5), 100.0, 0.1)
     state = CameraState(np.ones((1, 5)), np.eye(3)[None], np.zeros((1, 3)), "k1", np.array([-0.2]))
     by_camera, missing = restraint(state)
     assert not by_camera.any()
