@@ -8,11 +8,12 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.network import Patterns
-from neurocal_cli.pixel_error import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.pixel_error import ENTRIES, CameraState
 from neurocal_cli.problems import intrinsic_matrix
 from neurocal_cli.starts import FixedWeights, learn
 from neurocal_cli.user_units import translations_normalised
 from neurocal_cli.views import Views
+from neurocal_cli.whiteness import of_points
 
 __all__ = ["solve_given_poses"]
 
@@ -52,7 +53,7 @@ def solve_given_poses(job: Job) -> Solution:
     tally = job.tally
     tally.note(np.arange(views.n_views), learnt.agreed, int(learnt.starts.sum()), learnt.iterations)
     tally.squares = float(learnt.rms[0] ** 2 * len(views.index))
-    tally.before = float(normal_blocks(views.tiles, state)[0][:, -1, -1].sum())
+    tally.before = float((of_points(views, state) ** 2).sum())
     tally.curve = learnt.curve
     return Solution(job.refine(state), tally)
 

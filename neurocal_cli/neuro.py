@@ -23,7 +23,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.given_poses import solve_given_poses
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.observability import parameter_count
-from neurocal_cli.pixel_error import CameraState, normal_blocks
+from neurocal_cli.pixel_error import CameraState
 from neurocal_cli.random_cameras import find_camera, find_poses
 from neurocal_cli.refine import Refined
 from neurocal_cli.rivals import (
@@ -37,6 +37,7 @@ from neurocal_cli.rivals import (
 from neurocal_cli.stage_cameras import cameras_from_products, candidate_intrinsics
 from neurocal_cli.stage_constraints import train_constrained
 from neurocal_cli.stage_networks import Group, begin_flat, refuse_few_conditions, train_networks
+from neurocal_cli.whiteness import of_points
 
 __all__ = ["solve"]
 
@@ -72,7 +73,7 @@ def solve(job: Job) -> Solution:
 def _begin(job: Job, state: CameraState) -> Refined:
     """The last stage for the first time: what it starts from is noted."""
     job.progress("refining", 0.0)
-    job.tally.before = float(normal_blocks(job.views.tiles, state)[0][:, -1, -1].sum())
+    job.tally.before = float((of_points(job.views, state) ** 2).sum())
     return job.refine(state)
 
 

@@ -371,6 +371,16 @@ def test_the_record_of_the_network_is_the_camera() -> None:
         assert net.rmse_after == cal.rmse_px <= net.rmse_before
 
 
+def test_the_network_s_errors_in_pixels_are_of_every_point_whatever_it_weighs() -> None:
+    pixels, covariance = SOLID.pixels.copy(), np.tile([0.04, 0.0, 0.04], (len(SOLID), 1))
+    pixels[7] += 20.0
+    covariance[7] = [1e6, 0.0, 1e6]
+    net = pinhole(replace(SOLID, pixels=pixels, covariance=covariance)).network
+    assert net is not None
+    assert net.rmse_before > 20.0 / np.sqrt(len(SOLID))
+    assert net.rmse_after > 20.0 / np.sqrt(len(SOLID))
+
+
 def test_errors_are_those_of_the_points() -> None:
     cal = pinhole(FLAT)
     squared = []
