@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,8 +22,9 @@ from neurocal_cli.refine import Refined, refine
 from neurocal_cli.uncertainty import Covariance, covariance
 from neurocal_cli.unfolding import Unfolded, folds_back, unfolded
 from neurocal_cli.views import Views
+from neurocal_cli.whiteness import correlation, effective_number, of_points
 
-__all__ = ["Candidate", "falls_short", "fit_candidates", "supported"]
+__all__ = ["Candidate", "falls_short", "fit_candidates", "supported", "worth"]
 
 # A fisheye's coefficients beyond the first few are of use only when the points reach far out.
 _FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
@@ -33,7 +34,7 @@ _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
 _CHAIN = ("k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")
 _SHORT = 1.4  # times the rms error of free networks: the camera may be a wrong one
 _BEHIND = 1.5  # times the squared error
-_PAYS = 0.99  # of the squared error that more coefficients must be below
+_LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
 _SPARE = 1.3  # equations for each unknown
 _WIDE = 0.5  # radius from which on a lens can be a fisheye's: 27 degrees off the axis
@@ -84,6 +85,11 @@ class Candidate:
     def cost(self) -> float:
         """Sum of squared residuals."""
         return float(self.refined.cost.sum())
+
+    def criterion(self, n: float) -> float:
+        """Bayesian information criterion (Schwarz 1978), n residuals being independent."""
+        penalty = max(np.log(n), _LEAST_PENALTY) * self.coefficients
+        return float(n * np.log(max(self.cost, 1e-300)) + penalty)
 
 
 def supported(known: Known, model: str, views: Views) -> Known | None:
@@ -147,7 +153,7 @@ class _Bench:
         fisheyes = self._fisheyes(state)
         found = self._without_folds([*fitted.values(), *fisheyes])
         fitted = dict(zip(fitted, found, strict=False))
-        best = _fewest_coefficients(found[len(fitted) :])
+        best = _fewest_coefficients(found[len(fitted) :], self.job.views)
         return fitted if best is None else fitted | {"fisheye": best}
 
     def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
@@ -221,15 +227,23 @@ def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
     return best.cost > _SHORT**2 * float(free_networks(views, best.refined.state).sum()) + 1e-20
 
 
-def _fewest_coefficients(fisheyes: list[Candidate]) -> Candidate | None:
-    """The fisheye with as few coefficients as predict well."""
-    best: Candidate | None = None
-    for candidate in fisheyes:
-        if best is not None and best.sound and not candidate.sound:
-            continue
-        if best is None or not best.sound or candidate.lost.sum() < _PAYS * best.lost.sum():
-            best = candidate
-    return best
+def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate | None:
+    """The fisheye with as many coefficients as the criterion asks for."""
+    some = [candidate for candidate in fisheyes if candidate.sound] or fisheyes
+    n = worth(views, some)
+    return min(some, key=lambda candidate: candidate.criterion(n), default=None)
+
+
+def worth(views: Views, fitted: Collection[Candidate]) -> float:
+    """What the number of residuals is worth, when neighbours are alike.
+
+    In the fit that is closest: what a lens that is too simple leaves is alike in neighbours, too, but tells
+    of the lens.
+    """
+    if not fitted:
+        return 1.0
+    closest = min(fitted, key=lambda candidate: candidate.cost).refined.state
+    return 2 * effective_number(len(views.index), correlation(views, of_points(views, closest)))
 
 
 def _determined(views: Views, known: Known, state: CameraState, cov: Covariance) -> bool:

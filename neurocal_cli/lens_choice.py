@@ -22,11 +22,10 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.job import Job, Solution
 from neurocal_cli.leave_out import FOLDS, held_out_views
 from neurocal_cli.lens import MODELS
-from neurocal_cli.lens_candidates import Candidate, falls_short, fit_candidates
+from neurocal_cli.lens_candidates import Candidate, falls_short, fit_candidates, worth
 from neurocal_cli.pixel_error import CameraState
 from neurocal_cli.points import Correspondences
 from neurocal_cli.views import Views
-from neurocal_cli.whiteness import correlation, effective_number, of_points
 
 __all__ = ["LensChoice", "choose_lens"]
 
@@ -34,7 +33,6 @@ _TIE = 0.009  # of the rms error
 _FAR_WORSE = 2.0  # times the rms error of a model that folds back
 _WORTH = 1.05  # times the rms error: what coefficients that cancel each other must be better by
 _CHANCE = 4.6  # standard errors, of five folds, that chance exceeds in one case of a hundred
-_LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
 _MORE = 2  # coefficients
 _DECISIVE = 10.0  # of the criterion: odds of 150
 _FAR_BELOW = 2.0  # times the squared error of the pinhole
@@ -124,10 +122,8 @@ def _best(fitted: dict[str, Candidate], views: Views) -> str:
     folds tell the better of two models, but among many models one is better than it should be by chance.
     """
     sound = _eligible(fitted, views.n_views > 1)
-    # What a lens that is too simple leaves is alike in neighbours too, but tells of the lens.
-    closest = min(sound.values(), key=lambda c: c.cost).refined.state
-    n = 2 * effective_number(len(views.index), correlation(views, of_points(views, closest)))
-    criterion = {name: _criterion(candidate, n) for name, candidate in sound.items()}
+    n = worth(views, sound.values())
+    criterion = {name: candidate.criterion(n) for name, candidate in sound.items()}
     most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + _MORE
     pool = {
         name: candidate
@@ -170,11 +166,6 @@ def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidat
         return sound or unfolded
     lowest = [min(float(c.lost.sum()) for c in some.values()) for some in (sound, unfolded)]
     return sound if lowest[0] < _WORTH**2 * lowest[1] else unfolded
-
-
-def _criterion(candidate: Candidate, n: float) -> float:
-    penalty = max(np.log(n), _LEAST_PENALTY) * candidate.coefficients
-    return float(n * np.log(max(candidate.cost, 1e-300)) + penalty)
 
 
 def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:

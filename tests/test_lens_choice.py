@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,9 +47,10 @@ def test_the_choice_predicts_new_views_as_well_as_any_model(model: str) -> None:
 @pytest.mark.parametrize("model", BENT)
 def test_the_choice_is_right_for_200_lenses(model: str) -> None:
     right, few, well = np.mean([judged(model, seed) for seed in range(200)], axis=0)
-    assert right >= (0.95 if model == "none" else 0.85)
     assert few == 1.0
-    assert well >= 0.93
+    # Whether k3 is there cannot be told where points stay near the axis, but new views may go far out.
+    assert right >= (0.85 if model == "plumb_bob" else 0.95)
+    assert well >= (0.93 if model == "plumb_bob" else 0.975)
 
 
 @pytest.mark.parametrize("seed", range(12))
@@ -64,6 +66,28 @@ def test_a_strong_lens_whose_boards_leave_a_pinhole_open_is_chosen() -> None:
     # Small boards far away: each one's own network follows them no better than the pinhole.
     scene, _ = bent_set("k1k2", 20007)
     assert chosen(scene, 20007).distortion_model == "k1k2"
+
+
+@pytest.mark.parametrize("seed", [20091, 20096])
+def test_a_model_that_lost_its_way_is_fitted_from_a_better_one(seed: int) -> None:
+    # From the pinhole only the rational lens arrives.
+    assert {"k1", "k1k2", "k1k2p1p2", "plumb_bob"} <= set(
+        chosen(bent_set("k1k2p1p2", seed)[0], seed).lens_choice
+    )
+    assert judged("k1k2p1p2", seed)[1]
+
+
+def test_what_a_fisheye_leaves_out_the_others_have_when_a_point_is_set_aside() -> None:
+    scene, _ = bent_set("fisheye", 1)
+    points = scene.points(SIGMA, np.random.default_rng([1, 1]))
+    pixels = points.pixels.copy()
+    pixels[5] += 30.0
+    clean = calibrate(points.select(np.arange(len(points)) != 5), skew=False)
+    found = calibrate(replace(points, pixels=pixels), skew=False)
+    assert found.n_rejected == 1
+    assert found.distortion_model == "fisheye"
+    assert "k4" in found.fixed
+    assert found.lens_choice == pytest.approx(clean.lens_choice, rel=1e-3)
 
 
 def test_the_alternatives_are_told() -> None:

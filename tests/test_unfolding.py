@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bent import SIGMA, bent_set, new_views
+from bent import SIGMA, bent_set, new_views, through
 
 from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli.camera import Pose, project
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.lens import Lens, bend
 from neurocal_cli.lens_domain import radial_slope
 from neurocal_cli.pixel_error import CameraState
+from neurocal_cli.stereo.fitting import fit_rig
 from neurocal_cli.unfolding import Unfolded, folds_back
 
 LENSES = {
@@ -117,3 +119,20 @@ def test_standard_deviations_are_not_too_small() -> None:
         value = {"alpha_u": found.intrinsics.alpha_u, "k1": found.distortion[0], "k2": found.distortion[1]}
         errors.append([(value[name] - truth[name]) / found.std[name] for name in truth])
     assert (np.sqrt(np.mean(np.square(errors), axis=0)) < 1.2).all()
+
+
+def test_a_rig_keeps_a_camera_that_it_would_fold() -> None:
+    scene, k = bent_set("k1k2", 38)
+    view = np.array(scene.view)
+    poses = {name: Pose(pose.R, pose.t - [60.0, 0, 0]) for name, pose in scene.poses.items()}
+    pixels = np.concatenate(
+        [project(scene.intrinsics.A, poses[v], scene.world[view == v])[0] for v in scene.poses]
+    )
+    other = through(replace(scene, pixels=pixels, poses=poses), "k1k2", k)
+    right = other.points(SIGMA, np.random.default_rng([38, 5]))
+    left = noisy("k1k2", 38)
+    cameras = [calibrate(points, distortion="k1k2", skew=False) for points in (left, right)]
+    rig = fit_rig(cameras[0], cameras[1], refine_cameras=True)
+    assert np.array_equal(rig.left.distortion, cameras[0].distortion)
+    assert any("the left camera's lens would fold back" in text for text in rig.warnings)
+    assert rig.baseline == pytest.approx(60.0, abs=4 * rig.std["baseline"])
