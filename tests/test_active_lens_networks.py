@@ -46,21 +46,65 @@ def test_derivatives_by_the_weights_are_those_of_the_output(
     rng = np.random.default_rng(seed)
     topology = Topology(controls, own, hidden)
     weights = rng.normal(size=(3, topology.n_weights))
-    x = rng.uniform(-1, 1, (5, controls))
+    x = rng.uniform(-1.3, 1.3, (5, controls))
     y, J = respond_with_jacobian(topology, weights, x)
     np.testing.assert_allclose(y, respond(topology, weights, x), rtol=0, atol=0)
     for k in range(topology.n_weights):
         step = np.zeros(topology.n_weights)
         step[k] = STEP
         slope = (respond(topology, weights + step, x) - respond(topology, weights - step, x)) / (2 * STEP)
-        np.testing.assert_allclose(J[:, :, k], slope, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(J[:, :, k], slope, rtol=1e-6, atol=1e-8 * max(1.0, np.abs(y).max()))
 
 
-def test_a_network_without_hidden_units_is_a_plane() -> None:
+def network(topology: Topology, **parts: object) -> Array:
+    """Weights (1, P), zero but for the named ones."""
+    weights = np.zeros((1, topology.n_weights))
+    for name, values in parts.items():
+        weights[0, topology.parts[name]] = values
+    return weights
+
+
+def test_a_network_without_weights_under_priors_is_a_plane() -> None:
     topology = Topology(2, 0, 0)
+    assert sorted(np.flatnonzero(topology.groups < 0)) == [2, 3, 10]  # q of x and o
     x = np.random.default_rng(0).uniform(-1, 1, (7, 2))
-    y = respond(topology, np.array([[2.0, -3.0, 0.5]]), x)[0]
-    np.testing.assert_allclose(y, 2 * x[:, 0] - 3 * x[:, 1] + 0.5, rtol=1e-14)
+    weights = np.where(topology.groups < 0, 1.0, 0.0) * 2.0
+    np.testing.assert_allclose(
+        respond(topology, weights[None], x)[0], 2 * x[:, 0] + 2 * x[:, 1] + 2, rtol=1e-14
+    )
+
+
+@given(pole=st.floats(1.02, 50), side=st.sampled_from([-1, 1]))
+def test_plane_and_bow_are_any_homographic_function(pole: float, side: int) -> None:
+    """1 / (p - x) over the range, p beyond it; and along its tangent, not through the pole, outside."""
+    topology = Topology(1, 0, 0)
+    x = np.linspace(-1, 1, 21)[:, None]
+    p = side * pole
+    # Its chord, and what is below it: 1 / (p - x) = (p + x - h(x) / p) / (p^2 - 1).
+    chord = 1 / (p * p - 1)
+    weights = network(topology, a=np.arctanh(-1 / (0.99 * p)), q=[chord, -chord / p], o=p * chord)
+    np.testing.assert_allclose(respond(topology, weights, x)[0], 1 / (p - x[:, 0]), rtol=1e-8)
+    there = np.array([[side * (1 - 1e-6)], [side * (1 + 1e-6)], [side * 3.0 * pole]])
+    y = respond(topology, weights, there)[0]
+    assert np.isfinite(y).all()
+    assert y[1] - y[0] == pytest.approx(2e-6 * side / (p - side) ** 2, rel=1e-2)
+
+
+def test_products_are_of_different_controls() -> None:
+    topology = Topology(2, 1, 1)
+    x = np.random.default_rng(0).uniform(-1, 1, (7, 2))
+    m = np.array([0.3, -0.7, 1.1, 0.4])
+    bow = 1 - x * x
+    z = np.column_stack([x, bow])
+    assert {tuple(sorted(pair)) for pair in zip(*topology.pairs, strict=True)} == {
+        (0, 1),
+        (0, 3),
+        (1, 2),
+        (2, 3),
+    }
+    y = sum(w * z[:, i] * z[:, j] for w, i, j in zip(m, *topology.pairs, strict=True))
+    np.testing.assert_allclose(respond(topology, network(topology, m=m), x)[0], y, rtol=1e-13)
+    assert Topology(1, 2, 2).pairs[0].size == 0
 
 
 @given(st.sampled_from(SCALES), st.floats(1, 1e5))

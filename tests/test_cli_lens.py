@@ -229,7 +229,7 @@ def test_a_control_that_is_missing_or_too_many_is_a_usage_error(folder: Path) ->
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        ("format: 1", "format: 2"),
+        ("format: 2", "format: 1"),
         ("camera: still", "camera: floating"),
         ("controls: [zoom, focus]", "controls: [zoom, iris]"),
         ("scale: ", "scale: cubic #"),

@@ -27,9 +27,9 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["TOPOLOGIES", "Budget", "fit_committee", "suitable_topologies"]
 
-# (own, hidden): units of the first layer for each control, units of the second.
-TOPOLOGIES = ((0, 0), (1, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
-# Three values of a control do not tell how it bends: no units of its own then.
+# (own, hidden): tanh units of the first layer for each control, units of the second.
+TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
+# Three values of a control tell no more than its bow: no tanh units of its own then.
 _SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
 _WEIGHTS_PER_SETTING = 1.5
 _CLEARLY = 5.0  # logarithm of the odds for another scale than the logarithmic, which fits any zoom's noise
@@ -55,8 +55,8 @@ class Budget:
 
     topologies: tuple[tuple[int, int], ...] | None = None
     starts: int = 12
-    best: int = 12
-    members: int = 8
+    best: int = 20
+    members: int = 12
     schedule: Schedule = field(default_factory=Schedule)
 
 

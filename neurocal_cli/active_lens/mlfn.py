@@ -1,10 +1,20 @@
 """One multi-layer feed-forward network (the paper's MLFN) from lens controls to one camera parameter.
 
-Two hidden layers of tanh units and a linear output. Units of the first see one control each, so they
-bend its scale; units of the second see the controls and the bent ones. The output sees both by direct
-connections as well, so that without any hidden unit the network is a plane:
+Two hidden layers and a linear output. Units of the first see one control each, so they bend its scale:
+one bow for each control, and tanh units. Tanh units of the second see the controls and the bent ones.
+The output sees both by direct connections as well, and the products of two controls and of their bows
+(sigma-pi units), so that without weights that are under a prior the network is a plane:
 
-    r = (x, tanh(s x + c)),   g = tanh(U r + b),   y = v.g + q.r + o
+    h(x) = (1 - x^2) / (1 + tilt x),   tilt = 0.99 tanh(a),
+    z = (x, h(x)),   r = (z, tanh(s x + c)),   g = tanh(U r + b),
+    y = v.g + q.r + z'M z / 2 + o,   M = 0 but between two controls
+
+The bow is made for optics. By Newton's formula image distances, and with them focal lengths, are
+homographic functions (A x + B) / (1 + C x) of where groups of glass are and of the object's
+distance; they rise steeply towards a pole beyond the range's end, at close focus or at the long end
+of a zoom, where tanh units would need many settings. Plane and bow together are all such functions,
+the pole at -1 / tilt, and all parabolas, tilt 0. At both ends of the range a bow is 0; beyond them
+x in its denominator stays -1 or 1, so that nobody who extrapolates meets the pole.
 
 Stacks of B networks of one topology are computed side by side: weights are (B, P).
 """
@@ -22,6 +32,8 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Topology", "respond", "respond_with_jacobian"]
 
+_STEEPEST = 0.99  # of a bow's tilt: its pole stays a hundredth of half the range beyond the range's end
+
 
 @dataclass(frozen=True)
 class Topology:
@@ -32,7 +44,7 @@ class Topology:
     controls : int
         Inputs, D.
     own : int
-        Units of the first hidden layer for each control.
+        Tanh units of the first hidden layer for each control, beside its bow.
     hidden : int
         Units of the second hidden layer, H.
     """
@@ -44,14 +56,23 @@ class Topology:
     @property
     def width(self) -> int:
         """R: what the second layer and the output see."""
-        return self.controls * (1 + self.own)
+        return self.controls * (2 + self.own)
+
+    @cached_property
+    def pairs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Places in r of the two factors of each product."""
+        D = self.controls
+        pairs = [(i, j) for i in range(2 * D) for j in range(i) if i % D != j % D]
+        first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        return first, second
 
     @cached_property
     def parts(self) -> dict[str, slice]:
-        """Places of s, c, U, b, v, q, o among the weights."""
-        first, R, H = self.controls * self.own, self.width, self.hidden
+        """Places of a, s, c, U, b, v, q, m (the weights in M), o among the weights."""
+        D, own, R, H = self.controls, self.controls * self.own, self.width, self.hidden
+        counts = {"a": D, "s": own, "c": own, "U": H * R, "b": H, "v": H, "q": R, "m": len(self.pairs[0])}
         parts, start = {}, 0
-        for name, count in (("s", first), ("c", first), ("U", H * R), ("b", H), ("v", H), ("q", R), ("o", 1)):
+        for name, count in (counts | {"o": 1}).items():
             parts[name] = slice(start, start + count)
             start += count
         return parts
@@ -65,22 +86,23 @@ class Topology:
     def groups(self) -> NDArray[np.int64]:
         """(P,) the prior that each weight is under; -1: the plane, which is free.
 
-        Weights of one kind share a prior: s, c, the weights in U from each control, b, v, and q from
-        the first layer.
+        Weights of one kind share a prior: s, c, the weights in U from each control, b, v, q from tanh
+        units and q from bows, a, and m.
         """
         D, R, H = self.controls, self.width, self.hidden
         group = np.full(self.n_weights, -1)
         group[self.parts["s"]], group[self.parts["c"]] = 0, 1
-        source = np.concatenate([np.arange(D), np.repeat(np.arange(D), self.own)])
+        source = np.concatenate([np.arange(D), np.arange(D), np.repeat(np.arange(D), self.own)])
         group[self.parts["U"]] = np.tile(2 + source, H)
         group[self.parts["b"]], group[self.parts["v"]] = 2 + D, 3 + D
-        group[self.parts["q"]] = np.where(np.arange(R) < D, -1, 4 + D)
+        group[self.parts["q"]] = np.repeat([-1, 5 + D, 4 + D], [D, D, R - 2 * D])
+        group[self.parts["a"]], group[self.parts["m"]] = 6 + D, 7 + D
         return group
 
     @property
     def n_groups(self) -> int:
         """How many priors there are."""
-        return 5 + self.controls
+        return 8 + self.controls
 
     @property
     def log_symmetries(self) -> float:
@@ -91,8 +113,8 @@ class Topology:
     def random_weights(self, count: int, rng: np.random.Generator) -> Array:
         """(count, P) weights to start from: hidden units at random, their outgoing weights small."""
         weights = rng.normal(size=(count, self.n_weights))
-        weights[:, self.parts["v"]] *= 0.3
-        weights[:, self.parts["q"]] *= 0.3
+        for outgoing in ("v", "q", "m"):
+            weights[:, self.parts[outgoing]] *= 0.3
         weights[:, self.parts["o"]] = 0.0
         return weights
 
@@ -116,30 +138,50 @@ def respond(topology: Topology, weights: Array, x: Array) -> Array:
 
 def respond_with_jacobian(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array]:
     """Outputs (B, n) and their derivatives by the weights (B, n, P)."""
-    y, bent, r, g = _layers(topology, weights, x)
+    y, r, g = _layers(topology, weights, x)
     part, D = topology.parts, topology.controls
     B, n, H = len(weights), len(x), topology.hidden
+    z, bow, bent = r[:, :, : 2 * D], r[:, :, D : 2 * D], r[:, :, 2 * D :]
     U = weights[:, part["U"]].reshape(B, H, topology.width)
     by_sum = (1 - g * g) * weights[:, None, part["v"]]  # by the argument of each second-layer unit
     by_r = by_sum @ U + weights[:, None, part["q"]]
-    by_argument = by_r[:, :, D:] * (1 - bent * bent)
+    by_r[:, :, : 2 * D] += z @ _products(topology, weights)
+    by_argument = by_r[:, :, 2 * D :] * (1 - bent * bent)
+    squashed, inside = np.tanh(weights[:, None, part["a"]]), np.clip(x, -1, 1)
+    by_tilt = by_r[:, :, D : 2 * D] * bow * -inside / (1 + _STEEPEST * squashed * inside)
+    first, second = topology.pairs
     J = np.empty((B, n, topology.n_weights))
+    J[:, :, part["a"]] = by_tilt * _STEEPEST * (1 - squashed * squashed)
     J[:, :, part["s"]] = by_argument * np.repeat(x, topology.own, axis=1)
     J[:, :, part["c"]] = by_argument
     J[:, :, part["U"]] = (by_sum[..., None] * r[:, :, None]).reshape(B, n, -1)
     J[:, :, part["b"]], J[:, :, part["v"]], J[:, :, part["q"]], J[:, :, part["o"]] = by_sum, g, r, 1.0
+    J[:, :, part["m"]] = r[:, :, first] * r[:, :, second]
     return y, J
 
 
-def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array, Array, Array]:
-    """Output (B, n), first hidden layer (B, n, D own), what the second sees (B, n, R), second (B, n, H)."""
+def _products(topology: Topology, weights: Array) -> Array:
+    """M (B, 2 D, 2 D), symmetric."""
+    M = np.zeros((len(weights), 2 * topology.controls, 2 * topology.controls))
+    first, second = topology.pairs
+    M[:, first, second] = M[:, second, first] = weights[:, topology.parts["m"]]
+    return M
+
+
+def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array, Array]:
+    """Output (B, n), first hidden layer with the controls (B, n, R), second (B, n, H)."""
     part = topology.parts
     B, n, D = len(weights), *x.shape
+    tilt = _STEEPEST * np.tanh(weights[:, None, part["a"]])
+    bow = (1 - x * x) / (1 + tilt * np.clip(x, -1, 1))
     bent = np.tanh(
         weights[:, None, part["s"]] * np.repeat(x, topology.own, axis=1) + weights[:, None, part["c"]]
     )
-    r = np.concatenate([np.broadcast_to(x, (B, n, D)), bent], axis=2)
+    r = np.concatenate([np.broadcast_to(x, (B, n, D)), bow, bent], axis=2)
     U = weights[:, part["U"]].reshape(B, topology.hidden, topology.width)
     g = np.tanh(r @ np.swapaxes(U, 1, 2) + weights[:, None, part["b"]])
     y = (g @ weights[:, part["v"], None] + r @ weights[:, part["q"], None])[..., 0] + weights[:, part["o"]]
-    return y, bent, r, g
+    if D > 1:
+        z = r[:, :, : 2 * D]
+        y = y + 0.5 * ((z @ _products(topology, weights)) * z).sum(axis=2)
+    return y, r, g

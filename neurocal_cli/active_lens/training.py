@@ -23,7 +23,7 @@ __all__ = ["Schedule", "Trained", "followed", "prior_precision", "sparse_control
 
 _FLAT = 1e-4  # precision of the weights that are free: a std of 100 spreads of the targets
 _MOST = 1e4  # precision of a prior
-_LEAST, _LEAST_SPARSE = 0.03, 1.0
+_LEAST, _LEAST_SPARSE, _LEAST_TILT = 0.03, 1.0, 1.0
 _ENOUGH_VALUES = 4
 _DAMPING = (1e-10, 1e8)
 
@@ -82,10 +82,11 @@ def followed(effective: Array, squares: Array, x: Array) -> Array:
 
     Data that leave a direction open do not shrink weights along it. So priors stay narrower than 6
     standard units; and those of weights from a control of three values than 1, or a unit could turn
-    between two of them, seen by nobody.
+    between two of them, seen by nobody; and that of the bows' weights a, as tanh(a) reaches no farther.
     """
-    least = np.full(effective.shape[-1], _LEAST)
-    least[2 : 2 + x.shape[1]][sparse_controls(x)] = _LEAST_SPARSE
+    least, D = np.full(effective.shape[-1], _LEAST), x.shape[1]
+    least[2 : 2 + D][sparse_controls(x)] = _LEAST_SPARSE
+    least[6 + D] = _LEAST_TILT
     return np.clip(effective / squares, least, _MOST)
 
 

@@ -24,7 +24,7 @@ from neurocal_cli.lens import coefficient_names
 
 __all__ = ["format_lens", "read_lens", "write_lens"]
 
-_FORMAT = 1
+_FORMAT = 2
 _BLOCK = "neurocal_lens"
 _CAMERA = ("alpha_u", "alpha_v", "u0", "v0")
 _MOST_UNITS = 1000
@@ -149,7 +149,10 @@ def _tables_lines(lens: ActiveLens) -> Iterator[str]:
 
 def _lens(block: Field) -> ActiveLens:
     if block["format"].integer() != _FORMAT:
-        raise FormatError(f"{block.path}.format is not {_FORMAT}; update neurocal", block.source)
+        raise FormatError(
+            f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again",
+            block.source,
+        )
     controls = _names(block["controls"])
     if not controls or any(name not in CONTROLS for name in controls) or len(set(controls)) < len(controls):
         block["controls"].fail("zoom, focus or both")
