@@ -207,8 +207,7 @@ class JointLearner:
         N, _ = self.system()
         cost = self.cost(self.nets, self.shared)
         _, volume = np.linalg.slogdet(N)
-        symmetries = sum(net.topology.log_symmetries for net in self.nets.nets)
-        evidence = symmetries - 0.5 * cost - 0.5 * volume + 0.5 * float(np.log(self.nets.prior).sum())
+        evidence = -0.5 * cost - 0.5 * volume + 0.5 * float(np.log(self.nets.prior).sum())
         return Joint(self.nets, self.constants, cost, _inverse(N), float(evidence), converged)
 
 

@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import lgamma, log
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,12 +102,6 @@ class Topology:
     def n_groups(self) -> int:
         """How many priors there are."""
         return 8 + self.controls
-
-    @property
-    def log_symmetries(self) -> float:
-        """Logarithm of the number of weight vectors that give the same function."""
-        own = self.controls * (lgamma(self.own + 1) + self.own * log(2))
-        return own + lgamma(self.hidden + 1) + self.hidden * log(2)
 
     def random_weights(self, count: int, rng: np.random.Generator) -> Array:
         """(count, P) weights to start from: hidden units at random, their outgoing weights small."""

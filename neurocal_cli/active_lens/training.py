@@ -225,9 +225,8 @@ class _Learner:
         volume = np.where(sign > 0, volume, np.inf)
         log_prior = 0.5 * np.log(self.prior).sum(axis=1)
         noise = (self.include * np.log(self.variance + self.tau2[:, None])).sum(axis=1)
-        # Units that unknown noise leaves idle have no mirror images to count.
-        symmetries = self.topology.log_symmetries if self.variance.any() else 0.0
-        evidence = -self.cost - 0.5 * volume + log_prior - 0.5 * noise + symmetries
+        # Mirror images of the weights are not counted: an idle unit has none, and would count as many.
+        evidence = -self.cost - 0.5 * volume + log_prior - 0.5 * noise
         return Trained(
             self.topology, self.w, self.a, self.tau2, np.where(np.isfinite(evidence), evidence, -np.inf)
         )
