@@ -159,6 +159,59 @@ def test_known_cameras_go_the_simple_path(folder: Path) -> None:
     assert "theta" in calibration.fixed
 
 
+def write_camera(path: Path, zoom: float, k: str) -> None:
+    """An OpenCV file."""
+    path.write_text(
+        "%YAML:1.0\nimage_width: 1280\nimage_height: 960\n"
+        "camera_matrix: !!opencv-matrix\n   rows: 3\n   cols: 3\n   dt: d\n"
+        f"   data: [{100 * zoom}, 0., 640., 0., {101 * zoom}, 480., 0., 0., 1.]\n"
+        f"distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n   data: [{k}]\n"
+    )
+
+
+def test_calibration_files_that_a_table_names_go_the_simple_path(folder: Path) -> None:
+    (folder / "files").mkdir()
+    lines = ["zoom,camera"]
+    for zoom in range(20, 70, 5):
+        write_camera(folder / "files" / f"at{zoom}.yml", zoom, f"{-0.4 + 0.005 * zoom}, 0.1, 0., 0., 0.")
+        lines.append(f"{zoom},files/at{zoom}.yml")
+    (folder / "files.csv").write_text("\n".join(lines) + "\n")
+    result = run("lens", "fit", folder / "files.csv", "--hidden", 0, 0, "-o", folder / "files.yaml")
+    assert result.exit_code == 0, result.stderr
+    camera = run("lens", "camera", folder / "files.yaml", "--zoom", 37)
+    (folder / "at37.yaml").write_text(camera.stdout)
+    calibration = read_calibration(folder / "at37.yaml")
+    assert calibration.intrinsics.alpha_v == pytest.approx(3737, rel=1e-4)
+    assert calibration.distortion_model == "k1k2"  # the simplest that holds what the files have
+    assert calibration.distortion[:2] == pytest.approx([-0.215, 0.1], abs=1e-3)
+    assert calibration.points.image_size == (1280, 960)
+    again = run("lens", "camera", folder / "files.yaml", "--zoom", 37)
+    assert again.stdout == camera.stdout
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("zoom,camera\n20,none.yml\n30,none.yml\n40,none.yml\n", "none.yml: there is no such file"),
+        ("camera\nplain.yml\n", "no column zoom or focus"),
+        ("zoom,camera\n20,plain.yml\n30,fisheye.yml\n40,plain.yml\n", "some cameras are fisheyes"),
+        ("zoom,camera\n20,plain.yml\n30,small.yml\n40,plain.yml\n", "image_size differs"),
+    ],
+)
+def test_lists_of_cameras_that_cannot_be_used_are_refused(tmp_path: Path, lines: str, message: str) -> None:
+    write_camera(tmp_path / "plain.yml", 20, "-0.1, 0, 0, 0, 0")
+    text = (tmp_path / "plain.yml").read_text()
+    (tmp_path / "small.yml").write_text(text.replace("1280", "640"))
+    fisheye = text.replace("cols: 5", "cols: 4").replace("0, 0, 0, 0]", "0, 0, 0]")
+    (tmp_path / "fisheye.yml").write_text(fisheye + "distortion_model: equidistant\n")
+    (tmp_path / "list.csv").write_text(lines)
+    result = run("lens", "fit", tmp_path / "list.csv", "-o", tmp_path / "lens.yaml")
+    assert result.exit_code == 1
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert not (tmp_path / "lens.yaml").exists()
+
+
 def test_columns_without_a_view_make_a_view_of_each_setting(folder: Path) -> None:
     lines = (folder / "points.csv").read_text().splitlines()
     plain = [

@@ -15,6 +15,7 @@ from neurocal_cli.active_lens.settings import CONTROLS
 from neurocal_cli.active_lens.start import check_settings
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.lens import coefficient_names
 
 __all__ = ["LensCameras", "fit_lens_cameras"]
 
@@ -32,11 +33,15 @@ class LensCameras:
     controls : tuple of str
     settings : (S, D) array
     names : tuple of str
-        alpha_u, alpha_v, u0, v0 and perhaps t_z.
+        alpha_u, alpha_v, u0, v0, perhaps t_z, and the distortion coefficients.
     local : (S, L) array
     image_size : (width, height), optional
     unit : str
     source : str
+    model : str
+        Lens model.
+    theta : float [rad]
+        Of all of them.
     """
 
     controls: tuple[str, ...]
@@ -46,6 +51,8 @@ class LensCameras:
     image_size: tuple[int, int] | None = None
     unit: str = "mm"
     source: str = "cameras"
+    model: str = "none"
+    theta: float = np.pi / 2
 
     @classmethod
     def of(
@@ -54,8 +61,10 @@ class LensCameras:
         image_size: tuple[int, int] | None = None,
         unit: str = "mm",
         source: str = "cameras",
+        model: str = "none",
+        theta: float = np.pi / 2,
     ) -> LensCameras:
-        """Take columns zoom and/or focus, alpha_u, alpha_v, u0, v0 and perhaps t_z, (S,) each.
+        """Take columns zoom and/or focus, alpha_u, alpha_v, u0, v0, perhaps t_z, and coefficients, (S,) each.
 
         Raises
         ------
@@ -63,14 +72,16 @@ class LensCameras:
             A column that is missing, values that no camera has, one setting only.
         """
         controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
-        missing = [name for name in _INTRINSIC if columns.get(name) is None]
+        coefficients = coefficient_names(model)
+        missing = [name for name in (*_INTRINSIC, *coefficients) if columns.get(name) is None]
         if not controls or missing:
             lacking = missing[0] if missing else "zoom or focus"
             raise InputError(
                 f"{source}: there is no column {lacking}; known cameras need zoom and/or focus, "
                 "alpha_u, alpha_v, u0, v0"
             )
-        names = (*_INTRINSIC, *(["t_z"] if columns.get("t_z") is not None else []))
+        t_z = ["t_z"] if columns.get("t_z") is not None else []
+        names = (*_INTRINSIC, *t_z, *coefficients)
         settings = np.column_stack([np.asarray(columns[name], dtype=float) for name in controls])
         local = np.column_stack([np.asarray(columns[name], dtype=float) for name in names])
         if not (np.isfinite(settings).all() and np.isfinite(local).all()):
@@ -83,7 +94,8 @@ class LensCameras:
             raise InputError(f"{source}: all cameras are at one setting; a lens needs several")
         controls = tuple(name for name, moving in zip(controls, moves, strict=True) if moving)
         order = np.lexsort(settings[:, moves].T[::-1])
-        return cls(controls, settings[order][:, moves], names, local[order], image_size, unit, source)
+        moving_settings = settings[order][:, moves]
+        return cls(controls, moving_settings, names, local[order], image_size, unit, source, model, theta)
 
 
 def fit_lens_cameras(
@@ -118,13 +130,13 @@ def fit_lens_cameras(
         replace(budget, members=_MEMBERS),
         lambda share: report("fitting a network to each parameter", share),
     )
-    constants = Constants(np.pi / 2, np.eye(3), np.zeros(2))
+    constants = Constants(cameras.theta, np.eye(3), np.zeros(2))
     table = TableRecord(cameras.local, constants, _scatter_normal(members, cameras.local))
     return ActiveLens(
         controls=cameras.controls,
         settings=cameras.settings,
         names=cameras.names,
-        model="none",
+        model=cameras.model,
         still=False,
         known=True,
         members=tuple(Member(nets, constants) for nets in members),
@@ -132,7 +144,7 @@ def fit_lens_cameras(
         static=table,
         variance=1.0,
         scatter=np.zeros(L),
-        free_theta=False,
+        free_theta=cameras.theta != np.pi / 2,
         counts=np.zeros(S, dtype=np.int64),
         rmse=np.full(S, np.nan),
         rejected=(),

@@ -74,7 +74,8 @@ def lens() -> None:
     cls=Argument,
     description="CSV files with columns zoom and/or focus and X,Y,Z,u,v (and optionally view), read "
     "as one; or "
-    "known cameras: zoom and/or focus, alpha_u,alpha_v,u0,v0 (and t_z); - is standard input.",
+    "known cameras: zoom and/or focus, alpha_u,alpha_v,u0,v0 (and t_z), or zoom and/or focus and "
+    "camera, the name of a calibration file; - is standard input.",
 )
 @click.option(
     "--distortion",
@@ -102,7 +103,7 @@ def lens() -> None:
     nargs=2,
     metavar="N1 N2",
     show_default="chosen by the data",
-    help="Hidden units of each network: of the first layer for each control, and of the second.",
+    help="Tanh units of each network: of the first layer for each control, and of the second.",
 )
 @click.option(
     "--outliers",

@@ -1,4 +1,4 @@
-"""Points at many lens settings, and known cameras at them, from CSV."""
+"""Points at many lens settings from CSV."""
 
 from __future__ import annotations
 
@@ -11,21 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.active_lens.fit_known import LensCameras
-from neurocal_cli.active_lens.settings import CONTROLS, LensPoints, describe
+from neurocal_cli.active_lens.settings import LensPoints, describe
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import read_bytes, write_whole
+from neurocal_cli.io.lens_cameras import names_cameras, read_cameras, require_setting
 from neurocal_cli.io.points_csv import POINTS, format_points
 from neurocal_cli.io.points_join import correspondences
-from neurocal_cli.io.table import Schema, Table, parse_table
+from neurocal_cli.io.table import Table, parse_table
 
-__all__ = ["CAMERAS", "read_lens_data", "read_lens_points", "write_lens_points"]
-
-CAMERAS = Schema(
-    kind="cameras",
-    required=("alpha_u", "alpha_v", "u0", "v0"),
-    optional=("t_z", *CONTROLS),
-)
+__all__ = ["read_lens_data", "read_lens_points", "write_lens_points"]
 
 
 def read_lens_data(
@@ -50,8 +45,8 @@ def read_lens_data(
         raise InputError("there are no files; give at least one")
     contents = [read_bytes(path) for path in several]
     remarks = notes if notes is not None else []
-    if all(_names_cameras(data) for data, _ in contents):
-        return _cameras([parse_table(data, source, CAMERAS) for data, source in contents], remarks)
+    if all(names_cameras(data) for data, _ in contents):
+        return read_cameras(contents, remarks)
     return _points([parse_table(data, source, POINTS) for data, source in contents], remarks)
 
 
@@ -76,58 +71,8 @@ def write_lens_points(lens: LensPoints, path: str | Path) -> None:
     write_whole(path, "\n".join(lines))
 
 
-def _names_cameras(data: bytes) -> bool:
-    """Whether the header has alpha_u."""
-    for line in data.splitlines():
-        if line.strip() and not line.lstrip(b"\xef\xbb\xbf \t").startswith(b"#"):
-            return b"alpha_u" in line
-    return False
-
-
-def _cameras(tables: list[Table], notes: list[str]) -> LensCameras:
-    for table in tables:
-        _note_unknown(table, notes)
-    shared = [
-        name for name in (*CAMERAS.required, *CAMERAS.optional) if all(name in t.numbers for t in tables)
-    ]
-    _require_setting([set(table.numbers) for table in tables], tables)
-    sizes = {table.metadata.image_size for table in tables} - {None}
-    if len(sizes) > 1:
-        raise InputError(f"{tables[0].source}: the files' image_size differs; cameras of one lens have one")
-    return LensCameras.of(
-        {name: np.concatenate([table.numbers[name] for table in tables]) for name in shared},
-        next(iter(sizes), None),
-        tables[0].metadata.unit or "mm",
-        tables[0].source,
-    )
-
-
-def _note_unknown(table: Table, notes: list[str]) -> None:
-    if table.unknown:
-        names = ", ".join(repr(name[:40]) for name in table.unknown)
-        notes.append(f"{table.source}: column{'s' * (len(table.unknown) > 1)} not used: {names}")
-
-
-def _require_setting(names: list[set[str]], tables: list[Table]) -> tuple[str, ...]:
-    """The controls that all files have.
-
-    Raises
-    ------
-    FormatError
-        None, or other ones in another file.
-    """
-    for found, table in zip(names, tables, strict=True):
-        if found.isdisjoint(CONTROLS):
-            raise FormatError(
-                "there is no column zoom or focus; name the setting of each row in one or both", table.source
-            )
-        if found & set(CONTROLS) != names[0] & set(CONTROLS):
-            raise FormatError(f"has not the same of zoom and focus as {tables[0].source}", table.source)
-    return tuple(name for name in CONTROLS if name in names[0])
-
-
 def _points(tables: list[Table], notes: list[str]) -> LensPoints:
-    controls = _require_setting([set(table.numbers) for table in tables], tables)
+    controls = require_setting(tables)
     values = [np.column_stack([table.numbers[name] for name in controls]) for table in tables]
     plain = []
     for table, setting in zip(tables, values, strict=True):

@@ -1,0 +1,158 @@
+"""Known cameras at many lens settings: a CSV of their parameters, or one that names calibration files."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from neurocal_cli.active_lens.fit_known import LensCameras
+from neurocal_cli.active_lens.settings import CONTROLS
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.camera_files import read_intrinsics
+from neurocal_cli.io.table import Schema, Table, parse_table
+from neurocal_cli.lens import MODELS
+
+__all__ = ["names_cameras", "note_unknown", "read_cameras", "require_setting"]
+
+_PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
+_FILES = "camera"
+_TABLE = Schema(kind="cameras", required=_PARAMETERS, optional=("t_z", *CONTROLS))
+_LIST = Schema(kind="cameras", required=(_FILES,), optional=("t_z", *CONTROLS), labels=frozenset({_FILES}))
+_NESTED = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")  # each begins with the one before
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Cameras of one file.
+
+    Attributes
+    ----------
+    columns : dict of (n,) arrays
+        Settings, `_PARAMETERS` and perhaps t_z.
+    theta : (n,) array [rad]
+    models : list of str
+        Lens model of each.
+    coefficients : list of arrays
+    sizes : set of (width, height)
+    """
+
+    columns: dict[str, Array]
+    theta: Array
+    models: list[str]
+    coefficients: list[Array]
+    sizes: set[tuple[int, int]]
+
+
+def names_cameras(data: bytes) -> bool:
+    """Whether a file's header has alpha_u, or a column `camera` and no points."""
+    names = _header(data)
+    return "alpha_u" in names or (_FILES in names and "X" not in names)
+
+
+def _header(data: bytes) -> set[str]:
+    for line in data.removeprefix(b"\xef\xbb\xbf").splitlines():
+        if line.strip() and not line.lstrip().startswith(b"#"):
+            return set(re.split(r'[\s,;"]+', line.decode("utf-8", "replace")))
+    return set()
+
+
+def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> LensCameras:
+    """Read known cameras from the contents of files and their names.
+
+    Raises
+    ------
+    FormatError, InputError
+        A file that cannot be read, without the setting's column, or cameras that are not of one lens.
+    """
+    tables = [parse_table(data, source, _schema(data)) for data, source in contents]
+    for table in tables:
+        note_unknown(table, notes)
+    require_setting(tables)
+    parts = [_listed(table) if _FILES in table.labels else _tabled(table) for table in tables]
+    sizes = set().union(*(part.sizes for part in parts))
+    if len(sizes) > 1:
+        raise InputError(f"{tables[0].source}: the cameras' image_size differs; those of one lens have one")
+    model, coefficients = _common_model(parts, tables[0].source)
+    shared = [name for name in parts[0].columns if all(name in part.columns for part in parts)]
+    columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in shared}
+    return LensCameras.of(
+        columns | dict(zip(MODELS[model], coefficients.T, strict=True)),
+        next(iter(sizes), None),
+        tables[0].metadata.unit or "mm",
+        tables[0].source,
+        model,
+        float(np.median(np.concatenate([part.theta for part in parts]))),
+    )
+
+
+def _schema(data: bytes) -> Schema:
+    return _TABLE if "alpha_u" in _header(data) else _LIST
+
+
+def _tabled(table: Table) -> _Rows:
+    n, size = len(table), table.metadata.image_size
+    sizes = set() if size is None else {size}
+    return _Rows(table.numbers, np.full(n, np.pi / 2), ["none"] * n, [np.zeros(0)] * n, sizes)
+
+
+def _listed(table: Table) -> _Rows:
+    """Read the calibration files that a table names; their paths are relative to its folder."""
+    folder = Path(table.source).parent
+    cameras = [read_intrinsics(folder / name) for name in table.labels[_FILES].tolist()]
+    K = [camera.intrinsics for camera in cameras]
+    parameters = {name: np.array([getattr(k, name) for k in K]) for name in _PARAMETERS}
+    sizes = {camera.image_size for camera in cameras} | {table.metadata.image_size}
+    return _Rows(
+        dict(table.numbers) | parameters,
+        np.array([k.theta for k in K]),
+        [camera.distortion_model for camera in cameras],
+        [camera.distortion for camera in cameras],
+        {size for size in sizes if size is not None},
+    )
+
+
+def _common_model(parts: Sequence[_Rows], source: str) -> tuple[str, Array]:
+    """The simplest lens model that holds all cameras', and its coefficients (S, K)."""
+    models = [model for part in parts for model in part.models]
+    rows = [row for part in parts for row in part.coefficients]
+    if "fisheye" in models:
+        if set(models) != {"fisheye"}:
+            raise InputError(f"{source}: some cameras are fisheyes and some are not; give those of one lens")
+        return "fisheye", np.array(rows)
+    padded = np.zeros((len(rows), len(MODELS[_NESTED[-1]])))
+    for k, row in enumerate(rows):
+        padded[k, : len(row)] = row
+    used = int(np.flatnonzero(padded.any(axis=0)).max(initial=-1)) + 1
+    model = next(name for name in _NESTED if len(MODELS[name]) >= used)
+    return model, padded[:, : len(MODELS[model])]
+
+
+def note_unknown(table: Table, notes: list[str]) -> None:
+    """Name the columns that are kept out."""
+    if table.unknown:
+        names = ", ".join(repr(name[:40]) for name in table.unknown)
+        notes.append(f"{table.source}: column{'s' * (len(table.unknown) > 1)} not used: {names}")
+
+
+def require_setting(tables: Sequence[Table]) -> tuple[str, ...]:
+    """The controls that all files have.
+
+    Raises
+    ------
+    FormatError
+        None, or other ones in another file.
+    """
+    names = [set(table.numbers) & set(CONTROLS) for table in tables]
+    for found, table in zip(names, tables, strict=True):
+        if not found:
+            raise FormatError(
+                "there is no column zoom or focus; name the setting of each row in one or both", table.source
+            )
+        if found != names[0]:
+            raise FormatError(f"has not the same of zoom and focus as {tables[0].source}", table.source)
+    return tuple(name for name in CONTROLS if name in names[0])
