@@ -9,6 +9,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from neurocal_cli.active_lens.camera_at import camera_at
+    from neurocal_cli.active_lens.evaluation import evaluate_lens
+    from neurocal_cli.active_lens.fit import fit_lens
+    from neurocal_cli.active_lens.fit_known import fit_lens_cameras
+    from neurocal_cli.active_lens.lens_model import ActiveLens
     from neurocal_cli.board import Board
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.camera import Intrinsics, Pose
@@ -18,6 +23,8 @@ if TYPE_CHECKING:
     from neurocal_cli.io.board_yaml import read_board
     from neurocal_cli.io.calibration_yaml import read_calibration, write_calibration
     from neurocal_cli.io.images import read_image
+    from neurocal_cli.io.lens_points import read_lens_data, read_lens_points
+    from neurocal_cli.io.lens_yaml import read_lens, write_lens
     from neurocal_cli.io.points_csv import read_points, write_points
     from neurocal_cli.io.rig_yaml import read_rig, write_rig
     from neurocal_cli.methods import calibrate
@@ -33,6 +40,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "ActiveLens": "active_lens.lens_model",
     "Board": "board",
     "Calibration": "calibration",
     "Correspondences": "points",
@@ -42,25 +50,34 @@ _HOMES = {
     "Rig": "stereo.rig",
     "calibrate": "methods",
     "calibrate_stereo": "stereo.methods",
+    "camera_at": "active_lens.camera_at",
     "detect_points": "detection.detect",
     "evaluate_camera": "evaluation",
+    "evaluate_lens": "active_lens.evaluation",
     "evaluate_rig": "stereo.evaluation",
     "evaluate_stereo": "stereo.evaluation",
+    "fit_lens": "active_lens.fit",
+    "fit_lens_cameras": "active_lens.fit_known",
     "fit_rig": "stereo.fitting",
     "read_board": "io.board_yaml",
     "read_calibration": "io.calibration_yaml",
     "read_image": "io.images",
+    "read_lens": "io.lens_yaml",
+    "read_lens_data": "io.lens_points",
+    "read_lens_points": "io.lens_points",
     "read_points": "io.points_csv",
     "read_rig": "io.rig_yaml",
     "triangulate": "stereo.triangulation",
     "undistort_image": "remapping",
     "undistort_points": "undistortion",
     "write_calibration": "io.calibration_yaml",
+    "write_lens": "io.lens_yaml",
     "write_points": "io.points_csv",
     "write_rig": "io.rig_yaml",
 }
 
 __all__ = [
+    "ActiveLens",
     "Board",
     "Calibration",
     "Correspondences",
@@ -70,20 +87,28 @@ __all__ = [
     "Rig",
     "calibrate",
     "calibrate_stereo",
+    "camera_at",
     "detect_points",
     "evaluate_camera",
+    "evaluate_lens",
     "evaluate_rig",
     "evaluate_stereo",
+    "fit_lens",
+    "fit_lens_cameras",
     "fit_rig",
     "read_board",
     "read_calibration",
     "read_image",
+    "read_lens",
+    "read_lens_data",
+    "read_lens_points",
     "read_points",
     "read_rig",
     "triangulate",
     "undistort_image",
     "undistort_points",
     "write_calibration",
+    "write_lens",
     "write_points",
     "write_rig",
 ]
