@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 
@@ -12,7 +12,8 @@ from scipy.interpolate import RBFInterpolator, RectBivariateSpline, RegularGridI
 from zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, seen, truth
 
 from neurocal_cli.active_lens.camera_at import camera_at
-from neurocal_cli.active_lens.evaluation import evaluate_lens
+from neurocal_cli.active_lens.committee import Budget, fit_committee
+from neurocal_cli.active_lens.evaluation import _rival_error, _rms, _squares, evaluate_lens
 from neurocal_cli.active_lens.fit import fit_lens
 from neurocal_cli.active_lens.fit_known import LensCameras, fit_lens_cameras
 from neurocal_cli.active_lens.interpolation import (
@@ -24,6 +25,7 @@ from neurocal_cli.active_lens.interpolation import (
     thin_plate_matrix,
 )
 from neurocal_cli.active_lens.lens_model import ActiveLens
+from neurocal_cli.active_lens.rivals import rivals_of
 from neurocal_cli.active_lens.settings import LensPoints
 from neurocal_cli.active_lens.simulated import SimulatedZoom
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
@@ -335,30 +337,74 @@ def test_the_simulated_zoom_obeys_its_law() -> None:
     assert (points.points.pixels < [640, 480]).all()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("bends", [False, True], ids=["straight", "bends"])
-def test_networks_beat_every_rival_between_45_settings(law: str, bends: bool) -> None:
-    """Mean over five seeds of the error at the 32 settings in between; rivals on their best scale."""
-    from neurocal_cli.active_lens.evaluation import _matched, _rival_error
-    from neurocal_cli.active_lens.rivals import rivals_of
+@dataclass
+class Held:
+    """Errors over the floor at the settings in between, by law."""
 
-    own, cover = [], []
-    rivals: dict[str, list[float]] = {}
-    for seed in range(1, 6):
-        lens = fit_lens(seen(law, grid(9, 5), seed, bends=bends), distortion="k1" if bends else "none")
-        held_out = seen(law, between(9, 5), 1000 + seed, bends=bends)
-        own.append(evaluate_lens(lens, held_out).rmse_px / FLOOR)
-        cover.append(covered(lens, law, between(9, 5)))
-        points, _ = _matched(lens, held_out)
-        x = lens.scaled(points.settings)
-        for name, rival in rivals_of(lens, "log").items():
-            error = _rival_error(lens, points, *rival(x), lens.tables.constants)
-            rivals.setdefault(name, []).append(error / FLOOR)
-    assert not any(np.mean(own) > 1.005 * np.mean(errors) for errors in rivals.values())
-    if law == "c":
-        assert np.mean(own) < 1.05
-    assert np.mean(cover) > 0.9
+    networks: dict[str, float] = field(default_factory=dict)
+    alone: dict[str, float] = field(default_factory=dict)
+    alternating: dict[str, float] = field(default_factory=dict)
+    rivals: dict[str, dict[str, float]] = field(default_factory=dict)
+    cover: dict[str, float] = field(default_factory=dict)
+
+    def take(self, law: str, bends: bool) -> None:
+        """Fit a law five times; alternating once, beside the joint one of the same seed."""
+        errors: dict[str, list[float]] = {}
+        for seed in range(5):
+            points = seen(law, grid(9, 5), seed, bends=bends)
+            lens = fit_lens(points, distortion="k1" if bends else "none")
+            held_out = seen(law, between(9, 5), 1000 + seed, bends=bends)
+            x = lens.scaled(held_out.settings)
+            errors.setdefault("networks", []).append(evaluate_lens(lens, held_out).rmse_px / FLOOR)
+            errors.setdefault("alone", []).append(
+                _rms(_squares(lens, held_out, one_at_a_time(lens, x), lens.static.constants)) / FLOOR
+            )
+            errors.setdefault("cover", []).append(covered(lens, law, between(9, 5)))
+            for scale in {"log", lens.members[0].nets.scale}:
+                for name, rival in rivals_of(lens, scale).items():
+                    error = _rival_error(lens, held_out, *rival(x), lens.tables.constants)
+                    errors.setdefault(f"{name} {'log' if scale == 'log' else 'own'}", []).append(
+                        error / FLOOR
+                    )
+        turns = fit_lens(points, distortion="k1" if bends else "none", training="alternating")
+        self.alternating[law] = evaluate_lens(turns, held_out).rmse_px / FLOOR / errors["networks"][-1]
+        mean = {name: float(np.mean(values)) for name, values in errors.items()}
+        for into, name in ((self.networks, "networks"), (self.alone, "alone"), (self.cover, "cover")):
+            into[law] = mean.pop(name)
+        # On a logarithmic scale the networks' own is not another one.
+        own = {name.replace("log", "own"): error for name, error in mean.items()}
+        self.rivals[law] = own | mean
+
+
+def one_at_a_time(lens: ActiveLens, x: np.ndarray) -> np.ndarray:
+    """What networks say that learn one parameter at a time, from the static calibrations alone."""
+    table, rng = lens.static, np.random.default_rng(0)
+    settings = lens.scaled(lens.settings)
+    members = fit_committee(
+        settings, lens.names, table.local, table.normal, lens.variance, rng, Budget(), lambda share: None
+    )
+    return np.mean([nets.local(x) for nets in members], axis=0)
+
+
+MOST = {"a": 1.04, "b": 1.01, "c": 1.01, "d": 1.02}  # what is reached, and a little for another machine
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bends", [False, True], ids=["straight", "bends"])
+def test_networks_beat_every_rival_between_45_settings(bends: bool) -> None:
+    """Means over five seeds at 32 settings; rivals on a logarithmic scale and on the networks' own."""
+    held = Held()
+    for law in LAWS:
+        held.take(law, bends)
+    for law in LAWS:
+        assert held.networks[law] < MOST[law]
+        assert held.networks[law] < 1.002 * held.alone[law]
+        assert all(held.networks[law] < 1.005 * error for error in held.rivals[law].values())
+        assert held.alternating[law] == pytest.approx(1, abs=0.1)
+        assert held.cover[law] > 0.9
+    networks = np.mean(list(held.networks.values()))
+    for name in held.rivals["a"]:
+        assert networks < 0.8 * np.mean([held.rivals[law][name] for law in LAWS])
 
 
 @pytest.mark.slow
@@ -372,4 +418,4 @@ def test_a_real_lens_of_42_zooms_left_out_one_by_one() -> None:
         table = dict(zip(names, rest[:, :5].T, strict=True))
         lens = fit_lens_cameras(LensCameras.of(table))
         errors.append(lens.predict(data[k : k + 1, :1]).local[0, 0] - data[k, 1])
-    assert np.sqrt(np.mean(np.square(errors))) < 160  # px; a quadratic 147, a straight line 158
+    assert np.sqrt(np.mean(np.square(errors))) < 147  # px; a quadratic 147.1, a cubic 150, a line 158

@@ -160,6 +160,27 @@ def test_evidence_prefers_a_plane_where_there_is_one() -> None:
     assert np.sqrt(((respond(plane, simple.weights, between)[0] - between @ [1.0, -0.5]) ** 2).mean()) < 0.01
 
 
+def test_five_values_tell_close_focus() -> None:
+    """Strong breathing, which grows with the zoom; close focus is a fifth of the range from the pole."""
+    z, f = (axis.ravel() for axis in np.meshgrid(np.linspace(-1, 1, 7), np.linspace(-1, 1, 5), indexing="ij"))
+    at, near = np.random.default_rng(3).uniform(-1, 1, (2, 100))
+
+    def breathes(zoom: Array, focus: Array) -> Array:
+        return (1.5 + zoom) * (1 / (1.4 - focus) - 1.4)
+
+    topology = Topology(2, 0, 0)
+    targets, noise = breathes(z, f), np.full(35, 1e-6)
+    start = topology.random_weights(6, np.random.default_rng(4))
+    trained = train(topology, np.column_stack([z, f]), targets, noise, start)
+    best = trained.weights[[int(trained.evidence.argmax())]]
+    error = respond(topology, best, np.column_stack([at, near]))[0] - breathes(at, near)
+    assert np.abs(error).max() < 0.005  # a spline through the same values errs by 0.1
+    powers = np.stack(np.meshgrid(range(5), range(5)), -1).reshape(-1, 2)
+    rows, there = (np.prod(np.stack(p, -1)[:, None] ** powers, axis=2) for p in ((z, f), (at, near)))
+    polynomial = there @ np.linalg.lstsq(rows, targets, rcond=None)[0] - breathes(at, near)
+    assert np.abs(error).max() < 0.1 * np.abs(polynomial).max()
+
+
 def still(bends: bool = False) -> tuple[LensPoints, PixelData]:
     lens = seen("c", grid(4, 3), seed=3, side=4, bends=bends)
     return lens, PixelData.of(lens, True, "k1" if bends else "none", True)

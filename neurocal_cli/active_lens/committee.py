@@ -31,8 +31,9 @@ __all__ = ["TOPOLOGIES", "Budget", "fit_committee", "suitable_topologies"]
 TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
 # Three values of a control tell no more than its bow: no tanh units of its own then.
 _SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
-_WEIGHTS_PER_SETTING = 1.5
+_WEIGHTS_PER_SETTING = 2.0
 _CLEARLY = 5.0  # logarithm of the odds for another scale than the logarithmic, which fits any zoom's noise
+_IN_LINE = 0.6  # share of the best networks that may be in the committee
 _GRID = 13  # places on each control where networks are compared
 
 
@@ -133,7 +134,7 @@ def fit_committee(
 
 
 def suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
-    """Topologies that are worth trying on settings (S, D): hardly more weights than settings."""
+    """Topologies that are worth trying on settings (S, D): up to twice as many weights, most of them idle."""
     limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
     choices = _SPARSE if sparse_controls(x).any() else TOPOLOGIES
     return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
@@ -199,8 +200,12 @@ def _fit(x: Array, targets: Array, variance: Array, rng: np.random.Generator, bu
 
 
 def _agreeing(nets: Sequence[ParameterNet], probe: Array, count: int) -> list[ParameterNet]:
-    """The `count` networks nearest to the median of all, the nearest first; repeated if there are fewer."""
+    """The `count` networks nearest to the median of all, the nearest first.
+
+    Those farthest from it are never taken: where few settings leave few networks to choose from, the
+    nearer ones are repeated.
+    """
     outputs = np.array([net.output(probe) for net in nets])
     distance = ((outputs - np.median(outputs, axis=0)) ** 2).mean(axis=1)
-    order = np.argsort(distance, kind="stable")
-    return [nets[order[k % len(nets)]] for k in range(count)]
+    order = np.argsort(distance, kind="stable")[: max(1, round(_IN_LINE * len(nets)))]
+    return [nets[order[k % len(order)]] for k in range(count)]

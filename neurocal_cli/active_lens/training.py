@@ -83,11 +83,15 @@ def followed(effective: Array, squares: Array, x: Array) -> Array:
     Data that leave a direction open do not shrink weights along it. So priors stay narrower than 6
     standard units; and those of weights from a control of three values than 1, or a unit could turn
     between two of them, seen by nobody; and that of the bows' weights a, as tanh(a) reaches no farther.
+    It stays as wide where a control has three values, which tell a bow but not its tilt.
     """
-    least, D = np.full(effective.shape[-1], _LEAST), x.shape[1]
-    least[2 : 2 + D][sparse_controls(x)] = _LEAST_SPARSE
+    D, sparse = x.shape[1], sparse_controls(x)
+    least, most = np.full(effective.shape[-1], _LEAST), np.full(effective.shape[-1], _MOST)
+    least[2 : 2 + D][sparse] = _LEAST_SPARSE
     least[6 + D] = _LEAST_TILT
-    return np.clip(effective / squares, least, _MOST)
+    if sparse.any():
+        most[6 + D] = _LEAST_TILT
+    return np.clip(effective / squares, least, most)
 
 
 def prior_precision(topology: Topology, precision: Array) -> Array:
