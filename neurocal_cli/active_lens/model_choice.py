@@ -22,7 +22,8 @@ _CHANCE = 3.0  # ... and the residual variance by so many of its standard deviat
 
 def choose_model(lens: LensPoints, options: Options, reject: bool, report: Progress) -> Start:
     """The simplest lens model that predicts held-out settings as well as a richer one."""
-    best: tuple[float, Start] | None = None
+    best: Start | None = None
+    best_px: float | None = None  # not known before a richer model asks for it
     failure: DegenerateGeometryError | None = None
     for model in LADDER:
         try:
@@ -30,14 +31,20 @@ def choose_model(lens: LensPoints, options: Options, reject: bool, report: Progr
         except DegenerateGeometryError as error:
             failure = error
             continue
+        if best is None:
+            best = start
+            continue
+        if not _explains_more(start, best):
+            continue
         report(f"trying distortion {model}", 0.5)
+        best_px = _held_out(best, options) if best_px is None else best_px
         error_px = _held_out(start, options)
-        if best is None or (_explains_more(start, best[1]) and error_px < _WORTH * best[0]):
-            best = (error_px, start)
+        if error_px < _WORTH * best_px:
+            best, best_px = start, error_px
     if best is None:
         assert failure is not None
         raise failure
-    return best[1]
+    return best
 
 
 def _explains_more(rich: Start, simple: Start) -> bool:
