@@ -1,5 +1,21 @@
 """neurocal: camera calibration by a neural network whose weights are the camera.
 
+Data flow from the top to the bottom of this list, and nothing imports from further down:
+
+====================================  ==================================================================
+errors, geometry, camera, lens        the language: conventions, projection, distortion
+points, board, calibration            what goes in and what comes out
+network, training                     the calibrating network and its trainers
+adjustment                            the pixel error of all views, its minimum, its covariance
+search                                from random weights to a camera
+lenses                                which lens the data support, and straightening with it
+calibrating, methods                  `calibrate`: the fit, without the points that lie, as a result
+judging, evaluation, report           what a result is worth
+stereo, active_lens, plots            two cameras; a camera whose zoom and focus move; pictures
+io, rendering, detection              files; exact synthetic images; points from images
+commands                              the command line
+====================================  ==================================================================
+
 The names below are loaded on first use, so that a command imports only what it needs.
 """
 
@@ -27,15 +43,15 @@ if TYPE_CHECKING:
     from neurocal_cli.io.lens_yaml import read_lens, write_lens
     from neurocal_cli.io.points_csv import read_points, write_points
     from neurocal_cli.io.rig_yaml import read_rig, write_rig
+    from neurocal_cli.lenses.remapping import undistort_image
+    from neurocal_cli.lenses.undistortion import undistort_points
     from neurocal_cli.methods import calibrate
     from neurocal_cli.points import Correspondences
-    from neurocal_cli.remapping import undistort_image
     from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
     from neurocal_cli.stereo.fitting import fit_rig
     from neurocal_cli.stereo.methods import calibrate_stereo
     from neurocal_cli.stereo.rig import Rig
     from neurocal_cli.stereo.triangulation import triangulate
-    from neurocal_cli.undistortion import undistort_points
 
 __version__ = "0.1.0"
 
@@ -68,8 +84,8 @@ _HOMES = {
     "read_points": "io.points_csv",
     "read_rig": "io.rig_yaml",
     "triangulate": "stereo.triangulation",
-    "undistort_image": "remapping",
-    "undistort_points": "undistortion",
+    "undistort_image": "lenses.remapping",
+    "undistort_points": "lenses.undistortion",
     "write_calibration": "io.calibration_yaml",
     "write_lens": "io.lens_yaml",
     "write_points": "io.points_csv",

@@ -13,14 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.problems import KnownCamera
+from neurocal_cli.adjustment.user_units import see
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import Lens
 from neurocal_cli.points import Correspondences
-from neurocal_cli.problems import KnownCamera
-from neurocal_cli.user_units import see
 
 __all__ = ["CameraEvaluation", "ViewEvaluation", "evaluate_camera"]
 

@@ -31,7 +31,6 @@ __all__ = [
     "coefficient_names",
     "distort",
     "pinhole_coefficients",
-    "undistort",
 ]
 
 MODELS = {
@@ -202,23 +201,3 @@ def _bend_fisheye(
         power = power * t2
     cross = x * y * slope
     return (x * scale, y * scale), (scale + x * x * slope, cross, cross, scale + y * y * slope), by
-
-
-def undistort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
-    """Straighten bent points, the inverse of `distort` within the lens's first fold.
-
-    Parameters
-    ----------
-    model : str
-    k : sequence of float
-    x, y : arrays of one shape
-        Bent normalised points.
-
-    Returns
-    -------
-    x, y : arrays of that shape
-        ``nan`` where no straight point bends to the given one.
-    """
-    from neurocal_cli.lens_domain import straightened  # which is made of the models here
-
-    return straightened(Lens(model, np.asarray(k, dtype=float)), x, y)

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import Lens, bend, coefficient_names, distort
+from neurocal_cli.lens import Coefficients, Lens, bend, coefficient_names, distort
 
-__all__ = ["first_fold", "is_seen", "radial_slope", "straight_pixels", "straightened"]
+__all__ = ["first_fold", "is_seen", "radial_slope", "straight_pixels", "straightened", "undistort"]
 
 _FARTHEST = 1e3  # radius of straight points that no image reaches
 _TABLE = 4096
@@ -90,6 +90,24 @@ def is_seen(lens: Lens, x: Array, y: Array) -> NDArray[np.bool_]:
     with np.errstate(all="ignore"):
         _, (xx, xy, yx, yy), _ = bend(lens.model, lens.coefficients, x, y)
         return np.asarray((np.hypot(x, y) < first_fold(lens)) & (xx * yy - xy * yx > 0))
+
+
+def undistort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
+    """Straighten bent points, the inverse of `distort` within the lens's first fold.
+
+    Parameters
+    ----------
+    model : str
+    k : sequence of float
+    x, y : arrays of one shape
+        Bent normalised points.
+
+    Returns
+    -------
+    x, y : arrays of that shape
+        ``nan`` where no straight point bends to the given one.
+    """
+    return straightened(Lens(model, np.asarray(k, dtype=float)), x, y)
 
 
 def straightened(lens: Lens, x: Array, y: Array) -> tuple[Array, Array]:

@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scenes import Scene, random_flat_set
 
+from neurocal_cli.adjustment.refine import refine
+from neurocal_cli.adjustment.user_units import Seen, normalised
+from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Pose, project
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import Lens, distort
 from neurocal_cli.lens_domain import first_fold, is_seen
+from neurocal_cli.lenses.unfolding import folds_back
 from neurocal_cli.points import Correspondences
-from neurocal_cli.refine import refine
-from neurocal_cli.unfolding import folds_back
-from neurocal_cli.user_units import Seen, normalised
-from neurocal_cli.views import arrange
 
 BENT = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "fisheye")
 SIGMA = 0.2

@@ -8,14 +8,14 @@ from functools import partial
 import numpy as np
 
 from neurocal_cli import calibrate
+from neurocal_cli.adjustment.pixel_error import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.adjustment.problems import Known, known_for
+from neurocal_cli.adjustment.refine import refine
+from neurocal_cli.adjustment.uncertainty import covariance
+from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.camera import Intrinsics, Pose, project
 from neurocal_cli.geometry import Array
-from neurocal_cli.pixel_error import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.points import Correspondences
-from neurocal_cli.problems import Known, known_for
-from neurocal_cli.refine import refine
-from neurocal_cli.uncertainty import covariance
-from neurocal_cli.views import Views, arrange
 
 # Every point, a pinhole: what a reference optimiser does.
 pinhole = partial(calibrate, distortion="none", outliers="keep")

@@ -14,9 +14,9 @@ from seen_grids import labelled_vertices, seen_grid
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect
 from neurocal_cli.detection.detect import Detection, detect_points, gather, label
-from neurocal_cli.detection.identity import Identified, Located
-from neurocal_cli.detection.identity_placement import Placement
-from neurocal_cli.detection.identity_words import NoBoardError
+from neurocal_cli.detection.identity.identify import Identified, Located
+from neurocal_cli.detection.identity.placement import Placement
+from neurocal_cli.detection.identity.words import NoBoardError
 from neurocal_cli.errors import InputError
 from neurocal_cli.rendering import Rendered, render
 

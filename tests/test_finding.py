@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from rendered import condition, picture
 
-from neurocal_cli.detection import Grid, find_levels
-from neurocal_cli.detection.finding import find_grids
+from neurocal_cli.detection import Grid
+from neurocal_cli.detection.finding import levels as find_levels
+from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.geometry import Array
 from neurocal_cli.rendering import PlaneTruth, Rectangle, render, scene_bound
 

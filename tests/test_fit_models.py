@@ -9,12 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neurocal_cli.detection import fit_edges, fit_vertices
-from neurocal_cli.detection.fit_box import PIXEL, box_profile, half_widths
-from neurocal_cli.detection.fit_edges import EdgeData
-from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
-from neurocal_cli.detection.fit_newton import Shape
-from neurocal_cli.detection.fit_profile import (
+from neurocal_cli.detection.fitting import edges as fit_edges
+from neurocal_cli.detection.fitting import vertices as fit_vertices
+from neurocal_cli.detection.fitting.box import PIXEL, box_profile, half_widths
+from neurocal_cli.detection.fitting.edges import EdgeData
+from neurocal_cli.detection.fitting.newton import Shape
+from neurocal_cli.detection.fitting.profile import (
     RESPONSE_TERMS,
     box_kurtosis,
     erf_and_density,
@@ -23,7 +23,8 @@ from neurocal_cli.detection.fit_profile import (
     response_terms,
     tail_terms,
 )
-from neurocal_cli.detection.fit_vertices import VertexData
+from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fitting.vertices import VertexData
 from neurocal_cli.geometry import Array
 
 STEP = 1e-5

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from test_fit_models import some_map
 
-from neurocal_cli.detection.fit_forms import choose_map
-from neurocal_cli.detection.fit_map import Frame, SmoothMap, homography_start
-from neurocal_cli.detection.fit_newton import BLUR, Fit, Linear, Part, Prior, gauss_newton
-from neurocal_cli.detection.fit_noise import BoardBlur
-from neurocal_cli.detection.fit_robust import Rows, fit_map, median
-from neurocal_cli.detection.fit_shading import Levels, fit_shading
-from neurocal_cli.detection.fit_strips import gather, grid_lines
+from neurocal_cli.detection.fitting.forms import choose_map
+from neurocal_cli.detection.fitting.newton import BLUR, Fit, Linear, Part, Prior, gauss_newton
+from neurocal_cli.detection.fitting.noise import BoardBlur
+from neurocal_cli.detection.fitting.robust import Rows, fit_map, median
+from neurocal_cli.detection.fitting.shading import Levels, fit_shading
+from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fitting.strips import gather, grid_lines
 from neurocal_cli.geometry import Array
 
 GRID = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)

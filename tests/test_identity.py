@@ -15,12 +15,12 @@ from seen_grids import labelled_vertices, seen_grid, seen_grids, true_vertices, 
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import Grid
-from neurocal_cli.detection.identity import identify
-from neurocal_cli.detection.identity_ends import DIRECTIONS, End, board_ends
-from neurocal_cli.detection.identity_fit import fit_camera, motion
-from neurocal_cli.detection.identity_placement import Placement, placements
-from neurocal_cli.detection.identity_trim import trimmed
-from neurocal_cli.detection.identity_words import LOOKS_THE_SAME, NoBoardError
+from neurocal_cli.detection.identity.ends import DIRECTIONS, End, board_ends
+from neurocal_cli.detection.identity.fit import fit_camera, motion
+from neurocal_cli.detection.identity.identify import identify
+from neurocal_cli.detection.identity.placement import Placement, placements
+from neurocal_cli.detection.identity.trim import trimmed
+from neurocal_cli.detection.identity.words import LOOKS_THE_SAME, NoBoardError
 from neurocal_cli.geometry import Array
 from neurocal_cli.rendering import Rectangle, Rendered, Scene, Sides, Target, ground_truth, render
 

@@ -20,9 +20,29 @@ HOMES = {
     "rich": ("commands/",),
     "matplotlib": ("plots.py", "active_lens/plots.py"),
     "yaml": ("io/",),
-    "cv2": ("detection/", "rendering/", "io/images.py", "remapping.py"),
+    "cv2": ("detection/", "rendering/", "io/images.py", "lenses/remapping.py"),
     "scipy": (),
 }
+# Rooms, a folder or a module each, from the ground up: each imports from itself and from lower levels only.
+LEVELS = (
+    {"errors", "geometry"},
+    {"board", "camera", "lens", "network", "points"},
+    {"calibration", "lens_domain", "training"},
+    {"rendering"},
+    {"adjustment"},
+    {"judging", "lenses", "search"},
+    {"calibrating"},
+    {"methods"},
+    {"evaluation"},
+    {"report"},
+    {"stereo"},
+    {"plots"},
+    {"active_lens"},
+    {"io"},
+    {"detection"},
+    {"commands"},
+    {"__main__"},
+)
 METHODS = {"read_text", "read_bytes", "write_text", "write_bytes", "open"}
 NUMPY_FILES = {"load", "save", "savez", "savetxt", "loadtxt", "genfromtxt", "fromfile", "tofile"}
 
@@ -42,6 +62,18 @@ def calls(tree: ast.Module) -> Iterator[tuple[str, str]]:
             yield "", node.func.id
         elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
             yield ast.unparse(node.func.value), node.func.attr
+
+
+def room(name: str) -> str:
+    return name.split("/")[0].removesuffix(".py")
+
+
+@pytest.mark.parametrize("name", [name for name in MODULES if name != "__init__.py"])
+def test_a_module_imports_from_its_own_room_and_from_below(name: str) -> None:
+    mine = room(name)
+    (level,) = (k for k, rooms in enumerate(LEVELS) if mine in rooms)
+    used = {m.split(".")[1] for m in imported(MODULES[name]) if m.startswith("neurocal_cli.")}
+    assert used <= set().union({mine}, *LEVELS[:level])
 
 
 @pytest.mark.parametrize("package", HOMES)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scenes import Scene, pinhole, random_flat_set, random_solid
 
-from neurocal_cli.evaluation import evaluate_camera
-from neurocal_cli.leave_out import (
+from neurocal_cli.adjustment.leave_out import (
     disagreement,
     held_out,
     held_out_points,
@@ -16,9 +15,10 @@ from neurocal_cli.leave_out import (
     reduced,
     without_each,
 )
+from neurocal_cli.adjustment.refine import Refined, refine
+from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.points import Correspondences
-from neurocal_cli.refine import Refined, refine
-from neurocal_cli.views import Views, arrange
 
 FREE = np.array([True, False, True, True, True])
 

@@ -9,13 +9,13 @@ from scenes import Scene, board_midpoints, random_flat_set, table_1
 from test_real_data import zhang
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
+from neurocal_cli.adjustment.pixel_error import CameraState, normal_blocks, residuals
+from neurocal_cli.adjustment.tiles import tile
 from neurocal_cli.camera import INTRINSIC_NAMES, project
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import write_calibration
 from neurocal_cli.lens import Lens, distort
-from neurocal_cli.pixel_error import CameraState, normal_blocks, residuals
-from neurocal_cli.tiles import tile
 
 LENSES = {
     "k1": [-0.25],

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from test_lens import LENSES
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import Lens, bend, distort, undistort
-from neurocal_cli.lens_domain import first_fold, is_seen, straightened
+from neurocal_cli.lens import Lens, bend, distort
+from neurocal_cli.lens_domain import first_fold, is_seen, straightened, undistort
 
 SPREAD = {
     "k1": [0.4],

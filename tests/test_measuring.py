@@ -228,7 +228,7 @@ def test_occluders_in_many_pictures() -> None:
 @pytest.mark.skipif(not LARGE.is_file(), reason="needs the photograph")
 def test_edges_of_a_sharp_photograph_settle() -> None:
     cv2 = pytest.importorskip("cv2")
-    finding = pytest.importorskip("neurocal_cli.detection.finding")
+    finding = pytest.importorskip("neurocal_cli.detection.finding.grids")
     image = cv2.imread(str(LARGE), 0)
     measured = measure(image, finding.find_grids(image)[0])
     assert len(measured.kind) + measured.rejected == 1739  # of 36 x 25 vertices
@@ -239,7 +239,7 @@ def test_edges_of_a_sharp_photograph_settle() -> None:
 @pytest.mark.parametrize("points", ["midpoints", "vertices"])
 def test_photographs_calibrate_better_than_with_opencv_corners(points: str) -> None:
     cv2 = pytest.importorskip("cv2")
-    finding = pytest.importorskip("neurocal_cli.detection.finding")
+    finding = pytest.importorskip("neurocal_cli.detection.finding.grids")
     places_3d, pixels = [], []
     for path in sorted(PHOTOS.glob("left*.jpg")):
         image = cv2.imread(str(path), 0)

@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from test_uncertainty import noisy, whitener
 
 from neurocal_cli import Correspondences, Intrinsics, Pose
+from neurocal_cli.adjustment.pixel_error import ENTRIES
+from neurocal_cli.adjustment.problems import intrinsic_matrix
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import INTRINSIC_NAMES, project
 from neurocal_cli.geometry import Array
-from neurocal_cli.pixel_error import ENTRIES
-from neurocal_cli.problems import intrinsic_matrix
 
 CAMERA = Intrinsics(800.0, 820.0, 330.0, 250.0)
 BOARD = np.array([(30.0 * x, 30.0 * y, 0.0) for y in range(6) for x in range(9)])

@@ -5,11 +5,11 @@ import pytest
 from scenes import Scene, pinhole, table_1
 
 from neurocal_cli import Calibration
+from neurocal_cli.adjustment.pixel_error import normal_blocks
+from neurocal_cli.adjustment.uncertainty import covariance
+from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array
-from neurocal_cli.pixel_error import normal_blocks
-from neurocal_cli.uncertainty import covariance
-from neurocal_cli.views import arrange
 
 UNKNOWNS = {1: 11, 2: 9, 3: 6, 4: 5}
 

@@ -9,8 +9,8 @@ import pytest
 from scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences
+from neurocal_cli.adjustment.noise import common_share, with_common_share
 from neurocal_cli.geometry import Array
-from neurocal_cli.noise import common_share, with_common_share
 
 
 def stated(n: int, rng: np.random.Generator) -> Array:

@@ -9,10 +9,10 @@ import pytest
 from scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
+from neurocal_cli.adjustment.pixel_error import ENTRIES
+from neurocal_cli.adjustment.problems import known_for
+from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
-from neurocal_cli.pixel_error import ENTRIES
-from neurocal_cli.problems import known_for
-from neurocal_cli.views import arrange
 
 SCENE = table_1()
 CAMERA = Intrinsics(555.123456789, 549.1, 171.7, 121.3, 1.5)

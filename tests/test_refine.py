@@ -9,11 +9,11 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from neurocal_cli.adjustment.pixel_error import CameraState, normal_blocks
+from neurocal_cli.adjustment.problems import intrinsic_matrix
+from neurocal_cli.adjustment.refine import refine
+from neurocal_cli.adjustment.tiles import Tiles, tile
 from neurocal_cli.geometry import Array
-from neurocal_cli.pixel_error import CameraState, normal_blocks
-from neurocal_cli.problems import intrinsic_matrix
-from neurocal_cli.refine import refine
-from neurocal_cli.tiles import Tiles, tile
 
 FREE = {
     "type 1": [1, 1, 1, 1, 1],

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns
-from neurocal_cli.starts import Agreement, FixedWeights, Learnt, learn
 from neurocal_cli.training import Task, Trained
+from neurocal_cli.training.starts import Agreement, FixedWeights, Learnt, learn
 
 K, N = 3, 8
 

@@ -5,8 +5,8 @@ import pytest
 from rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate
+from neurocal_cli.adjustment.pixel_error import residuals
 from neurocal_cli.geometry import Array
-from neurocal_cli.pixel_error import residuals
 from neurocal_cli.stereo.consensus import find_consensus
 from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.pixel_error import Columns, RigState, rig_normal_blocks

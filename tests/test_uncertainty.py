@@ -9,12 +9,12 @@ import pytest
 from scenes import Scene, pinhole, random_flat_set, random_solid
 
 from neurocal_cli import Correspondences
+from neurocal_cli.adjustment.pixel_error import CameraState, normal_blocks
+from neurocal_cli.adjustment.uncertainty import covariance
+from neurocal_cli.adjustment.views import arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
 from neurocal_cli.geometry import Array
-from neurocal_cli.pixel_error import CameraState, normal_blocks
-from neurocal_cli.uncertainty import covariance
-from neurocal_cli.views import arrange
 
 
 def whitener(points: Correspondences) -> Array:

@@ -19,7 +19,7 @@ from neurocal_cli.camera import Intrinsics
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import Lens
-from neurocal_cli.undistortion import new_camera, undistortion
+from neurocal_cli.lenses.undistortion import new_camera, undistortion
 
 SIZE = (640, 480)
 BENDING = [model for model in LENSES if model != "none"]
@@ -269,7 +269,7 @@ def test_nothing_is_mirrored_beyond_the_fold() -> None:
     assert np.isnan(su[radius > fold + 0.01]).all()
     naive = cv2.undistort(white, cam.K, np.array([-0.25, 0, 0, 0]), newCameraMatrix=zoomed_out.K)
     assert naive[radius > 1.5].any()  # what others show there
-    from neurocal_cli.remapping import Remapping
+    from neurocal_cli.lenses.remapping import Remapping
 
     done = Remapping(step, SIZE)(white)
     assert done[radius < fold - 0.05].min() == 255

@@ -9,13 +9,13 @@ import pytest
 from bent import SIGMA, bent_set, new_views, through
 
 from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli.adjustment.pixel_error import CameraState
 from neurocal_cli.camera import Pose, project
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.lens import Lens, bend
 from neurocal_cli.lens_domain import radial_slope
-from neurocal_cli.pixel_error import CameraState
+from neurocal_cli.lenses.unfolding import Unfolded, folds_back
 from neurocal_cli.stereo.fitting import fit_rig
-from neurocal_cli.unfolding import Unfolded, folds_back
 
 LENSES = {
     "k1": [-0.2],

@@ -16,7 +16,7 @@ from scenes import board_midpoints
 from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.camera import project
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.judgement import judged
+from neurocal_cli.judging.judgement import judged
 from neurocal_cli.lens import distort
 
 SIZE = (640, 480)

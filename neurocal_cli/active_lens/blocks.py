@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.active_lens.settings import LensPoints
+from neurocal_cli.adjustment.pixel_error import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.adjustment.refine import refine
+from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
 from neurocal_cli.lens import coefficient_names
-from neurocal_cli.pixel_error import POSE, CameraState, camera_columns, normal_blocks
-from neurocal_cli.refine import refine
-from neurocal_cli.views import Views, arrange
 
 __all__ = ["Constants", "Normal", "PixelData"]
 

@@ -90,7 +90,7 @@ def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) 
     note(notes)
     points, arguments = estimation.prepare(points)
 
-    from neurocal_cli.judgement import judged
+    from neurocal_cli.judging.judgement import judged
     from neurocal_cli.methods import calibrate as learn
 
     with ProgressBar() as progress:

@@ -17,7 +17,7 @@ from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageErr
 
 if TYPE_CHECKING:
     from neurocal_cli.io.camera_files import CameraFile
-    from neurocal_cli.remapping import Remapping
+    from neurocal_cli.lenses.remapping import Remapping
 
 __all__ = ["undistort"]
 
@@ -212,8 +212,8 @@ class _Work:
 
     def _image(self, path: str, output: str) -> bytes:
         from neurocal_cli.io.images import encode_image, read_picture
-        from neurocal_cli.remapping import Remapping
-        from neurocal_cli.undistortion import undistortion
+        from neurocal_cli.lenses.remapping import Remapping
+        from neurocal_cli.lenses.undistortion import undistortion
 
         picture = read_picture(path)
         if self.remapping is None:
@@ -230,7 +230,7 @@ class _Work:
 
     def _points(self, path: str) -> str:
         from neurocal_cli.io.points_csv import format_points, read_points
-        from neurocal_cli.undistortion import undistort_points
+        from neurocal_cli.lenses.undistortion import undistort_points
 
         notes: list[str] = []
         points = read_points(path, notes=notes)
@@ -252,7 +252,7 @@ class _Work:
         """Write the camera of what was corrected."""
         from neurocal_cli.io.camera_info import format_camera_info
         from neurocal_cli.io.files import write_whole
-        from neurocal_cli.undistortion import undistortion
+        from neurocal_cli.lenses.undistortion import undistortion
 
         step = undistortion(self.camera, self.alpha, self.size)
         write_whole(path, format_camera_info(self.camera.camera_name, self.size, step.new.A))

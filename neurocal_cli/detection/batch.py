@@ -15,7 +15,7 @@ import numpy as np
 
 from neurocal_cli.board import Board
 from neurocal_cli.detection.detect import Detection, Points, detect_points
-from neurocal_cli.detection.finding import find_grids
+from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.io.images import Image, encode_png, read_image

@@ -13,13 +13,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fit_board import Board, Fitted, fit_all_vertices, fit_board
-from neurocal_cli.detection.fit_box import sharp_profile
-from neurocal_cli.detection.fit_edges import OFFSET, TILT
-from neurocal_cli.detection.fit_newton import BLUR
-from neurocal_cli.detection.fit_profile import response
-from neurocal_cli.detection.fit_robust import median
-from neurocal_cli.detection.fit_vertices import FIRST, SECOND
+from neurocal_cli.detection.fitting.board import Board, Fitted, fit_all_vertices, fit_board
+from neurocal_cli.detection.fitting.box import sharp_profile
+from neurocal_cli.detection.fitting.edges import OFFSET, TILT
+from neurocal_cli.detection.fitting.newton import BLUR
+from neurocal_cli.detection.fitting.profile import response
+from neurocal_cli.detection.fitting.robust import median
+from neurocal_cli.detection.fitting.vertices import FIRST, SECOND
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.geometry import Array
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.detection.detect import Detection, label
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
-from neurocal_cli.detection.identity import Located
+from neurocal_cli.detection.identity.identify import Located
 from neurocal_cli.detection.residuals import residuals
 from neurocal_cli.geometry import Array
 

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.arrowhead import ArrowheadCovariance, arrowhead_covariance
+from neurocal_cli.adjustment.arrowhead import ArrowheadCovariance, arrowhead_covariance
+from neurocal_cli.adjustment.parameters import parameter_covariance, parameter_warnings, pose_std
+from neurocal_cli.adjustment.pixel_error import ENTRIES, POSE, CameraState, residuals
+from neurocal_cli.adjustment.problems import intrinsic_matrix
+from neurocal_cli.adjustment.tiles import Tiles
 from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.camera import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.lens import Lens
-from neurocal_cli.parameters import parameter_covariance, parameter_warnings, pose_std
-from neurocal_cli.pixel_error import ENTRIES, POSE, CameraState, residuals
-from neurocal_cli.problems import intrinsic_matrix
+from neurocal_cli.lenses.unfolding import folds_back
 from neurocal_cli.stereo.pixel_error import Columns, Sightings, through_rig
 from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.refine import RefinedRig
 from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.tiles import Tiles
-from neurocal_cli.unfolding import folds_back
 
 __all__ = ["assemble_rig", "folding_sides"]
 

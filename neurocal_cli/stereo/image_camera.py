@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from neurocal_cli.adjustment.pixel_error import ENTRIES
+from neurocal_cli.adjustment.problems import KnownCamera
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import bend, undistort
-from neurocal_cli.pixel_error import ENTRIES
-from neurocal_cli.problems import KnownCamera
+from neurocal_cli.lens import bend
+from neurocal_cli.lens_domain import undistort
 
 __all__ = ["ImageCamera"]
 

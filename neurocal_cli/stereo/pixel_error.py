@@ -3,7 +3,7 @@
 A view that both cameras saw has one pose, in the left camera's frame; the right camera's follows
 through the rig, R'_k = R R_k and t'_k = R t_k + t. A view that only one camera saw has that camera's
 pose and tells nothing of the rig, but as much of its camera as it ever did. Each camera's derivatives
-are those of `neurocal_cli.pixel_error`; the right camera's are led through the rig:
+are those of `neurocal_cli.adjustment.pixel_error`; the right camera's are led through the rig:
 
     R -> exp(w) R,  t -> t + tau,  R_k -> exp(w_k) R_k,  t_k -> t_k + tau_k   give
     w' = w + R w_k,  tau' = w x (R t_k) + R tau_k + tau
@@ -17,9 +17,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.pixel_error import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.adjustment.tiles import Tiles
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
-from neurocal_cli.pixel_error import POSE, CameraState, camera_columns, normal_blocks
-from neurocal_cli.tiles import Tiles
 
 __all__ = ["Columns", "Frames", "RigState", "Sightings", "rig_normal_blocks", "through_rig"]
 

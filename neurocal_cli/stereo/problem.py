@@ -7,18 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.noise import common_share, measured, with_common_share
+from neurocal_cli.adjustment.pixel_error import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.adjustment.tiles import tile
+from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Pose
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import coefficient_names
-from neurocal_cli.noise import common_share, measured, with_common_share
-from neurocal_cli.pixel_error import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.pixel_error import Frames, RigState, Sightings
-from neurocal_cli.tiles import tile
-from neurocal_cli.views import Views, arrange
 
 __all__ = ["RigProblem", "free_parameters", "rig_problem"]
 

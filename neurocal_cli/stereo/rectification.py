@@ -14,7 +14,7 @@ import numpy as np
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import UsageError
 from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
-from neurocal_cli.lens import undistort
+from neurocal_cli.lens_domain import undistort
 from neurocal_cli.stereo.rig import Rig
 
 __all__ = ["Rectification", "rectify"]

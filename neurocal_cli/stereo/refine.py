@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.arrowhead import arrowhead_step
+from neurocal_cli.adjustment.arrowhead import arrowhead_step
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.pixel_error import Columns, Frames, RigState, Sightings, rig_normal_blocks
 

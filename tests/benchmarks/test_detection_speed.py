@@ -17,7 +17,7 @@ from rendered import picture
 from neurocal_cli.board import Board
 from neurocal_cli.detection.batch import keep_memory
 from neurocal_cli.detection.detect import detect_points
-from neurocal_cli.detection.finding import find_grids
+from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.measuring import measure
 
 cv2 = pytest.importorskip("cv2")

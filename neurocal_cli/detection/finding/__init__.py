@@ -1,0 +1,1 @@
+"""Where chessboards are in a picture: saddles, linked and grown into grids."""

@@ -1,0 +1,70 @@
+"""Whether a lattice is a chessboard, or something in the clutter that resembles one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.detection.finding.grow import Lattice, signs
+from neurocal_cli.detection.finding.levels import Level, sampled
+from neurocal_cli.geometry import Array
+
+__all__ = ["edges_seen", "has_block", "is_smooth"]
+
+_ASIDE = 0.16  # squares; to either side of an edge, half-way between two vertices
+_LEAST_EDGE = 0.3  # of the contrast, across an edge
+_EDGES = 0.9  # share of the edges that are seen
+# Vertices may be off from where their neighbours put them, rms, by so many squares and px, and by
+# so many px per ratio of the noise (of second derivatives) to the contrast.
+_OFF, _OFF_PX, _OFF_NOISE = 0.021, 0.09, 20.0
+_MANY, _FEW_SMOOTH = 18, 0.6  # few vertices are in line by chance: less is tolerated of them
+
+
+def has_block(lattice: Lattice) -> bool:
+    """Whether a block of 3 x 3 vertices is known: below that no line is tested by a third vertex."""
+    seen = lattice.seen
+    if min(seen.shape) < 3:
+        return False
+    rows = seen[:-2] & seen[1:-1] & seen[2:]
+    return bool((rows[:, :-2] & rows[:, 1:-1] & rows[:, 2:]).any())
+
+
+def is_smooth(level: Level, lattice: Lattice) -> bool:
+    """Whether vertices are where their neighbours put them, as well as noise allows."""
+    return roughness(level, lattice) < (1 if lattice.seen.sum() >= _MANY else _FEW_SMOOTH)
+
+
+def roughness(level: Level, lattice: Lattice) -> float:
+    """How far vertices are from where their neighbours put them, over what is tolerated."""
+    row, col, at = lattice.known
+    off = at.in_squares(lattice.pixels[row, col] - at.points) / np.maximum(at.spread, 1.0)[:, None]
+    contrast = max(float(np.nanmedian(lattice.contrast)), 1e-3)
+    tolerated = _OFF + (_OFF_PX + _OFF_NOISE * level.noise / contrast) / max(float(np.median(at.width)), 1.0)
+    return float(np.sqrt((off**2).mean())) / tolerated
+
+
+def edges_seen(level: Level, lattice: Lattice) -> bool:
+    """Whether dark and bright are told apart across the edges between neighbouring vertices."""
+    row, col, at = lattice.known
+    pixels, contrast = lattice.pixels, lattice.contrast
+    c, r = np.full_like(pixels, np.nan), np.full_like(pixels, np.nan)
+    c[row, col], r[row, col] = at.c, at.r
+    held = [
+        _held(level, pixels, r, contrast, lattice.dark),
+        # With rows and columns exchanged, the squares on either side are too.
+        _held(level, pixels.transpose(1, 0, 2), c.transpose(1, 0, 2), contrast.T, lattice.dark),
+    ]
+    return float(np.concatenate(held).mean()) >= _EDGES
+
+
+def _held(level: Level, pixels: Array, ways: Array, contrast: Array, dark: int) -> Array:
+    """Whether each edge along a row is seen; ways (rows, cols, 2) lead from row to row."""
+    known = np.isfinite(pixels[..., 0])
+    row, col = np.nonzero(known[:, :-1] & known[:, 1:])
+    start, end = pixels[row, col], pixels[row, col + 1]
+    across = 0.5 * (ways[row, col] + ways[row, col + 1])
+    middle = 0.5 * (start + end)
+    sides = np.stack([middle + _ASIDE * across, middle - _ASIDE * across], axis=1)
+    value = sampled(level.smooth, sides)
+    rise = (value[:, 1] - value[:, 0]) * signs(row, col, dark)
+    usual = np.minimum(contrast[row, col], contrast[row, col + 1])
+    return np.asarray(rise > _LEAST_EDGE * usual)

@@ -1,0 +1,111 @@
+"""Vertices that two lattices claim: copies of a lattice, and the vertices on a fold."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.detection.finding.grow import Lattice, cropped, framed, frontier
+from neurocal_cli.detection.finding.predict import expected
+from neurocal_cli.geometry import Array
+
+__all__ = ["disputed", "distinct", "touching"]
+
+_SAME = 0.25  # of a square's width; between vertices that are the same
+_MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on ...
+_MEETS_PARTLY = 0.22  # ... if few of its row are seen
+_MOSTLY = 0.6  # share of a row
+_COPY = 0.5  # share of vertices in another lattice
+_BESIDE = 2.0  # squares; farther from each other lattices have nothing in dispute
+
+
+def distinct(lattices: list[Lattice]) -> list[Lattice]:
+    """Leave out lattices most of whose vertices are in a larger one."""
+    kept: list[Lattice] = []
+    for lattice in sorted(lattices, key=lambda x: -int(x.seen.sum())):
+        points = lattice.pixels[lattice.seen]
+        reach = _SAME * lattice.width
+        if not any((_distance(points, x.pixels[x.seen]) < reach).mean() > _COPY for x in kept):
+            kept.append(lattice)
+    return kept
+
+
+def touching(lattices: list[Lattice]) -> bool:
+    """Whether any two lattices come so near each other that they may claim the same vertices."""
+    boxes = []
+    for lattice in lattices:
+        points, room = lattice.pixels[lattice.seen], _BESIDE * _longest(lattice)
+        boxes.append((points.min(axis=0) - room, points.max(axis=0) + room))
+    return any(
+        bool(((low <= other_high) & (other_low <= high)).all())
+        for k, (low, high) in enumerate(boxes)
+        for other_low, other_high in boxes[:k]
+    )
+
+
+def _longest(lattice: Lattice) -> float:
+    """Longest side of a square [px]."""
+    p = lattice.pixels
+    sides = np.concatenate([np.diff(p, axis=0).reshape(-1, 2), np.diff(p, axis=1).reshape(-1, 2)])
+    return float(np.nanmax(np.hypot(*sides.T)))
+
+
+def disputed(lattices: list[Lattice]) -> list[Lattice]:
+    """Take outermost rows off a lattice that lie in another one, or where another one goes on.
+
+    Of two planes that meet at a fold each may have grown to the fold and a little beyond it.
+    """
+    result = list(lattices)
+    if len(result) < 2:
+        return result
+    for _ in range(2):
+        claims = [_claim(x) for x in result]
+        for i, lattice in enumerate(result):
+            for j, claim in enumerate(claims):
+                if i != j:
+                    lattice = _trimmed(lattice, claim)
+            result[i] = lattice
+    return result
+
+
+def _claim(lattice: Lattice) -> tuple[Array, float]:
+    """Vertices of a lattice and where it would go on (N, 2), and its squares' width."""
+    wider, _ = framed(lattice)
+    row, col = frontier(wider)
+    at = expected(wider.pixels, row, col)
+    return np.concatenate([lattice.pixels[lattice.seen], at.points]), lattice.width
+
+
+def _trimmed(lattice: Lattice, claim: tuple[Array, float]) -> Lattice:
+    points, width = claim
+    seen = lattice.seen
+    away = np.full(seen.shape, np.inf)
+    away[seen] = _distance(lattice.pixels[seen], points) / min(width, lattice.width)
+    drop = np.zeros_like(seen)
+    for line, inner in _OUTERMOST:
+        known = int(seen[line].sum())
+        # A row that is not whole is likelier to be where a plane ends.
+        meets = _MEETS if known > 0.75 * seen[inner].sum() else _MEETS_PARTLY
+        if known and (away[line][seen[line]] < meets).mean() >= _MOSTLY:
+            drop[line] = seen[line]
+    if not drop.any():
+        return lattice
+    pixels = np.where(drop[..., None], np.nan, lattice.pixels)
+    return cropped(replace(lattice, pixels=pixels, contrast=np.where(drop, np.nan, lattice.contrast)))
+
+
+_OUTERMOST = (
+    (np.s_[0, :], np.s_[1, :]),
+    (np.s_[-1, :], np.s_[-2, :]),
+    (np.s_[:, 0], np.s_[:, 1]),
+    (np.s_[:, -1], np.s_[:, -2]),
+)
+
+
+def _distance(points: Array, others: Array) -> Array:
+    """(N,) from each point to the nearest of the others [px]."""
+    if not len(points) or not len(others):
+        return np.full(len(points), np.inf)
+    away = points[:, None] - others[None]
+    return np.asarray(np.sqrt((away**2).sum(axis=-1).min(axis=1)))

@@ -1,0 +1,138 @@
+"""Lattices that run over a fold from one plane to another are cut there.
+
+Along a line of vertices in one plane second differences change slowly, however tilted the plane and
+bent the lens. At a fold they jump: at one vertex if the fold goes through it, else at the two
+beside it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.finding.grow import Lattice, cropped
+from neurocal_cli.geometry import Array
+
+__all__ = ["joined", "unfolded"]
+
+# The least bend that is a fold [squares] and its ratio to the bends of the rows far from it: paper
+# is bent too, and the less the better the board is otherwise.
+_FOLDS = ((0.13, 4.0), (0.06, 12.0))
+_BENT_PX = 0.2  # px; what imprecise vertices add to it
+_UNKNOWN = 0.03  # squares; the bend of the rows far from it where there is none
+_LEAST_ROWS = 4
+_BETWEEN = 1.4  # what a bend shared by two rows counts more, to be as large as that of one row
+_ONE_SIDED = 0.7  # what a bend counts that is compared with one side only
+
+
+def unfolded(lattice: Lattice) -> list[Lattice]:
+    """Cut a lattice into the parts that are joined and have no fold.
+
+    Vertices on a fold go to neither side: they belong to both planes, and their edges bend there.
+    """
+    whole = joined(lattice)
+    if len(whole) != 1:
+        return [part for piece in whole for part in unfolded(piece)]
+    lattice = whole[0]
+    row, col = _folds(lattice)
+    if row[1] == 0 and col[1] == 0:
+        return [lattice]
+    pixels = lattice.pixels if row[1] >= col[1] else lattice.pixels.transpose(1, 0, 2)
+    position = max(row, col, key=lambda fold: fold[1])[0]
+    index = np.arange(len(pixels))
+    if position in (1, len(pixels) - 2):
+        # A fold, or an outermost row that is wrong: only the latter is certain not to belong here.
+        position = 0.0 if position == 1 else len(pixels) - 1
+    parts = []
+    for side in (index < position - 0.25, index > position + 0.25):
+        kept = np.where(side[:, None, None], pixels, np.nan)
+        if pixels is not lattice.pixels:
+            kept = kept.transpose(1, 0, 2)
+        part = _restricted(lattice, np.isfinite(kept[..., 0]))
+        parts += unfolded(part) if part.seen.any() else []
+    return parts
+
+
+def _restricted(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:
+    pixels = np.where(kept[..., None], lattice.pixels, np.nan)
+    return cropped(replace(lattice, pixels=pixels, contrast=np.where(kept, lattice.contrast, np.nan)))
+
+
+def joined(lattice: Lattice) -> list[Lattice]:
+    """Parts whose vertices are neighbours of each other along rows and columns."""
+    count, label = cv2.connectedComponents(lattice.seen.astype(np.uint8), connectivity=4)
+    if count == 2:
+        return [cropped(lattice)]
+    return [_restricted(lattice, label == k) for k in range(1, count)]
+
+
+def _folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The sharpest folds along a row and along a column, see `_fold`."""
+    pixels = lattice.pixels
+    row, col, at = lattice.known
+    width = max(float(np.median(at.width)), 1.0)
+    folds = []
+    for axis in (0, 1):
+        line = np.moveaxis(pixels, axis, 0)
+        second = np.full(line.shape, np.nan)
+        second[1:-1] = line[2:] - 2 * line[1:-1] + line[:-2]
+        index = (row, col) if axis == 0 else (col, row)
+        second[index] = at.in_squares(second[index])
+        folds.append(_fold(second, width))
+    return folds[0], folds[1]
+
+
+def _fold(second: Array, width: float) -> tuple[float, float]:
+    """Find the sharpest bend that is a fold.
+
+    Parameters
+    ----------
+    second : (rows, cols, 2) array [squares]
+        Second differences along the columns, nan where unknown.
+    width : float [px]
+        Of the squares.
+
+    Returns
+    -------
+    position, size : float
+        Among the rows, and in squares; (0, 0) without a fold.
+    """
+    rows = len(second)
+    if rows < _LEAST_ROWS:
+        return 0.0, 0.0
+    before, after, far = (np.full_like(second, np.nan) for _ in range(3))
+    before[1:], after[:-1], far[:-2] = second[:-1], second[1:], second[2:]
+    at = _size(_against_one_or_both(second, before, after))
+    # Between row i and i + 1.
+    between = _BETWEEN * _size(0.5 * (second + after - before - far))
+    size = np.stack([at, between], axis=-1).ravel()
+    best = int(size.argmax())
+    others = np.abs(np.arange(2 * rows) - best) > 3
+    far_off = size[others & (size > 0)]
+    usual = float(np.percentile(far_off, 25)) if len(far_off) else _UNKNOWN
+    least = (max(bend + _BENT_PX / width, ratio * usual) for bend, ratio in _FOLDS)
+    if size[best] < min(least):
+        return 0.0, 0.0
+    return 0.5 * best, float(size[best])
+
+
+def _against_one_or_both(values: Array, first: Array, second: Array) -> Array:
+    """Differences from the mean of two arrays, reduced where one of them is unknown."""
+    both = values - 0.5 * (first + second)
+    one = _ONE_SIDED * (values - np.where(np.isnan(first), second, first))
+    return np.where(np.isnan(both), one, both)
+
+
+def _size(values: Array) -> Array:
+    """Median length of each row's vectors; 0 where fewer than two are known."""
+    length = np.sqrt((values**2).sum(axis=-1))
+    count = np.isfinite(length).sum(axis=1)
+    size = np.zeros(len(length))
+    # Unknown ones come last.
+    ordered, row = np.sort(length, axis=1), np.arange(len(length))
+    median = 0.5 * (ordered[row, (count - 1) // 2] + ordered[row, count // 2])
+    size[count >= 2] = median[count >= 2]
+    return size

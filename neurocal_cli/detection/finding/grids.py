@@ -1,0 +1,179 @@
+"""All chessboards in a picture, whatever their size: `find_grids`.
+
+Saddles of the brightness are linked along edges; blocks of 3 x 3 linked vertices grow into grids
+on a reduced picture, and are completed and made precise on finer and finer ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.finding.accept import edges_seen, has_block, is_smooth
+from neurocal_cli.detection.finding.claims import disputed, distinct, touching
+from neurocal_cli.detection.finding.fold import joined, unfolded
+from neurocal_cli.detection.finding.grow import Lattice, cleaned, grown, smoothing
+from neurocal_cli.detection.finding.levels import Level, levels_of
+from neurocal_cli.detection.finding.merge import merged
+from neurocal_cli.detection.finding.refine import settle
+from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
+from neurocal_cli.detection.finding.seeds import find_links, find_seeds, find_slim_seeds
+from neurocal_cli.detection.finding.stretch import stretched
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.geometry import Array
+
+__all__ = ["find_grids"]
+
+# px; grids are looked for and grow on levels up to this size: on larger ones they only become
+# more precise, unless nothing has been found till there.
+_SEARCHED = 1.4e6
+# Pixels of the largest level that is searched when smaller ones gave nothing: a board that is not seen
+# at this size would have to be a speck in a picture that fills the memory.
+_MOST_SEARCHED = 30_000_000
+_TRIES, _SLIM_TRIES = 8, 4  # seeds per level that come to nothing
+
+
+def find_grids(image: NDArray[np.generic]) -> list[Grid]:
+    """Find every chessboard in a picture.
+
+    Parameters
+    ----------
+    image : (height, width) array
+        Grey, of 8 or 16 bits or real numbers of any range.
+
+    Returns
+    -------
+    grids : list of Grid
+        The one that fills most of the picture first. Vertices are good to a few tenths of a pixel.
+        Planes that meet at a fold are grids of their own. A grid has at least 3 x 3 vertices:
+        anything smaller is found in clutter too, and no vertex between others tests its lines.
+    """
+    lattices: list[Lattice] = []
+    saddles: Saddles
+    levels = levels_of(image)
+    small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
+    for level in reversed(levels):
+        lattices = [_finer(level, x) for x in lattices]
+        if level in small or (not lattices and level.image.size <= _MOST_SEARCHED):
+            if level is small[0]:
+                lattices = [y for x in lattices for y in _boards(cleaned(level, grown(level, x)))]
+            saddles = find_saddles(level, _covered(level, lattices) if lattices else None)
+            lattices += _new(level, saddles, not lattices)
+            if level not in small[1:]:
+                lattices = _separated(level, lattices)
+    if not lattices and levels and levels[0] in small:
+        lattices = _separated(levels[0], _slivers(levels[0], saddles))
+    return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
+
+
+def _separated(level: Level, lattices: list[Lattice]) -> list[Lattice]:
+    """Grids of one plane each."""
+    result = []
+    several = distinct(lattices)
+    if touching(several):
+        several = [part for x in disputed(several) for part in _boards(cleaned(level, x))]
+    for lattice in several:
+        planes = [part for part in unfolded(lattice) if has_block(part)]
+        if len(planes) > 1 or (planes and planes[0].seen.sum() < lattice.seen.sum()):
+            # What was taken out at a fold for lying between two planes may belong to one.
+            planes = [cleaned(level, grown(level, x, outwards=False)) for x in planes]
+        result += [x for x in planes if has_block(x) and is_smooth(level, x)]
+    return [x for x in (_mended(level, x) for x in merged(distinct(result))) if has_block(x)]
+
+
+def _mended(level: Level, lattice: Lattice) -> Lattice:
+    """Look for vertices behind hidden ones, in a lattice that has such."""
+    if lattice.seen.all():
+        return lattice
+    return cleaned(level, grown(level, lattice, outwards=False, reach=2))
+
+
+def _area(pixels: Array) -> float:
+    """Of all whole squares [px^2]."""
+    p, q = pixels[1:, 1:] - pixels[:-1, :-1], pixels[1:, :-1] - pixels[:-1, 1:]
+    return float(np.nansum(np.abs(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])) / 2)
+
+
+def _new(level: Level, saddles: Saddles, first: bool) -> list[Lattice]:
+    """Grids of a level's saddles; with more effort for the first in an image."""
+    if len(saddles) < 9:
+        return []
+    links = find_links(level, saddles)
+    seeds, _ = find_seeds(saddles, links)
+    found = _sprouted(level, saddles, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES)
+    if not found and first and level.scale == 1:
+        found = _sprouted(level, saddles, *find_slim_seeds(saddles, links), _SLIM_TRIES)
+    return found
+
+
+def _sprouted(
+    level: Level, saddles: Saddles, seeds: NDArray[np.intp], dark: NDArray[np.intp], tries: int
+) -> list[Lattice]:
+    """Grids that grow from seeds, until some of these have come to nothing."""
+    found: list[Lattice] = []
+    free = np.ones(len(saddles), dtype=bool)
+    for seed, parity in zip(seeds, dark, strict=True):
+        if not free[seed].all():
+            continue
+        free[seed] = False
+        planted = Lattice(saddles.points[seed], saddles.contrast[seed], int(parity))
+        grid = cleaned(level, grown(level, planted))
+        boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_seen(level, x)]
+        if boards:
+            found += boards
+            free &= _covered(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
+        else:
+            tries -= 1
+        if tries <= 0:
+            break
+    return found
+
+
+def _slivers(level: Level, saddles: Saddles) -> list[Lattice]:
+    """Grids of squares so narrow that their edges' directions are not seen."""
+    part = stretched(level, saddles.points) if len(saddles) >= 9 else None
+    if part is None:
+        return []
+    found = []
+    for lattice in _new(part.level, find_saddles(part.level), True):
+        there = part.back(lattice.pixels[lattice.seen])
+        pixels = np.full_like(lattice.pixels, np.nan)
+        settled = settle(level.image, there, smoothing(0.0))
+        close = np.hypot(*(settled - there).T) < 1
+        pixels[lattice.seen] = np.where(close[:, None], settled, there)
+        grid = grown(level, replace(lattice, pixels=pixels))
+        found += _boards(cleaned(level, grid))
+    return found
+
+
+def _finer(level: Level, lattice: Lattice) -> Lattice:
+    """The same grid on the next level."""
+    lattice = replace(lattice, pixels=2 * lattice.pixels)
+    row, col = np.nonzero(lattice.seen)
+    pixels = lattice.pixels.copy()
+    settled = settle(level.image, pixels[row, col], smoothing(lattice.width))
+    close = np.hypot(*(settled - pixels[row, col]).T) < 2
+    pixels[row, col] = np.where(close[:, None], settled, pixels[row, col])
+    return replace(lattice, pixels=pixels)
+
+
+def _covered(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
+    """Paint the squares of grids, and a little around them."""
+    mask = np.zeros(level.image.shape, dtype=np.uint8)
+    for lattice in lattices:
+        p = lattice.pixels
+        quads = np.stack([p[:-1, :-1], p[:-1, 1:], p[1:, 1:], p[1:, :-1]], axis=2).reshape(-1, 4, 2)
+        quads = quads[np.isfinite(quads).all(axis=(1, 2))]
+        thickness = max(1, round(0.4 * lattice.width))
+        whole = np.rint(quads).astype(np.int32)
+        cv2.fillPoly(mask, list(whole), 255)
+        cv2.polylines(mask, list(whole), True, 255, thickness)
+    return mask
+
+
+def _boards(lattice: Lattice) -> list[Lattice]:
+    """Parts of a lattice that are boards."""
+    return [part for part in joined(lattice) if has_block(part)]

@@ -1,0 +1,192 @@
+"""Places where two edges cross, as the vertices of a chessboard do.
+
+A vertex has four *ports*, the directions in which its edges leave it, numbered by growing angle
+(from u towards v) such that a dark sector follows ports 0 and 2 and a bright one ports 1 and 3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.finding.levels import Level, sampled
+from neurocal_cli.detection.finding.refine import settle
+from neurocal_cli.geometry import Array
+
+__all__ = ["Saddles", "find_saddles"]
+
+_THRESHOLD = 5.0  # standard deviations of the noise
+_BORDER = 4  # px
+_AROUND = 2  # px, within which a saddle is the steepest
+_BAND = 50_000  # pixels
+_RADII = (5.0, 3.0)  # px; of the rings, the better one first
+_RAYS = 32
+_MOST_BENT = np.radians(22)  # of a line on its way through the vertex
+_MOST_DIFFERENT = np.radians(14)  # between two rings
+_SHARPEST = 3.0  # standard deviations of the noise
+_ROUNDEST = 0.02  # ratio of the principal curvatures: along a bright stripe it is 0
+_NARROWEST = np.radians(14)
+_PER_MEGAPIXEL = 4000  # saddles that are looked at ...
+_MOST = 1400  # ... and kept
+_LEAST = 500
+
+
+@dataclass(frozen=True, eq=False)
+class Saddles:
+    """Candidates for vertices.
+
+    Attributes
+    ----------
+    points : (N, 2) array [px]
+    ports : (N, 4) array [rad]
+        Directions of the four edges; see the module.
+    contrast : (N,) array [DN]
+        Bright minus dark sectors.
+    """
+
+    points: Array
+    ports: Array
+    contrast: Array
+
+    def __len__(self) -> int:
+        """Count them."""
+        return len(self.points)
+
+    def __getitem__(self, which: NDArray[np.generic]) -> Saddles:
+        """Some of them."""
+        return Saddles(self.points[which], self.ports[which], self.contrast[which])
+
+
+def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Saddles:
+    """Find the crossings of edges in a level.
+
+    Parameters
+    ----------
+    level : Level
+    covered : (height, width) uint8 array, optional
+        Non-zero where not to look.
+    """
+    points = _strongest(level, covered)
+    points = settle(level.image, points, 1.0, rounds=2)
+    points = points[np.isfinite(points[:, 0])]
+    curved, sharp = _curved(level, points)
+    points, curved = points[sharp], curved[sharp]
+    if not len(points):
+        return Saddles(np.zeros((0, 2)), np.zeros((0, 4)), np.zeros(0))
+    noise = level.noise
+    rings = [_ring(sampled(level.smooth, points[:, None] + r * _DIRECTIONS), noise) for r in _RADII]
+    (ports, contrast, good), (ports_small, contrast_small, good_small) = rings
+    # Where squares are small, rings reach into the next ones: trust a ring that agrees with a
+    # smaller one, and curvature where none does.
+    good &= ~(good_small & (_differ(ports, ports_small) > _MOST_DIFFERENT))
+    astray = _differ(ports_small, curved) > 2 * _MOST_DIFFERENT
+    ports_small = np.where(astray[:, None], curved, ports_small)
+    ports = np.where(good[:, None], ports, ports_small)
+    contrast = np.where(good, contrast, contrast_small)
+    kept = np.flatnonzero(good | good_small)
+    kept = kept[np.argsort(-contrast[kept], kind="stable")[:_MOST]]
+    return Saddles(points[kept], ports[kept], contrast[kept])
+
+
+def _curved(level: Level, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Ports from the second derivatives, and whether both principal curvatures stand out from noise."""
+    u, v = np.rint(points.T).astype(np.intp)
+    uu, uv, vv = (x[v, u].astype(float) for x in level.curvature)
+    middle, radius = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
+    rising, falling = np.maximum(middle + radius, 1e-9), np.maximum(radius - middle, 1e-9)
+    weaker, stronger = np.minimum(rising, falling), np.maximum(rising, falling)
+    sharp = (weaker > _SHARPEST * level.noise) & (weaker > _ROUNDEST * stronger)
+    # Dark sectors lie to both sides of the direction in which brightness falls off.
+    dark = 0.5 * np.arctan2(2 * uv, uu - vv) + np.pi / 2
+    half = np.arctan(np.sqrt(falling / rising))
+    ports = np.stack([dark - half, dark + half, dark - half + np.pi, dark + half + np.pi], axis=-1)
+    return ports, sharp
+
+
+def _differ(first: Array, second: Array) -> Array:
+    """Largest angle between two sets of ports, whichever of the opposite ones come first."""
+    away = first[:, :2] - second[:, :2]
+    return np.abs((away + np.pi / 2) % np.pi - np.pi / 2).max(axis=1)
+
+
+_ANGLES = 2 * np.pi / _RAYS * np.arange(_RAYS)
+_DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+
+
+def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:
+    """Whole pixels where the saddle is steepest; (N, 2)."""
+    u, v, steepness = _peaks(level)
+    if covered is not None:
+        free = covered[v, u] == 0
+        u, v, steepness = u[free], v[free], steepness[free]
+    limit = max(_LEAST, round(_PER_MEGAPIXEL * level.image.size / 1e6))
+    if len(u) > limit:
+        best = np.argpartition(-steepness, limit)[:limit]
+        best.sort()
+        u, v = u[best], v[best]
+    return np.stack([u, v], axis=-1).astype(float)
+
+
+def _peaks(level: Level) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
+    """Whole pixels u, v (N,) where the saddle is steeper than within two pixels, and above the noise."""
+    uu, uv, vv = level.curvature
+    height, width = uv.shape
+    least = np.float32((_THRESHOLD * level.noise) ** 2)
+    found = [(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.float32))]
+    rows = max(8, _BAND // width)
+    # Band by band, which stays in the processor's cache.
+    for top in range(_BORDER, height - _BORDER, rows):
+        bottom = min(top + rows, height - _BORDER)
+        band = slice(top - _AROUND, bottom + _AROUND)
+        steepness = uv[band] * uv[band]
+        steepness -= uu[band] * vv[band]
+        largest = cv2.dilate(steepness, np.ones((2 * _AROUND + 1,) * 2, np.uint8))
+        inner = np.s_[_AROUND:-_AROUND, _BORDER:-_BORDER]
+        steepness, largest = steepness[inner], largest[inner]
+        peak = np.flatnonzero((steepness >= largest) & (steepness >= least))
+        v, u = np.divmod(peak, steepness.shape[1])
+        found.append((u + _BORDER, v + top, steepness[v, u]))
+    us, vs, values = zip(*found, strict=True)
+    return np.concatenate(us), np.concatenate(vs), np.concatenate(values)
+
+
+def _ring(profile: Array, noise: float) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Ports and contrast from the brightness around points, and which are like a vertex's.
+
+    Parameters
+    ----------
+    profile : (N, _RAYS) array [DN]
+    noise : float [DN]
+    """
+    count = len(profile)
+    ports, contrast = np.zeros((count, 4)), np.zeros(count)
+    high, low = profile.max(axis=1), profile.min(axis=1)
+    level = profile - (0.5 * (high + low))[:, None]
+    after = np.roll(level, -1, axis=1)
+    change = (level > 0) != (after > 0)
+    good = (change.sum(axis=1) == 4) & (high - low > 4 * noise)
+    if not good.any():
+        return ports, contrast, good
+    where = np.flatnonzero(good)
+    level, after, change = level[where], after[where], change[where]
+    row, ray = np.nonzero(change)
+    step = level[row, ray] / (level[row, ray] - after[row, ray])
+    angle = ((ray + step) * (2 * np.pi / _RAYS)).reshape(-1, 4)
+    # The first sector ends at the second crossing; number the ports so that it is dark.
+    dark = level.ravel()[(row * _RAYS + (ray + 1) % _RAYS).reshape(-1, 4)[:, 0]] < 0
+    angle = np.where(dark[:, None], angle, np.concatenate([angle[:, 1:], angle[:, :1] + 2 * np.pi], axis=1))
+    bent = np.stack([angle[:, 2] - angle[:, 0] - np.pi, angle[:, 3] - angle[:, 1] - np.pi], axis=-1)
+    mean = 0.5 * (angle[:, :2] + angle[:, 2:] - np.pi)
+    opening = mean[:, 1] - mean[:, 0]
+    sound = (np.abs(bent) < _MOST_BENT).all(axis=1)
+    sound &= (opening > _NARROWEST) & (opening < np.pi - _NARROWEST)
+    opposite = np.abs(level - np.roll(level, _RAYS // 2, axis=1)).mean(axis=1)
+    size = np.abs(level).mean(axis=1)
+    sound &= opposite < 0.7 * size
+    ports[where] = np.concatenate([mean, mean + np.pi], axis=1)
+    contrast[where] = 2 * size
+    good[where] = sound
+    return ports, contrast, good

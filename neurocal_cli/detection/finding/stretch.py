@@ -1,0 +1,82 @@
+"""Boards seen so obliquely that their squares are slivers: a stretched picture shows them better."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from neurocal_cli.detection.finding.levels import Level
+from neurocal_cli.geometry import Array
+
+__all__ = ["Stretched", "stretched"]
+
+_FACTOR = 2.0
+_ONE_WAY = 1.8  # least ratio of the gradients across and along the slivers
+_AROUND = 12  # px; beyond the outermost saddles
+_STRAY = 3.0  # times the saddles' median distance from their middle
+_LARGEST = 0.25  # share of the picture that they are spread over
+
+
+@dataclass(frozen=True, eq=False)
+class Stretched:
+    """A part of a level, stretched.
+
+    Attributes
+    ----------
+    level : Level
+        The part; coordinates of its own.
+    forth : (2, 3) array
+        From pixels of the original to those of the part.
+    """
+
+    level: Level
+    forth: Array
+
+    def back(self, points: Array) -> Array:
+        """Points (..., 2) of the part in the original [px]."""
+        return np.asarray((points - self.forth[:, 2]) @ np.linalg.inv(self.forth[:, :2]).T)
+
+
+def stretched(level: Level, saddles: Array) -> Stretched | None:
+    """Stretch the surroundings of saddles across the way most edges run.
+
+    Parameters
+    ----------
+    level : Level
+    saddles : (N, 2) array [px]
+
+    Returns
+    -------
+    part : Stretched or None
+        None where saddles are all over the picture, or edges run both ways.
+    """
+    height, width = level.image.shape
+    # Stray saddles do not widen the part.
+    away = np.hypot(*(saddles - np.median(saddles, axis=0)).T)
+    saddles = saddles[away <= _STRAY * np.median(away)]
+    low = np.maximum(np.floor(saddles.min(axis=0)) - _AROUND, 0).astype(int)
+    high = np.minimum(np.ceil(saddles.max(axis=0)) + _AROUND, [width, height]).astype(int)
+    if np.prod(high - low) > _LARGEST * level.image.size:
+        return None
+    crop = level.smooth[low[1] : high[1], low[0] : high[0]]
+    gradient = np.stack([cv2.Sobel(crop, cv2.CV_32F, *order).ravel() for order in ((1, 0), (0, 1))])
+    strength, direction = np.linalg.eigh(gradient.astype(float) @ gradient.T)
+    if strength[1] < _ONE_WAY**2 * strength[0]:
+        return None
+    along, across = direction.T
+    across = across * np.sign(across[0] * along[1] - across[1] * along[0])  # not mirrored
+    turn = np.stack([_FACTOR * across, along])
+    corners = np.array([[u, v] for u in (low[0], high[0]) for v in (low[1], high[1])]) @ turn.T
+    shift = -corners.min(axis=0)
+    size = np.ceil(np.ptp(corners, axis=0)).astype(int)
+    forth = np.concatenate([turn, shift[:, None]], axis=1)
+    part = cv2.warpAffine(
+        level.image,
+        forth,
+        (int(size[0]), int(size[1])),
+        flags=cv2.INTER_CUBIC,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    return Stretched(Level(np.asarray(part, dtype=np.float32), 1), forth)

@@ -1,0 +1,76 @@
+"""Whether a picture looks like a chessboard where a vertex is expected."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.finding.levels import Level, sampled
+from neurocal_cli.detection.finding.predict import Expected
+from neurocal_cli.geometry import Array
+
+__all__ = ["Look", "look"]
+
+_INTO = 0.3  # squares; from the vertex into the four squares around it
+_ALONG, _ASIDE = 0.36, 0.16  # squares; along its edges, and to either side of them
+_LEAST_EVEN = 0.6  # a board in plain sight has 0.9 and more, blurred or noisy or not
+_LEAST_EDGE = 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """How places look.
+
+    Attributes
+    ----------
+    contrast : (N,) array [DN]
+        Bright minus dark squares around the vertex; negative when their colours are the other way.
+    even : (N,) array
+        Darkest bright minus brightest dark square, over the contrast: 1 for an ideal vertex.
+    like : (N,) bool array
+        Two bright and two dark squares, and an edge between every two.
+    """
+
+    contrast: Array
+    even: Array
+    like: NDArray[np.bool_]
+
+
+def _offsets() -> Array:
+    """(12, 2) places in squares: inside the four squares, then beside the four edges."""
+    i, a, s = _INTO, _ALONG, _ASIDE
+    inside = [(i, i), (-i, i), (-i, -i), (i, -i)]  # colours alternate, the first dark
+    beside = [(a, s), (-s, a), (-a, -s), (s, -a)]  # on the dark side of each edge
+    across = [(a, -s), (s, a), (-a, s), (-s, -a)]
+    return np.array(inside + beside + across)
+
+
+_OFFSETS = _offsets()
+
+
+def look(level: Level, points: Array, at: Expected, dark: Array) -> Look:
+    """Look at the squares and edges around vertices.
+
+    Parameters
+    ----------
+    level : Level
+    points : (N, 2) array [px]
+    at : Expected
+        For the directions of the edges.
+    dark : (N,) array of +-1
+        +1 where the square towards growing c and r is dark.
+    """
+    places = points[:, None] + _OFFSETS[:, :1] * at.c[:, None] + _OFFSETS[:, 1:] * at.r[:, None]
+    value = sampled(level.smooth, places) * -dark[:, None]
+    even, odd = value[:, 0:4:2], value[:, 1:4:2]
+    contrast = even.mean(axis=1) - odd.mean(axis=1)
+    scale = np.maximum(np.abs(contrast), 1e-9)
+    flat = (even.min(axis=1) - odd.max(axis=1)) / scale
+    edges = (value[:, 4:8] - value[:, 8:12]) * np.array([1.0, -1.0, 1.0, -1.0])
+    like = (contrast > 0) & (flat > _LEAST_EVEN) & (edges.min(axis=1) > _LEAST_EDGE * contrast)
+    height, width = level.image.shape
+    # The places beyond the border repeat it and tell nothing.
+    inside = ((places > -1) & (places < np.array([width, height]))).all(axis=(1, 2))
+    return Look(contrast, flat, like & inside)

@@ -1,0 +1,303 @@
+"""The fits of all edges of a board, stage by stage: from vertices known to half a pixel to the limit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.box import half_widths
+from neurocal_cli.detection.fitting.edges import (
+    OFFSET,
+    EdgeData,
+    fit_edges,
+    light_at,
+    moments,
+    with_weight,
+)
+from neurocal_cli.detection.fitting.forms import choose_map
+from neurocal_cli.detection.fitting.free import fit_freely
+from neurocal_cli.detection.fitting.gate import believable, smooth
+from neurocal_cli.detection.fitting.newton import CONTRAST, MEAN, Fit, Shape
+from neurocal_cli.detection.fitting.noise import BoardBlur, Noise, level_prior, profile_shape
+from neurocal_cli.detection.fitting.pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.robust import MapFit, Rows, fit_map, median
+from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading, square_levels
+from neurocal_cli.detection.fitting.smooth_map import LENS, Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fitting.strips import Lines, gather, grid_lines
+from neurocal_cli.detection.fitting.vertices import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.geometry import Array
+
+__all__ = ["Board", "Edges", "Fitted", "fit_all_vertices", "fit_board"]
+
+Image = NDArray[np.generic]
+
+_START_SIGMA = 0.3  # px, of the found vertices' coordinates
+_GOOD_START = 1.3  # chi2 per coordinate of the found vertices at which their map will do
+_ANCHOR = 2.0  # px; later they only hold what the edges leave open
+_ENOUGH = 60  # edges that need no anchors
+_MOMENT_SIGMA = 0.05  # px, of offsets from moments
+_STEPS = 6  # of Gauss and Newton, at most
+_LEAST_VARIANCE = 1e-12  # px^2
+_NORMAL = 1.4826  # standard deviations in a median of absolute values
+_LEAST_SCALE = 0.1  # of the noise by the final residuals; less cannot be, the rounding being known
+_WIDEST = 12.0  # px, of the strips for moments
+_PRECISE = 0.003  # sigma; standard deviation of offsets
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """The edges between neighbouring vertices of a grid, those along c first.
+
+    Attributes
+    ----------
+    index : (E, 2) int array
+        First vertex, (c, r).
+    vertical : (E,) bool array
+    centre : (E, 2) array [squares]
+    light : (E,) array
+        +1 where the light side is that of growing r (c for vertical ones), else -1.
+    """
+
+    index: NDArray[np.int64]
+    vertical: NDArray[np.bool_]
+    centre: Array
+    light: Array
+
+    @classmethod
+    def of(cls, grid: Grid) -> Edges:
+        """All whose both vertices are seen."""
+        seen = grid.seen
+        along_c = np.argwhere(seen[:, :-1] & seen[:, 1:])[:, ::-1]
+        along_r = np.argwhere(seen[:-1] & seen[1:])[:, ::-1]
+        index = np.concatenate([along_c, along_r])
+        vertical = np.arange(len(index)) >= len(along_c)
+        centre = index + np.where(vertical[:, None], [0.0, 0.5], [0.5, 0.0])
+        light = np.where((index.sum(axis=1) + grid.dark) % 2 == 1, 1.0, -1.0)
+        return cls(index.astype(np.int64), vertical, centre, light)
+
+
+@dataclass(frozen=True, eq=False)
+class Board:
+    """What is to be fitted.
+
+    Attributes
+    ----------
+    image : (H, W) array [DN]
+    grid : Grid
+    edges : Edges
+    anchors : Rows
+        The found vertices.
+    floor : float [DN^2]
+        Variance of the pixels that is always there, by rounding.
+    """
+
+    image: Image
+    grid: Grid
+    edges: Edges
+    anchors: Rows
+    floor: float
+
+    @classmethod
+    def of(cls, image: Image, grid: Grid, floor: float) -> Board:
+        """From an image and a grid in it."""
+        vertices = np.argwhere(grid.seen)[:, ::-1].astype(float)
+        anchors = Rows.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
+        return cls(image, grid, Edges.of(grid), anchors, floor)
+
+    def lines(self, at: SmoothMap) -> Lines:
+        """The edges as a map sees them."""
+        return grid_lines(at, self.edges.centre, self.edges.vertical, self.edges.light)
+
+    def rows(self, lines: Lines, offset: Array, variance: Array) -> Rows:
+        """Edges as what a map is fitted to; moved by an unknown common shift to the light side."""
+        value = (lines.middle * lines.normal).sum(axis=1) + offset
+        edges = Rows(self.edges.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
+        if len(offset) > _ENOUGH:
+            return edges
+        anchors = replace(self.anchors, variance=np.full_like(self.anchors.variance, _ANCHOR**2))
+        return edges.and_(anchors)
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """Fitted edges and what they share.
+
+    Attributes
+    ----------
+    lines : Lines
+    fit : Fit
+    data : EdgeData
+    map : MapFit
+    shading : Shading
+    shape : Shape
+    noise : Noise
+    good : (E,) bool array
+        Edges to be believed.
+    """
+
+    lines: Lines
+    fit: Fit
+    data: EdgeData
+    map: MapFit
+    shading: Shading
+    shape: Shape
+    noise: Noise
+    good: NDArray[np.bool_]
+
+    @property
+    def unevenness(self) -> float:
+        """Variance [px^2] of the edges around the smooth map that their fits cannot explain.
+
+        A print or a board that is not even, and pixels that the model does not describe: for a camera,
+        noise of the points like any other.
+        """
+        if not self.good.any():
+            return 0.0
+        return max(self.map.excess - 1, 0.0) * median(self.fit.covariance[self.good, OFFSET, OFFSET])
+
+
+def fit_board(board: Board) -> Fitted:
+    """All stages: map of the found vertices, moments, a first fit, what edges share, the last fit."""
+    frame = Frame.of(board.anchors.grid, (board.image.shape[1], board.image.shape[0]))
+    n = len(board.anchors.grid) // 2
+    points = board.anchors.value.reshape(2, n).T
+    start = homography_start(frame, board.anchors.grid[:n], points)
+    found = choose_map(start, board.anchors, np.zeros(1), _GOOD_START)
+    dark, light = square_levels(board.image, board.grid, found.map)
+    shading = fit_shading(frame, dark, light)
+    noise = max(median(np.concatenate([dark.noise, light.noise])), board.floor)
+    mapped, sigma = _by_moments(board, found, shading)
+    first = _first_fit(board, mapped, sigma, shading, noise)
+    return _last_fit(board, first)
+
+
+def _by_moments(board: Board, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
+    """Map through the edges' moments, and their blur [px]."""
+    lines = board.lines(found.map)
+    # Where lines cross at an angle they come into wide strips from the side.
+    slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
+    half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
+    half = np.clip(half, 2.0, _WIDEST)
+    strips = gather(board.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
+    offset, _, blur = moments(strips, half, *shading.at(lines.middle))
+    sigma = float(np.clip(median(blur), 0.33, 0.25 * median(lines.width)))
+    rows = board.rows(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
+    return fit_map(found.map, rows, found.shift), sigma
+
+
+def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noise: float) -> Fitted:
+    """Edges fitted with free levels, and the map through them."""
+    lines = board.lines(mapped.map)
+    offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
+    free = fit_freely(board.image, lines, offset, sigma, shading, noise)
+    data, fit, shape = free.data, free.fit, free.shape
+    good = smooth(fit)
+    variance = fit.covariance[:, OFFSET, OFFSET]
+    good &= variance > 0
+    variance = np.where(good, variance, _ANCHOR**2)
+    rows = board.rows(lines, fit.values[:, OFFSET], variance)
+    # What the vertices' map needs, that of the edges needs as well; a board's own unevenness is for later.
+    chosen = choose_map(mapped.map, rows, mapped.shift, least=mapped.form, most=max(mapped.form, LENS))
+    good &= chosen.weight[: len(good)] > 0
+    return Fitted(lines, fit, data, chosen, shading, shape, Noise(noise, noise, noise), good)
+
+
+def _last_fit(board: Board, first: Fitted) -> Fitted:
+    """Edges fitted with what all of them share, and the map through them."""
+    good, n = first.good, len(first.good)
+    lines = board.lines(first.map.map)
+    shading = _shading(first)
+    fit, data, shape, noise = _fine_fit(board, first, lines, shading)
+    scale = max(median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
+    fit, noise = fit.scaled(scale), noise.times(scale)
+    variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
+    trusted = np.where(smooth(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
+    rows = board.rows(lines, fit.values[:, OFFSET], trusted)
+    # Better edges may tell of a richer form.
+    mapped = choose_map(first.map.map, rows, first.map.shift, least=first.map.form)
+    expected = variance + mapped.map.variance(board.edges.centre, lines.normal)
+    departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
+    # A board that is uneven by itself, as paper is, departs from its map everywhere: no single edge is
+    # wrong for that, but all of them are less certain.
+    uneven = max(_NORMAL * median(np.abs(departure)), 1.0)
+    mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
+    good = believable(fit, departure, data.beyond)
+    return Fitted(lines, fit, data, mapped, shading, shape, noise, good)
+
+
+def _fine_fit(
+    board: Board, first: Fitted, lines: Lines, shading: Shading
+) -> tuple[Fit, EdgeData, Shape, Noise]:
+    """Fits to all pixels, with levels, blur, profile and noise from the whole board."""
+    n, half_length = len(first.good), 0.5 * lines.length
+    shape = profile_shape(first.data, first.fit, first.shape, first.good)
+    noise = Noise.of(first.fit, first.data.weight, board.floor)
+    blur = BoardBlur.of(first.fit, lines.normal, first.good)
+    sigma = blur.along(lines.normal)
+    data = edge_pixels(board.image, lines, sigma, shading, REACH * sigma, 1)
+    prior = level_prior(shading, lines.middle, sigma, blur.spread, noise.edge)
+    offset = first.map.residual[:n] + first.map.shift[0]
+    start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
+    data = with_weight(data, noise.weighted(light_at(data, start), data.weight))
+    fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
+    usual = median(sigma)
+    if usual < SHARP or median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
+        # So precise, or so sharp, that the profile from a share of the pixels is what is worst known.
+        shape = profile_shape(data, fit, shape, first.good)
+        noise = Noise.of(fit, data.weight, board.floor)
+        data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
+        fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
+    return fit, data, shape, noise
+
+
+def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Lines], NDArray[np.bool_]]:
+    """Fits of all seen vertices after those of the edges, with their lines, and which to believe."""
+    grid = board.anchors.grid[: len(board.anchors.grid) // 2]
+    lines = vertex_lines(fitted.map.map, grid)
+    light = np.where((grid.sum(axis=1) + board.grid.dark) % 2 == 1, 1.0, -1.0)
+    place = lines[0].middle
+    blur = BoardBlur.of(fitted.fit, fitted.lines.normal, fitted.good)
+    sigma = 0.5 * (blur.along(lines[0].normal) + blur.along(lines[1].normal))
+    contrast = fitted.shading.at(place)[1]
+    slopes = fitted.shading.slopes(place)
+    data = vertex_data(board.image, lines, light, sigma, REACH, slopes, contrast, _ends(board.grid.seen))
+    tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
+    shape = Shape(tails, fitted.shape.bend)
+    if fitted.shape.half is not None:
+        shape = replace(shape, half=np.stack([half_widths(line.normal) for line in lines], axis=1))
+    prior = level_prior(fitted.shading, place, sigma, blur.spread, fitted.noise.edge)
+    start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
+    half = (0.5 * lines[0].length, 0.5 * lines[1].length)
+    unit = replace(data, weight=data.weight / np.float32(fitted.noise.edge))
+    fit = fit_vertices(unit, start, prior, half, shape, _STEPS)
+    weight = fitted.noise.weighted(fit.linear.x, data.weight)
+    fit = fit_vertices(replace(data, weight=weight), fit.values, prior, half, shape, _STEPS)
+    fit = fit.scaled(max(median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
+    departure = np.zeros(len(grid))
+    for line, which in zip(lines, (FIRST, SECOND), strict=True):
+        variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
+        variance *= fitted.map.excess
+        departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
+    return fit, lines, believable(fit, departure, data.beyond)
+
+
+def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(V, 2, 2) where no vertex follows a seen one: back and forth, along c and along r."""
+    beyond = ~np.pad(seen, 1)
+    along_c = np.stack([beyond[1:-1, :-2], beyond[1:-1, 2:]], axis=-1)
+    along_r = np.stack([beyond[:-2, 1:-1], beyond[2:, 1:-1]], axis=-1)
+    return np.asarray(np.stack([along_c[seen], along_r[seen]], axis=1))
+
+
+def _shading(first: Fitted) -> Shading:
+    """Levels of the whole board from those of its edges."""
+    covariance, values, good = first.fit.covariance, first.fit.values, first.good
+    both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]
+    cross = 2 * covariance[:, MEAN, CONTRAST]
+    place = first.lines.middle[good]
+    dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
+    light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
+    return fit_shading(first.shading.frame, dark, light)

@@ -1,0 +1,236 @@
+"""Maximum-likelihood fits of straight or evenly curved edges to all the pixels around them.
+
+The light around an edge, with (s, d) the coordinates of `Lines` and z = (d - offset - tilt s) / sigma,
+
+    I = A(u, v) + B(u, v) F(x),   x = E(z) Q + phi(z) R
+
+A and B are mean level and half contrast, with slopes that are fixed; E and F are `fit_profile.profile` and
+`response`; Q fades the edge out towards other lines, a product of erf(t) in the distances t from those that
+cross it at both ends and from its two parallel neighbours; R corrects that for the crossing angle: blurring
+sign(z) sign(t) gives erf erf + 4 rho phi phi + ... with rho the cosine between the normals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.box import sharp_profile
+from neurocal_cli.detection.fitting.newton import (
+    BLUR,
+    CONTRAST,
+    MEAN,
+    MORE_STEPS,
+    Fit,
+    Linear,
+    Part,
+    Prior,
+    Shape,
+    gauss_newton,
+)
+from neurocal_cli.detection.fitting.profile import erf_and_density, response
+from neurocal_cli.detection.fitting.strips import Lines, Strips
+from neurocal_cli.geometry import Array
+
+__all__ = [
+    "OFFSET",
+    "TILT",
+    "EdgeData",
+    "edge_data",
+    "fit_edges",
+    "light_at",
+    "linearised",
+    "moments",
+    "with_weight",
+]
+
+Single = NDArray[np.float32]
+
+OFFSET, TILT = 0, 1  # the first two values of an edge's fit
+_ALONE = 9.0  # sigma to the next parallel line, beyond which it cannot be noticed
+_BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
+
+
+@dataclass(frozen=True, eq=False)
+class EdgeData:
+    """What the fits need of the pixels, (E, N) float32 arrays.
+
+    Attributes
+    ----------
+    s, d : arrays [px]
+    value : array [DN]
+        Less the slopes' share of A.
+    gain : array
+        B(u, v) relative to the edge's own.
+    Q, R : arrays
+    weight : array [1/DN^2]
+        Inverse variance of the noise; 0 for pixels that are not used.
+    beyond : (E,) array
+        Share of the strip's pixels that lie outside the image.
+    """
+
+    s: Single
+    d: Single
+    value: Single
+    gain: Single
+    Q: Single
+    R: Single
+    weight: Single
+    beyond: Array
+
+    def part(self, which: Part) -> EdgeData:
+        """The pixels of some edges."""
+        return EdgeData(*(getattr(self, field.name)[which] for field in fields(self)))
+
+
+def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:
+    """Offset, tilt and blur of edges in closed form, from anywhere in the strip.
+
+    With e = (I - A) / B, the mean of e over a strip is -offset / half_width, and that of 1 - e^2 is
+    4 sigma / sqrt(pi) over the width. Crude, but without a start.
+
+    Parameters
+    ----------
+    strips : Strips
+    half_width : (E,) array [px]
+    mean, contrast : (E,) arrays [DN]
+
+    Returns
+    -------
+    offset : (E,) array [px]
+    slope : (E,) array
+    sigma : (E,) array [px]
+    """
+    inside = strips.inside.astype(np.float32)
+    one = np.float32(1.0)
+    e = (strips.value - mean.astype(np.float32)[:, None]) / contrast.astype(np.float32)[:, None]
+    np.clip(e, -2 * one, 2 * one, out=e)
+    e *= inside
+    count = np.maximum(inside.sum(axis=1), 1)
+    square = np.einsum("en,en,en->e", strips.s, strips.s, inside)
+    slope = -half_width * np.einsum("en,en->e", e, strips.s) / np.maximum(square, 1)
+    offset = -half_width * e.sum(axis=1) / count
+    sigma = 2 * half_width / _BLUR_LOSS * (1 - np.einsum("en,en->e", e, e) / count)
+    return offset.astype(float), slope.astype(float), sigma.astype(float)
+
+
+def edge_data(
+    strips: Strips, lines: Lines, sigma: Array, slopes: tuple[Array, Array], contrast: Array, nearest: Array
+) -> EdgeData:
+    """Prepare pixels for fits.
+
+    Parameters
+    ----------
+    strips : Strips
+    lines : Lines
+    sigma : (E,) array [px]
+        sigma_t.
+    slopes : pair of (E, 2) arrays [DN/px]
+        Of A and B.
+    contrast : (E,) array [DN]
+        B where the slopes hold.
+    nearest : (E,) array
+        Pixels nearer than so many sigma to the crossing lines are left out.
+    """
+    Q = np.ones_like(strips.s)
+    R = np.zeros_like(strips.s)
+    used = strips.inside.copy()
+    per_sigma = (1 / sigma).astype(np.float32)[:, None]
+    for k in (0, 1):
+        crossing = lines.crossing[:, k].astype(np.float32)
+        end = lines.ends[:, k, None]
+        start = end * lines.tangent + 0.5 * lines.curvature[:, None] * end**2 * lines.normal
+        shift = (start * lines.crossing[:, k]).sum(axis=1).astype(np.float32)
+        t = (strips.u * crossing[:, :1] + strips.v * crossing[:, 1:] - shift[:, None]) * per_sigma
+        used &= t > nearest.astype(np.float32)[:, None]
+        near = t < 4.5
+        fade, density = erf_and_density(t[near])
+        Q[near] *= fade
+        rho = (lines.crossing[:, k] * lines.normal).sum(axis=1).astype(np.float32)
+        R[near] += np.broadcast_to(4 * rho[:, None], t.shape)[near] * density
+    slope_a, slope_b = (g.astype(np.float32) for g in slopes)
+    value = strips.value - strips.u * slope_a[:, :1] - strips.v * slope_a[:, 1:]
+    relative = slope_b / contrast.astype(np.float32)[:, None]
+    gain = 1 + strips.u * relative[:, :1] + strips.v * relative[:, 1:]
+    for k, side in ((0, 1), (1, -1)):
+        close = lines.apart[:, k] < _ALONE * sigma
+        if close.any():
+            t = (lines.apart[close, k, None].astype(np.float32) + side * strips.d[close]) * per_sigma[close]
+            Q[close] *= erf_and_density(t)[0]
+    return EdgeData(strips.s, strips.d, value, gain, Q, R, used.astype(np.float32), strips.beyond)
+
+
+def fit_edges(
+    data: EdgeData,
+    start: Array,
+    prior: Prior,
+    half_length: Array,
+    shape: Shape,
+    steps: int,
+    more: int = MORE_STEPS,
+) -> Fit:
+    """Gauss-Newton steps of all edges at once.
+
+    Parameters
+    ----------
+    data : EdgeData
+    start : (E, 5) array
+        Offset [px], tilt [px over the half length], and the values of `Fit`.
+    prior : Prior
+    half_length : (E,) array [px]
+    shape : Shape
+    steps, more : int
+        See `gauss_newton`.
+    """
+    lever = data.s / half_length.astype(np.float32)[:, None]
+
+    def model_of(part: Part) -> Callable[[Array], Linear]:
+        pixels, levers, form = data.part(part), lever[part], shape.part(part)
+        return lambda values: linearised(pixels, levers, values, form)
+
+    return gauss_newton(model_of, start, prior, data.weight, steps, more)
+
+
+def light_at(data: EdgeData, values: Array) -> Single:
+    """About the light x (E, N) between the levels, for weights that change slowly with it."""
+    offset, sigma = (values[:, k, None].astype(np.float32) for k in (OFFSET, BLUR))
+    return np.asarray(erf_and_density((data.d - offset) / sigma)[0] * data.Q, dtype=np.float32)
+
+
+def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Linear:
+    """The model and its derivatives; ``lever`` is s over the half length."""
+    offset, tilt, mean, contrast, sigma = (x.astype(data.value.dtype)[:, None] for x in values.T)
+    z = data.d - offset
+    z -= tilt * lever
+    z /= sigma
+    E, slope, widening, density = sharp_profile(z, sigma, shape.tails, shape.half)
+    widening *= data.Q
+    widening += z * z * density * data.R
+    x = E * data.Q
+    x += density * data.R
+    slope *= data.Q
+    slope -= z * density * data.R
+    factor = data.gain * (-contrast / sigma)
+    if shape.bend.any():
+        F, steep = response(x, shape.bend)
+        factor *= steep
+    else:
+        F = x
+    slope *= factor
+    jacobian = np.empty((len(z), 5, z.shape[1]), dtype=x.dtype)
+    jacobian[:, OFFSET] = slope
+    np.multiply(slope, lever, out=jacobian[:, TILT])
+    jacobian[:, MEAN] = 1
+    np.multiply(F, data.gain, out=jacobian[:, CONTRAST])
+    np.multiply(widening, -factor, out=jacobian[:, BLUR])
+    residual = data.value - mean
+    residual -= contrast * jacobian[:, CONTRAST]
+    return Linear(jacobian, residual, z, x)
+
+
+def with_weight(data: EdgeData, weight: Single) -> EdgeData:
+    """The same pixels with other weights; those not used stay unused."""
+    return replace(data, weight=np.where(data.weight > 0, weight, np.float32(0)))

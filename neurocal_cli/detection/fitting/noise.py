@@ -1,0 +1,191 @@
+"""What all edges of an image share: the noise of their pixels and the shape of their profile."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.edges import OFFSET, EdgeData
+from neurocal_cli.detection.fitting.newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
+from neurocal_cli.detection.fitting.profile import (
+    RESPONSE_TERMS,
+    erf_and_density,
+    response,
+    response_terms,
+    tail_terms,
+)
+from neurocal_cli.detection.fitting.robust import median
+from neurocal_cli.detection.fitting.shading import Shading
+from neurocal_cli.geometry import Array
+
+__all__ = ["BoardBlur", "Noise", "level_prior", "profile_shape"]
+
+Single = NDArray[np.float32]
+
+_FLAT = 0.95  # light, of -1 to 1, beyond which the levels are reached but for little
+# Noise that seems smaller than this share of the largest, as that of clipped pixels does, is not believed.
+_LEAST_SHARE = 0.3
+_LEAST_BLUR = 0.2905  # px
+_ROUND, _ROUND_ROWS = 0.5, 1.0  # relative, of the blur's square; rows' worth of belief that it is round
+_BLUR_SPREAD = 0.03  # relative, of single edges' blur around the board's at least
+_ENOUGH = 10000  # pixels to learn the profile's shape from
+# Standard deviations of the coefficients before anything is known: they bind what blur and contrast can
+# stand in for, and give way to ten thousand pixels.
+_TAILS, _BENDS = 0.01, 0.06
+_RIDGE = 1e-5
+_LEAST_SPREAD = 0.0002  # of levels, in variances of the noise
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variance of the pixels [DN^2] on the dark side, at the edge, on the light side."""
+
+    dark: float
+    edge: float
+    light: float
+
+    @classmethod
+    def of(cls, fit: Fit, weight: Single, floor: float) -> Noise:
+        """From the residuals of fits.
+
+        Parameters
+        ----------
+        fit : Fit
+        weight : (E, N) array
+            0 for pixels not used.
+        floor : float [DN^2]
+            Variance that rounding makes at least.
+        """
+        x, used = fit.linear.x, weight > 0
+        square = fit.linear.residual**2
+        variances = []
+        for part in (x < -_FLAT, np.abs(x) <= _FLAT, x > _FLAT):
+            mine = part & used
+            count = mine.sum(axis=1)
+            some = count >= min(8, int(count.max(initial=0)))
+            sums = np.einsum("en,en->e", square, mine.astype(np.float32))
+            # The median over the edges does not see those that are hidden.
+            variances.append(median(sums[some] / np.maximum(count[some], 1)) if some.any() else 0.0)
+        return cls(*(max(v, floor, _LEAST_SHARE * max(variances)) for v in variances))
+
+    def times(self, factor: float) -> Noise:
+        """All of it more by a factor."""
+        return Noise(factor * self.dark, factor * self.edge, factor * self.light)
+
+    def weighted(self, x: Single, used: Single) -> Single:
+        """Inverse variances [1/DN^2] of pixels at a light x between the levels; 0 where not used."""
+        at = np.clip(x, -1, 1)
+        variance = self.edge + np.where(at < 0, self.edge - self.dark, self.light - self.edge) * at
+        return np.where(used > 0, 1 / variance, 0).astype(np.float32)
+
+
+def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_]) -> Shape:
+    """Better shape of the profile from what the fits have left over, by least squares.
+
+    Shift, blur and levels are varied along with it, so that these don't hide what they cannot change.
+
+    Parameters
+    ----------
+    data : EdgeData
+    fit : Fit
+    shape : Shape
+        With which these were fitted.
+    good : (E,) bool array
+        Edges to use.
+    """
+    # A share of the pixels is enough for a dozen numbers.
+    step = max(1, int((data.weight[good] > 0).sum()) // _ENOUGH)
+    edges = np.flatnonzero(good)[:, None]
+    # Each edge another share, or all of them would be from the same places across the edges.
+    some = (edges, np.arange(0, data.s.shape[1] - step + 1, step) + 7 * edges % step)
+    z, x, Q = fit.linear.z[some], fit.linear.x[some], data.Q[some]
+    _, density = erf_and_density(z)
+    scale = fit.values[good, CONTRAST].astype(np.float32)[:, None] * data.gain[some]
+    steep = scale * Q if not shape.bend.any() else response(x, shape.bend)[1] * Q * scale
+    # Edge by edge: small products, for which no threads are started.
+    columns = np.empty((len(z), RESPONSE_TERMS + 6, z.shape[1]), dtype=np.float32)
+    tails, bends, others = np.split(columns, [2, 2 + RESPONSE_TERMS], axis=1)
+    tail_terms(z, density, out=tails)
+    tails *= steep[:, None]
+    response_terms(x, scale, out=bends)
+    others[:, 0] = fit.linear.jacobian[:, OFFSET][some]
+    others[:, 1] = fit.linear.jacobian[:, BLUR][some]
+    np.multiply(x, scale, out=others[:, 2])
+    others[:, 3] = 1
+    weighted = columns * data.weight[some][:, None]
+    normal = (weighted @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
+    right = (weighted @ fit.linear.residual[some][:, :, None]).sum(axis=(0, 2), dtype=float)
+    normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
+    # Blur, contrast, tails and the odd terms of the response can nearly stand in for one another.
+    believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _BENDS)]) ** -2
+    known = np.concatenate([shape.tails.mean(axis=0), shape.bend])
+    right[: len(known)] -= believed * known
+    normal[range(len(known)), range(len(known))] += believed
+    change = np.linalg.solve(normal, right)
+    bend = shape.bend + change[2 : 2 + RESPONSE_TERMS]
+    return replace(shape, tails=shape.tails + change[:2], bend=bend)
+
+
+@dataclass(frozen=True, eq=False)
+class BoardBlur:
+    """Blur of a board's edges: ``sigma^2 = n^T S n`` for an edge with the normal n.
+
+    Attributes
+    ----------
+    matrix : (2, 2) array [px^2]
+        S: round but for motion, and for lenses that see edges one way sharper than the other.
+    spread : float [px^2]
+        Variance of single edges' blur around that, beyond that of the fits.
+    """
+
+    matrix: Array
+    spread: float
+
+    @classmethod
+    def of(cls, fit: Fit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
+        """From the good ones of fits of edges with normals (E, 2)."""
+        if not good.any():
+            good = np.ones_like(good)
+        sigma, (n_u, n_v) = fit.values[good, BLUR], normal[good].T
+        usual = median(sigma)
+        terms = np.stack([n_u * n_u, 2 * n_u * n_v, n_v * n_v])
+        # Held to be round unless many edges say otherwise; single ones may be wrong.
+        rest = sigma**2 - usual**2
+        weight = 1 / (1 + (rest / (_ROUND * usual**2)) ** 2)
+        normal_matrix = (terms * weight) @ terms.T + np.eye(3) * _ROUND_ROWS
+        uu, uv, vv = np.linalg.solve(normal_matrix, terms @ (weight * rest))
+        matrix = usual**2 * np.eye(2) + np.array([[uu, uv], [uv, vv]])
+        blur = cls(matrix, 0.0)
+        scatter = median((sigma - blur.along(normal[good])) ** 2) / 0.455
+        return cls(matrix, max(scatter - 2 * median(fit.covariance[good, BLUR, BLUR]), 0.0))
+
+    def along(self, normal: Array) -> Array:
+        """(E,) blur [px] of edges with normals (E, 2)."""
+        square = ((normal @ self.matrix) * normal).sum(axis=1)
+        return np.sqrt(np.maximum(square, _LEAST_BLUR**2))
+
+
+def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: float, noise: float) -> Prior:
+    """What the whole board tells about the levels and the blur of single edges.
+
+    Parameters
+    ----------
+    shading : Shading
+    place : (E, 2) array [px]
+    sigma : (E,) array [px]
+        Blur.
+    blur_spread : float [px^2]
+        Variance of single edges' blur around that.
+    noise : float [DN^2]
+        Variance of a pixel.
+    """
+    mean, contrast = shading.at(place)
+    low, high = 1 / (shading.spread + _LEAST_SPREAD * noise)
+    precision = np.zeros((len(place), 3, 3))
+    # Of A = (light + dark) / 2 and B = (light - dark) / 2, from those of dark and light.
+    precision[:, MEAN, MEAN] = precision[:, CONTRAST, CONTRAST] = high + low
+    precision[:, MEAN, CONTRAST] = precision[:, CONTRAST, MEAN] = high - low
+    precision[:, BLUR, BLUR] = 1 / (blur_spread + (_BLUR_SPREAD * sigma) ** 2)
+    return Prior(np.stack([mean, contrast, sigma], axis=-1), precision)

@@ -1,0 +1,258 @@
+"""Fitting the smooth map to points known along directions, against outliers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.smooth_map import FORMS, Places, SmoothMap
+from neurocal_cli.geometry import Array
+
+__all__ = [
+    "STEPS",
+    "MapFit",
+    "Rows",
+    "Settled",
+    "finished_map",
+    "fit_map",
+    "loss_of",
+    "median",
+    "settled_map",
+    "usual_scale",
+]
+
+STEPS = 25  # at most
+_SHIFT_PRIOR = 1e-2  # 1/px^2
+_TINY = 1e-300
+_BELIEF = 20  # rows' worth of belief that variances are what they claim to be
+_CREEPING = 5e-3  # of chi2; what is gained so slowly is not worth the steps
+_SETTLED = 0.2  # of chi2
+_DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
+_TUKEY = 6.0  # standard deviations beyond which a row counts as an outlier
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Positions known along one direction each: ``direction . p = value``.
+
+    Attributes
+    ----------
+    grid : (N, 2) array [squares]
+    direction : (N, 2) array
+        Unit vectors.
+    value : (N,) array [px]
+    variance : (N,) array [px^2]
+    shift : (N, K) array
+        What else moves the values, linearly, by unknowns that are found along with the map.
+    """
+
+    grid: Array
+    direction: Array
+    value: Array
+    variance: Array
+    shift: Array
+
+    @classmethod
+    def of_points(cls, grid: Array, pixels: Array, sigma: float, shifts: int = 0) -> Rows:
+        """Both coordinates of points (N, 2)."""
+        n = len(grid)
+        return cls(
+            np.tile(grid, (2, 1)),
+            np.repeat(np.eye(2), n, axis=0),
+            pixels.T.reshape(-1),
+            np.full(2 * n, sigma**2),
+            np.zeros((2 * n, shifts)),
+        )
+
+    @property
+    def telling(self) -> NDArray[np.bool_]:
+        """(N,) rows that tell something about the map; anchors, which may be more than half, do not."""
+        typical = np.sort(self.variance)[len(self.variance) // 4]
+        return np.asarray(self.variance < 100 * typical)
+
+    def and_(self, other: Rows) -> Rows:
+        """Both together."""
+        names = ("grid", "direction", "value", "variance", "shift")
+        return Rows(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+
+
+@dataclass(frozen=True, eq=False)
+class MapFit:
+    """A map fitted to rows.
+
+    Attributes
+    ----------
+    map : SmoothMap
+    shift : (K,) array [px]
+        Unknowns of `Rows.shift`.
+    shift_variance : (K,) array [px^2]
+    residual : (N,) array [px]
+        Value minus map and shift.
+    weight : (N,) array
+        From 1 down to 0 for outliers.
+    chi2 : float
+        Tukey's loss, about the number of good rows less that of parameters.
+    excess : float
+        Variance of the good rows that tell something about the map, as a multiple of what they claim;
+        1 as long as it may be that by chance, less where it is less.
+    """
+
+    map: SmoothMap
+    shift: Array
+    shift_variance: Array
+    residual: Array
+    weight: Array
+    chi2: float
+    excess: float
+
+    @property
+    def form(self) -> int:
+        """Index of the map's form."""
+        return FORMS.index((self.map.radial, self.map.degree))
+
+
+def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = STEPS) -> MapFit:
+    """Levenberg-Marquardt steps with Tukey's weights, from a start that is nearly right.
+
+    Parameters
+    ----------
+    start : SmoothMap
+        Whose form is kept.
+    rows : Rows
+    shift : (K,) array [px]
+        Start of the shifts.
+    steps : int
+        At most.
+    """
+    return finished_map(settled_map(start, rows, shift, steps), rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """A map after its last step: shifts, residuals (N,) and derivatives (P, N) of what they compare with."""
+
+    map: SmoothMap
+    shift: Array
+    residual: Array
+    jacobian: Array
+
+
+def settled_map(start: SmoothMap, rows: Rows, shift: Array, steps: int, worth: float = 0.0) -> Settled:
+    """Steps to the best map of a form, but only one if that gains less chi2 than would be worth more."""
+    free, m = start.free, len(start.free)
+    prior = np.concatenate([start.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
+    values = np.concatenate([start.parameters[free], shift])
+    rows_there = _Rows.of(start, rows)
+    residual, jacobian = rows_there.residual(start, shift, free)
+    # Before the first step everything may be off, the shifts above all.
+    precision, telling = 1 / rows.variance, rows.telling
+    weight, damping, least = precision, _DAMPING, 0.0
+    for _ in range(steps):
+        normal = (jacobian * weight) @ jacobian.T
+        gradient = jacobian @ (weight * residual) - prior * values
+        normal.ravel()[:: len(values) + 1] += prior
+        step = _solved(normal, gradient, damping)
+        tried, moved = replace(start, parameters=start.parameters.copy()), values + step
+        tried.parameters[free] = moved[:m]
+        ahead, slopes = rows_there.residual(tried, moved[m:], free)
+        before = weight @ residual**2 + prior @ values**2
+        after = weight @ ahead**2 + prior @ moved**2
+        if not after <= before:
+            # Where parameters can stand in for one another, it would be so again.
+            damping = least = 10 * damping
+            continue
+        start, values, residual, jacobian = tried, moved, ahead, slopes
+        damping = max(0.1 * damping, least)
+        if before - after < worth:
+            break
+        worth = 0.0
+        z = residual * rows_there.steep
+        scale = usual_scale(z[telling])
+        weight = _tukey(z / scale) * precision
+        if before - after < max(_SETTLED * scale**2, _CREEPING * after) and damping <= max(_DAMPING, least):
+            break
+    return Settled(start, values[m:], residual, jacobian)
+
+
+def median(x: Array) -> float:
+    """The median, of an even number the upper one; numpy's takes ten times as long for a few hundred."""
+    flat = np.sort(x, axis=None)
+    return float(flat[len(flat) // 2]) if len(flat) else float("nan")
+
+
+def loss_of(z: Array) -> float:
+    """Chi2 that grows no more beyond what no good row reaches."""
+    return float(np.minimum(z * z, 100.0).sum())
+
+
+def _tukey(z: Array) -> Array:
+    return np.asarray(np.clip(1 - (z / _TUKEY) ** 2, 0, None) ** 2)
+
+
+def usual_scale(z: Array) -> float:
+    """How much larger than claimed the residuals of most rows are; at least 1.
+
+    What the map cannot follow must not count as outliers as long as most rows have their share in it.
+    """
+    return max(1.0, 1.5 * median(np.abs(z)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Rows, prepared for maps of one form."""
+
+    rows: Rows
+    places: Places
+    direction: Array
+    steep: Array  # inverse standard deviations
+
+    @classmethod
+    def of(cls, form: SmoothMap, rows: Rows) -> _Rows:
+        direction = np.ascontiguousarray(rows.direction.T)
+        return cls(rows, form.places(rows.grid), direction, 1 / np.sqrt(rows.variance))
+
+    def residual(self, now: SmoothMap, shift: Array, free: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Residuals (N,), and derivatives (P, N) of what they are compared with."""
+        value, along = now.along(self.places, self.direction)
+        residual = self.rows.value - value - self.rows.shift @ shift
+        return residual, np.concatenate([along[free], self.rows.shift.T])
+
+
+def _solved(normal: Array, gradient: Array, damping: float) -> Array:
+    """Solution of damped normal equations whose parameters have very different sizes."""
+    size = 1 / np.sqrt(np.maximum(normal.diagonal(), _TINY))
+    scaled = normal * size[:, None] * size
+    scaled.ravel()[:: len(size) + 1] += damping
+    return np.asarray(size * np.linalg.solve(scaled, gradient * size))
+
+
+def finished_map(settled: Settled, rows: Rows) -> MapFit:
+    """A settled map with its covariance, and what its residuals tell of the rows."""
+    now, shift, residual, jacobian = settled.map, settled.shift, settled.residual, settled.jacobian
+    free, telling = now.free, rows.telling
+    z = residual / np.sqrt(rows.variance)
+    weight = _tukey(z / usual_scale(z[telling]))
+    good = weight > 0
+    normal = (jacobian * (good / rows.variance)) @ jacobian.T
+    normal[np.diag_indices_from(normal)] += np.concatenate(
+        [now.prior[free], np.full(len(shift), _SHIFT_PRIOR)]
+    )
+    size = 1 / np.sqrt(np.maximum(np.diag(normal), _TINY))
+    inverse = np.linalg.inv(normal * size[:, None] * size) * size[:, None] * size
+    telling = good & telling
+    left = int(telling.sum()) - len(free) - len(shift)
+    excess = float((z[telling] ** 2).sum()) / max(left, 0.2 * len(z))
+    shrunk = min(1.0, (excess * left + _BELIEF) / (left + _BELIEF)) if left > 0 else 1.0
+    covariance = np.zeros((len(now.parameters),) * 2)
+    covariance[np.ix_(free, free)] = inverse[: len(free), : len(free)]
+    return MapFit(
+        map=replace(now, covariance=covariance),
+        shift=shift,
+        shift_variance=np.diag(inverse)[len(free) :].copy(),
+        residual=residual,
+        weight=weight,
+        chi2=float((z[good] ** 2).sum()),
+        excess=excess if excess > 1 + 3 * np.sqrt(2 / max(left, 1)) else shrunk,
+    )

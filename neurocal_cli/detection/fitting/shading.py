@@ -1,0 +1,140 @@
+"""Levels of the dark and the light squares over the image: low polynomials, fitted robustly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.robust import median
+from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.geometry import Array
+
+__all__ = ["Levels", "Shading", "fit_shading", "square_levels"]
+
+_LATTICE = np.linspace(0.25, 0.75, 8)  # of a square; its interior, away from the blurred edges
+_STEPS = 2  # after the last degree
+_TUKEY = 5.0  # standard deviations beyond which a level counts as an outlier
+_TINY = 1e-9  # DN^2
+_RIDGE = 1e-12
+_LEAST_CONTRAST = 1e-3  # DN; where there is none, the fits fail by themselves but must not divide by it
+_TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Levels:
+    """Levels [DN] measured at places of the image.
+
+    Attributes
+    ----------
+    place : (N, 2) array [px]
+    level, variance : (N,) arrays [DN], [DN^2]
+    noise : (N,) array [DN^2]
+        Variance of the pixels there, where it has been measured.
+    """
+
+    place: Array
+    level: Array
+    variance: Array
+    noise: Array = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True, eq=False)
+class Shading:
+    """Dark and light level as polynomials of the place.
+
+    Attributes
+    ----------
+    frame : Frame
+        Scales the pixels.
+    dark, light : (6,) arrays [DN]
+        Coefficients of 1, x, y, x^2, x y, y^2.
+    spread : (2,) array [DN^2]
+        Variance of single squares' levels around the dark and the light polynomial, and of these.
+    """
+
+    frame: Frame
+    dark: Array
+    light: Array
+    spread: Array
+
+    def at(self, place: Array) -> tuple[Array, Array]:
+        """Mean level and half contrast at places (N, 2)."""
+        terms = _terms(self.frame, place)
+        dark, light = terms @ self.dark, terms @ self.light
+        return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
+
+    def slopes(self, place: Array) -> tuple[Array, Array]:
+        """Gradients [DN/px] of mean level and half contrast at places (N, 2); (N, 2) arrays."""
+        x, y = ((place - self.frame.centre) / self.frame.unit).T
+        one, zero = np.ones_like(x), np.zeros_like(x)
+        du = np.stack([zero, one, zero, 2 * x, y, zero], axis=-1) / self.frame.unit
+        dv = np.stack([zero, zero, one, zero, x, 2 * y], axis=-1) / self.frame.unit
+        dark, light = (np.stack([du @ c, dv @ c], axis=-1) for c in (self.dark, self.light))
+        return 0.5 * (light + dark), 0.5 * (light - dark)
+
+
+def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels]:
+    """Medians of the interiors of the squares whose four vertices are seen: dark and light ones."""
+    seen = grid.seen
+    whole = seen[:-1, :-1] & seen[1:, :-1] & seen[:-1, 1:] & seen[1:, 1:]
+    r, c = np.nonzero(whole)
+    corner = np.stack([c, r], axis=-1).astype(float)
+    lattice = np.stack(np.meshgrid(_LATTICE, _LATTICE), axis=-1).reshape(-1, 2)
+    corners = at.at(corner[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
+    x, y = lattice.T
+    weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
+    places = np.einsum("lk,eki->eli", weights, corners)
+    height, width = image.shape
+    u, v = np.rint(places[..., 0]).astype(np.intp), np.rint(places[..., 1]).astype(np.intp)
+    values = image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(float)
+    half = values.shape[1] // 2
+    level = np.sort(values, axis=1)[:, half]
+    noise = (1.4826 * np.sort(np.abs(values - level[:, None]), axis=1)[:, half]) ** 2 + 1 / 12
+    is_dark = (c + r + grid.dark) % 2 == 0
+    middle = corners.mean(axis=1)
+    dark, light = (
+        Levels(middle[kind], level[kind], 0.5 * np.pi * noise[kind] / len(lattice), noise[kind])
+        for kind in (is_dark, ~is_dark)
+    )
+    return dark, light
+
+
+def fit_shading(frame: Frame, dark: Levels, light: Levels) -> Shading:
+    """Polynomials through levels, as high as the levels' number allows."""
+    (low, low_spread), (high, high_spread) = (_fit(frame, levels) for levels in (dark, light))
+    return Shading(frame, low, high, np.array([low_spread, high_spread]))
+
+
+def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
+    n = len(levels.level)
+    coefficients = np.zeros(_TERMS[-1])
+    if n == 0:
+        return coefficients, np.inf
+    terms = _terms(frame, levels.place)
+    residual, spread = levels.level - median(levels.level), 0.0
+    most = max([m for m in _TERMS if 3 * m <= n], default=1)
+    # From the median on to higher degrees: hidden squares must be known before they can bend anything.
+    for used in (*_TERMS, *(most,) * _STEPS):
+        used = min(used, most)
+        # The median does not see the outliers that the weights have to find.
+        scatter = median(residual**2) / 0.455 * n / max(n - used, 1)
+        weight = np.clip(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6, None) ** 2
+        root = np.sqrt(weight / (levels.variance + spread))
+        weighted = terms[:, :used].T * root
+        normal = weighted @ weighted.T
+        # Of terms that can't be told apart none is made up.
+        normal.ravel()[:: used + 1] *= 1 + _RIDGE
+        coefficients[:used] = np.linalg.solve(normal, weighted @ (levels.level * root))
+        residual = levels.level - terms[:, :used] @ coefficients[:used]
+        # What the levels' own errors may do by chance is not taken for spread of the squares.
+        chance = 1 + 4 / np.sqrt(n)
+        spread = max(scatter - chance * median(levels.variance), 0.0)
+    return coefficients, spread + most / n * median(levels.variance)
+
+
+def _terms(frame: Frame, place: Array) -> Array:
+    x, y = ((place - frame.centre) / frame.unit).T
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)

@@ -1,0 +1,258 @@
+"""The pixels along lines of a chessboard: where the lines run, and windows of pixels around them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.smooth_map import SmoothMap
+from neurocal_cli.geometry import Array
+
+__all__ = ["Lines", "Strips", "gather", "grid_lines"]
+
+Single = NDArray[np.float32]
+
+_AROUND = np.array([[0, 0], [-0.5, 0], [0.5, 0], [-0.5, -0.2], [-0.5, 0.2], [0.5, -0.2], [0.5, 0.2]])
+_CLOSEST = 0.5  # px
+_NEIGHBOURS = np.array([[0.0, -1.0], [0.0, 1.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Pieces of grid lines in the image, one cell long, each with the frame that its pixels are seen in.
+
+    Attributes
+    ----------
+    middle : (E, 2) array [px]
+        Where the map sees the middle of the piece; origin of the frame.
+    tangent, normal : (E, 2) arrays
+        Unit vectors; the normal points to the light side.
+    curvature : (E,) array [1/px]
+        The line is ``d = curvature s^2 / 2`` in the frame.
+    ends : (E, 2) array [px]
+        Tangential coordinates of the two ends.
+    crossing : (E, 2, 2) array
+        Unit normals of the lines that cross at the two ends, pointing into the piece.
+    apart : (E, 2) array [px]
+        Distance to the next parallel lines, against the normal and along it.
+    """
+
+    middle: Array
+    tangent: Array
+    normal: Array
+    curvature: Array
+    ends: Array
+    crossing: Array
+    apart: Array
+
+    @property
+    def width(self) -> Array:
+        """(E,) distance to the nearer parallel line [px]."""
+        return np.asarray(self.apart.min(axis=1))
+
+    @property
+    def length(self) -> Array:
+        """(E,) from end to end [px]."""
+        return self.ends[:, 1] - self.ends[:, 0]
+
+
+def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light: Array) -> Lines:
+    """Lines of a grid as a map sees them.
+
+    Parameters
+    ----------
+    at : SmoothMap
+    centre : (E, 2) array [squares]
+        Grid coordinates of the middles; a piece reaches half a square to both sides.
+    vertical : (E,) bool array
+        Whether the line runs along r.
+    light : (E,) array
+        +1 where the light side is that of growing r (of growing c for vertical ones), else -1.
+    """
+    swap = vertical[:, None, None]
+    offsets = np.concatenate([_AROUND, _NEIGHBOURS])
+    offsets = np.where(swap, offsets[:, ::-1], offsets)
+    points = at.at(centre[:, None] + offsets)
+    middle, first, last = points[:, 0], points[:, 1], points[:, 2]
+    tangent = last - first
+    tangent /= np.hypot(*tangent.T)[:, None]
+    turned = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
+    normal = turned * (light * np.where(vertical, -1, 1))[:, None]
+    ends = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], tangent)
+    sag = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], normal)
+    # The parabola through both ends, its slope at the origin folded into the frame.
+    curvature = 2 * (sag[:, 1] / ends[:, 1] - sag[:, 0] / ends[:, 0]) / (ends[:, 1] - ends[:, 0])
+    slope = sag[:, 0] / ends[:, 0] - 0.5 * curvature * ends[:, 0]
+    tangent, normal = tangent + slope[:, None] * normal, normal - slope[:, None] * tangent
+    across = points[:, [4, 6]] - points[:, [3, 5]]
+    crossing = np.stack([-across[..., 1], across[..., 0]], axis=-1)
+    crossing /= np.hypot(crossing[..., 0], crossing[..., 1])[..., None]
+    inward = np.einsum("eki,ei->ek", crossing, tangent) * [1.0, -1.0]
+    crossing *= np.sign(inward)[..., None]
+    apart = np.einsum("eki,ei->ek", points[:, 7:9] - middle[:, None], normal)
+    apart = np.stack([-apart.min(axis=1), apart.max(axis=1)], axis=-1)
+    return Lines(middle, tangent, normal, curvature, ends, crossing, np.maximum(apart, _CLOSEST))
+
+
+@dataclass(frozen=True, eq=False)
+class Strips:
+    """Pixels around lines, padded to the same number for all; float32.
+
+    Attributes
+    ----------
+    s, d : (E, N) arrays [px]
+        Tangential and normal coordinate, the latter less the line's curve.
+    value : (E, N) array [DN]
+    inside : (E, N) bool array
+        False for the padding and for pixels outside the strip or the image.
+    u, v : (E, N) arrays [px]
+        Relative to the line's middle.
+    beyond : (E,) array
+        Share of the strip's pixels that lie outside the image.
+    """
+
+    s: Single
+    d: Single
+    value: Single
+    inside: NDArray[np.bool_]
+    u: Single
+    v: Single
+    beyond: Array
+
+
+def gather(
+    image: NDArray[np.generic], lines: Lines, half_width: Array, trim: Array, stride: int = 1
+) -> Strips:
+    """Pixels of the strips ``|d| <= half_width`` between the ends of lines.
+
+    Each strip is a parallelogram of whole pixels: columns along the line, where it is more horizontal
+    than vertical (else rows), and in each column the pixels around the line.
+
+    Parameters
+    ----------
+    image : (H, W) array
+    lines : Lines
+    half_width : (E,) array [px]
+    trim : (E, 2) array [px]
+        What is left out at the two ends.
+    stride : int
+        Only every so manieth column.
+    """
+    steep = np.abs(lines.tangent[:, 1]) > np.abs(lines.tangent[:, 0])
+    order = np.where(steep[:, None], [[1, 0]], [[0, 1]])
+    t = np.take_along_axis(lines.tangent, order, axis=1)
+    n = np.take_along_axis(lines.normal, order, axis=1)
+    middle = np.take_along_axis(lines.middle, order, axis=1)
+    low, high = (lines.ends + trim * [1, -1]).T
+    reach = 0.5 * (high - low) * np.abs(t[:, 0]) + half_width * np.abs(t[:, 1])
+    centre = middle + (0.5 * (low + high))[:, None] * t
+    count = int(np.ceil((2 * reach.max() + 1) / stride))
+    first = np.ceil(centre[:, 0] - reach)
+    column = first[:, None] + stride * np.arange(count)
+    a: Array = column - middle[:, :1]
+    along = a / t[:, :1]
+    # The chord's height over the tangent, to the first order: columns are cut straight.
+    height = middle[:, 1:] + along * t[:, 1:] + 0.5 * lines.curvature[:, None] * along**2 / n[:, 1:]
+    spread = half_width / np.abs(t[:, 0])
+    rows = int(np.ceil(2 * spread.max() + 1))
+    top = np.ceil(height - spread[:, None])
+    window = _Window(np.asarray(column, dtype=float), top, rows, a, top - middle[:, 1:])
+    s, d = window.seen_along(t), window.seen_along(n)
+    d -= _column(0.5 * lines.curvature) * s * s
+    inside = np.abs(d) <= _column(half_width)
+    inside &= (s >= _column(low)) & (s <= _column(high))
+    total = inside.sum(axis=1)
+    framed = window.framed(steep, image.shape)
+    if framed is not None:
+        inside &= framed
+    used = inside.sum(axis=1)
+    index, inside = packed(inside, used)
+    along_columns, down = window.relative(index)
+    return Strips(
+        s=s.reshape(-1)[index],
+        d=d.reshape(-1)[index],
+        value=image.reshape(-1).take(window.places(steep, image.shape[1], index), mode="clip").astype("f4"),
+        inside=inside,
+        u=np.where(steep[:, None], down, along_columns),
+        v=np.where(steep[:, None], along_columns, down),
+        beyond=1 - used / np.maximum(total, 1),
+    )
+
+
+def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
+    """Where the wanted ones of each row are, side by side.
+
+    Parameters
+    ----------
+    wanted : (E, N) bool array
+    count : (E,) int array
+        Of the wanted ones in each row.
+
+    Returns
+    -------
+    index : (E, M) int array
+        In the flat array; 0 beyond a row's count.
+    inside : (E, M) bool array
+        False beyond a row's count.
+    """
+    most = int(count.max(initial=1))
+    inside = np.arange(most) < count[:, None]
+    index = np.zeros(inside.shape, dtype=np.intp)
+    index[inside] = np.flatnonzero(wanted)
+    return index, inside
+
+
+def _column(x: Array) -> Single:
+    return np.asarray(x[:, None], dtype=np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class _Window:
+    """Parallelograms of pixels: `rows` of them from `top` on in each column.
+
+    Attributes
+    ----------
+    column, top : (E, C) arrays [px]
+    rows : int
+    a, b : (E, C) arrays [px]
+        The same relative to the line's middle.
+    """
+
+    column: Array
+    top: Array
+    rows: int
+    a: Array
+    b: Array
+
+    def seen_along(self, way: Array) -> Single:
+        """(E, C rows) coordinates along directions (E, 2) from the middle."""
+        first = (self.a * way[:, :1] + self.b * way[:, 1:]).astype(np.float32)
+        down = _column(way[:, 1]) * np.arange(self.rows, dtype=np.float32)
+        return np.asarray((first[:, :, None] + down[:, None]).reshape(len(way), -1), dtype=np.float32)
+
+    def framed(self, steep: NDArray[np.bool_], size: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """(E, C rows) which pixels lie in an image of (height, width); None if all do."""
+        limits = np.where(steep[:, None], [size[0], size[1]], [size[1], size[0]])
+        column, last = self.column, self.top + (self.rows - 1)
+        wide, high = limits[:, :1], limits[:, 1:]
+        if (column >= 0).all() and (self.top >= 0).all() and (column < wide).all() and (last < high).all():
+            return None
+        row = self.top[:, :, None] + np.arange(self.rows)
+        inside = (row >= 0) & (row < high[:, :, None])
+        inside &= ((column >= 0) & (column < wide))[:, :, None]
+        return inside.reshape(len(column), -1)
+
+    def places(self, steep: NDArray[np.bool_], width: int, index: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Places of packed pixels in the flat image of a width; of those that stand for nothing, anywhere."""
+        right, down = (np.where(steep, a, b)[:, None] for a, b in ((width, 1), (1, width)))
+        first = (self.column * right + self.top * down).astype(np.intp)
+        return (first[:, :, None] + (down * np.arange(self.rows))[:, None]).reshape(-1)[index]
+
+    def relative(self, index: NDArray[np.intp]) -> tuple[Single, Single]:
+        """Coordinates of packed pixels relative to the line's middle, along the columns' way and down."""
+        a, b = self.a.astype(np.float32), self.b.astype(np.float32)
+        every = np.repeat(a.reshape(-1), self.rows)
+        down = np.asarray(b[:, :, None] + np.arange(self.rows, dtype=np.float32), dtype=np.float32)
+        return every[index], down.reshape(-1)[index]

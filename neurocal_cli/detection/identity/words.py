@@ -1,0 +1,67 @@
+"""Why an image gives no points: what is said when its grids cannot be laid on the board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from neurocal_cli.board import Board
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.identity.ends import End
+from neurocal_cli.errors import NeurocalError
+
+__all__ = ["LOOKS_THE_SAME", "NoBoardError", "another_size", "several_ways"]
+
+LOOKS_THE_SAME = (
+    "the board looks the same after a turn, colours included, so which corner is the first one depends on "
+    "how it lies in the image; for points that are the same in all images use a board with one even and "
+    "one odd side"
+)
+
+
+class NoBoardError(NeurocalError):
+    """An image that does not show the board, or not enough of it to tell where its points are."""
+
+
+def another_size(board: Board, grid: Grid, ends: Sequence[End]) -> str:
+    """What to say of a grid that has no place on the board."""
+    wanted = _sizes(board)
+    shape = grid.shape
+    if len(board.planes) == 1:
+        plane = board.planes[0]
+        if (shape[0] < shape[1]) != (plane.cols < plane.rows):  # named as the user names them
+            shape = shape[1], shape[0]
+        if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends:
+            return f"the pattern goes on beyond {wanted} inner vertices; give the size of the whole board"
+    have = "board has" if len(board.planes) == 1 else "planes of the board have"
+    return (
+        f"found {_size(shape)} inner vertices, the {have} {wanted}; give the size of the board in the image"
+    )
+
+
+def several_ways(board: Board, grids: Sequence[Grid], rms: float) -> str:
+    """What to say of grids that can lie on the board in more ways than one, the best to `rms` px."""
+    sizes = [sorted((plane.cols, plane.rows)) for plane in board.planes]
+    part = next((grid for grid in grids if sorted(grid.shape) not in sizes), None)
+    if part is not None:
+        return (
+            f"found {_size(part.shape)} of {_sizes(board)} inner vertices, and nothing tells which; show the "
+            "whole board, or its outer border on more sides"
+        )
+    if len(grids) < len(board.planes):
+        return (
+            f"only {len(grids)} of the {len(board.planes)} planes found, which does not tell how they lie; "
+            "show more of them"
+        )
+    return (
+        f"the planes fit together in more ways than one, to {rms:.2g} px; check the board's origins and axes "
+        "or take the image from nearer"
+    )
+
+
+def _sizes(board: Board) -> str:
+    names = [_size((plane.cols, plane.rows)) for plane in board.planes]
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _size(shape: tuple[int, int]) -> str:
+    return f"{shape[0]} x {shape[1]}"
