@@ -1,7 +1,14 @@
-"""Two processes share the tests (pytest-xdist), and threads of the BLAS in each would only be in the way."""
+"""For all tests: threads, and examples that are the same in every run."""
 
 import os
 
-# Before NumPy loads its BLAS.
+from hypothesis import settings
+
+# Two processes share the tests (pytest-xdist): threads of the BLAS in each would only be in each other's way.
+# Before NumPy loads it.
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
+
+# What fails once has to fail again.
+settings.register_profile("repeatable", derandomize=True)
+settings.load_profile("repeatable")

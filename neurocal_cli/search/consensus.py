@@ -78,7 +78,10 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
             search = _Search(views, some, kind, rng)
             search.run()
             hopeless[some] = search.judge(kept)
-            loose[some] = search.scale / search.spread
+            # A view all of whose pixels are one tells nothing.
+            loose[some] = np.divide(
+                search.scale, search.spread, np.full(len(some), np.inf), where=search.spread > 0
+            )
     # A lens may loosen all views, but one view far more than the others is another matter.
     told = loose[~np.isnan(loose)]
     if len(told) > 2:
