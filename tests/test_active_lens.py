@@ -398,10 +398,11 @@ def test_networks_beat_every_rival_between_45_settings(bends: bool) -> None:
         held.take(law, bends)
     for law in LAWS:
         assert held.networks[law] < MOST[law]
-        assert held.networks[law] < 1.002 * held.alone[law]
-        assert all(held.networks[law] < 1.005 * error for error in held.rivals[law].values())
+        assert held.networks[law] < held.alone[law]
+        assert all(held.networks[law] <= error for error in held.rivals[law].values())
         assert held.alternating[law] == pytest.approx(1, abs=0.1)
         assert held.cover[law] > 0.9
+    assert np.mean(list(held.cover.values())) < 0.99
     networks = np.mean(list(held.networks.values()))
     for name in held.rivals["a"]:
         assert networks < 0.8 * np.mean([held.rivals[law][name] for law in LAWS])

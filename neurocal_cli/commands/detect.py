@@ -53,7 +53,8 @@ _VERTICES = click.IntRange(2, 1000)
     "--points",
     type=click.Choice(["midpoints", "vertices"]),
     default="midpoints",
-    help="Measure the mid-points of the squares' edges or the inner vertices.",
+    help="Measure the mid-points of the squares' edges, or the inner vertices, whose errors are independent "
+    "of each other: take these where standard deviations matter.",
 )
 @click.option(
     "--gamma",

@@ -11,8 +11,8 @@ the r_j lie between the axis and the radius that the image's farthest corner is 
 follows from the lens, so it is found step by step. The data contradict such a lens when they fit it worse
 than chance would have it: then there is none.
 
-The standard deviations of what comes out are those of the points alone, which the condition can only
-make smaller.
+The standard deviations of what comes out are those of the points alone, as if the condition were not
+there: it can make them smaller, but its own bias is not in them.
 """
 
 from __future__ import annotations
