@@ -38,6 +38,10 @@ class Correspondences:
     covariance : (N, 3) array, optional [px^2]
         Columns suu, suv, svv of each pixel's covariance. Only ratios between points matter: the
         noise level itself is estimated from the residuals.
+    across : (N, 2) array, optional
+        Direction in the image in which each point was measured by itself, of any length; (0, 0) for one
+        that was measured in both. In the other direction its place comes from other points of the view,
+        as a mid-point's along its edge: not a measurement of its own. None: all in both.
     unit : str
         Of the world coordinates.
     source : str
@@ -68,6 +72,7 @@ class Correspondences:
     image_center: tuple[float, float] | None = None
     point: NDArray[Any] | Sequence[Any] | None = None
     covariance: Array | None = None
+    across: Array | None = None
     unit: str = "mm"
     source: str = "points"
     lines: NDArray[np.int64] | None = None
@@ -99,6 +104,8 @@ class Correspondences:
         self._set(view_names=names, view_index=_frozen(index))
         if self.covariance is not None:
             self._check_covariance(_matrix("covariance", self.covariance, 3))
+        if self.across is not None:
+            self._check_across(_matrix("across", self.across, 2))
         if self.image_size is not None:
             width, height = _pair(self.image_size)
             if not (width >= 1 and height >= 1 and width % 1 == 0 and height % 1 == 0):
@@ -154,6 +161,7 @@ class Correspondences:
             view=pick(self.view),
             point=pick(self.point),
             covariance=pick(self.covariance),
+            across=pick(self.across),
             lines=pick(self.lines),
         )
 
@@ -184,6 +192,18 @@ class Correspondences:
                 "definite; correct or remove the row"
             )
         self._set(covariance=_frozen(covariance))
+
+    def _check_across(self, across: Array) -> None:
+        if len(across) != len(self.world):
+            raise InputError(f"{self.source}: across needs one row for each of the {len(self.world)} points")
+        good = np.abs(across).max(axis=1) <= _LARGEST  # False for nan as well
+        if not good.all():
+            row = int(np.argmin(good))
+            raise InputError(
+                f"{self.place(row)}: the direction nu,nv in which the point was measured must be two finite "
+                "numbers; correct or remove the row"
+            )
+        self._set(across=_frozen(across) if across.any() else None)
 
 
 def _matrix(name: str, values: ArrayLike, columns: int) -> Array:

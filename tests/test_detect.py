@@ -97,7 +97,7 @@ def test_edges_turn_with_their_grid(matrix: tuple, offset: tuple) -> None:
     kind = np.array([EDGE_H, EDGE_V, VERTEX])
     index = np.array([[1, 2], [1, 2], [1, 2]])
     zeros = np.zeros((3, 2))
-    measured = Measured(kind, index, zeros, np.zeros((3, 3)), np.zeros((3, 3, 2)), 0, 0.0)
+    measured = Measured(kind, index, zeros, np.zeros((3, 3)), None, np.zeros((3, 3, 2)), 0, 0.0)
     grid = seen_grid(picture("base", 0).truth.planes[0], True)
     labels = label(Located(grid, plane, Placement(0, matrix, offset)), measured)
     if matrix[0][0] == 1:

@@ -57,7 +57,7 @@ def measured_on_a_bent_plane(noise: float) -> tuple[Measured, Array]:
     pixels += 5 * np.stack([x**3 + x * y**2, y * x**2], axis=-1)
     error = noise * rng.normal(size=pixels.shape)
     empty = np.zeros((9, 9, 2))
-    return Measured(kind, index, pixels + error, np.ones((120, 3)), empty, 0, 0.0), error
+    return Measured(kind, index, pixels + error, np.ones((120, 3)), None, empty, 0, 0.0), error
 
 
 def test_residuals_are_the_noise_and_not_the_lens() -> None:
@@ -71,6 +71,13 @@ def test_residuals_are_the_noise_and_not_the_lens() -> None:
 def test_few_points_have_no_residuals() -> None:
     measured, _ = measured_on_a_bent_plane(0.5)
     few = Measured(
-        measured.kind[:3], measured.index[:3], measured.pixels[:3], np.ones((3, 3)), measured.vertices, 0, 0.0
+        measured.kind[:3],
+        measured.index[:3],
+        measured.pixels[:3],
+        np.ones((3, 3)),
+        None,
+        measured.vertices,
+        0,
+        0.0,
     )
     assert not residuals(few).any()

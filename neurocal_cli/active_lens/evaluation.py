@@ -123,7 +123,7 @@ def _matched(lens: ActiveLens, points: LensPoints) -> tuple[LensPoints, list[str
         )
     columns = dict(zip(points.controls, points.settings[points.point_setting].T, strict=True))
     # Every point counts the same, as in any reprojection error.
-    plain = replace(points.points, covariance=None)
+    plain = replace(points.points, covariance=None, across=None)
     matched = LensPoints.grouped(plain, {name: columns[name] for name in lens.controls})
     outside = np.asarray(((matched.settings < lens.low) | (matched.settings > lens.high)).any(axis=1))
     warnings = []

@@ -58,9 +58,9 @@ class Start:
     @property
     def variance(self) -> float:
         """Of the noise of one coordinate [px^2], from the residuals of the tables."""
-        n, S = len(self.lens.points), self.lens.n_settings
+        n, S = self.data.views.n_equations, self.lens.n_settings
         unknowns = S * len(self.data.names) + (6 if self.data.still else 1 + 6 * self.lens.points.n_views)
-        return float(max(self.tables.normal.cost.sum() / max(2 * n - unknowns, 1), 1e-18))
+        return float(max(self.tables.normal.cost.sum() / max(n - unknowns, 1), 1e-18))
 
 
 def check_settings(count: int, controls: int, source: str) -> None:

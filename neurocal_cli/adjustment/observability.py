@@ -41,11 +41,12 @@ def check_points(views: Views, known: Known) -> None:
     if known.type in (1, 2):
         _check_planes(views, known)
         _check_helpers(views, known)
-    unknowns, equations = parameter_count(known, views.n_views), 2 * int(views.distinct.sum())
+    unknowns, equations = parameter_count(known, views.n_views), views.n_distinct_equations
     if equations <= unknowns:
+        of_point = 2 if views.across is None else 1
         raise DegenerateGeometryError(
-            f"{equations // 2} different points give {equations} equations for {unknowns} unknowns; "
-            f"give at least {unknowns // 2 + 1} points"
+            f"{views.distinct.sum()} different points give {equations:.0f} equations for {unknowns} "
+            f"unknowns; give at least {unknowns // of_point + 1} points"
             + (f", or more of the camera ({_givable(known)})" if known.type == 1 else "")
         )
 

@@ -40,12 +40,12 @@ def find_odd_view(job: Job, solution: Solution) -> str | None:
     if V < _FEWEST or known.type == 3 or not known.free_poses:
         return None
     quadratics = reduced(refined.normal, known.free_camera, known.free_poses)
-    spare = 2 * len(views.index) - parameter_count(known, V)
+    spare = views.n_equations - parameter_count(known, V)
     if _largest_move(quadratics, float(refined.cost.sum()) / max(spare, 1)) < _MOVES:
         return None
     conditions = np.where(views.nearly_flat, _CONDITIONS[True], _CONDITIONS[False])
     own = free_networks(views, refined.state)
-    own_spare = 2 * views.counts - 6 - conditions
+    own_spare = views.equations - 6 - conditions
     if own_spare.min() <= 0:
         return None
     variance = float(np.median(own / own_spare)) + 1e-24

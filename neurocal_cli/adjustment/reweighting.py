@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 from neurocal_cli.adjustment.job import Job, Solution
-from neurocal_cli.adjustment.noise import common_share, measured, with_common_share
-from neurocal_cli.adjustment.views import noise_model
+from neurocal_cli.adjustment.noise import Noise, measured, noise_of, with_common_share
+from neurocal_cli.adjustment.views import Views, arrange, noise_model
 from neurocal_cli.adjustment.whiteness import of_points
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["reweighted"]
+__all__ = ["reweighted", "weighed"]
 
 _PASSES = 10
 _SETTLED = 0.005  # change of the share that no result depends on
@@ -34,19 +34,39 @@ def reweighted(job: Job, solution: Solution, points: Correspondences) -> tuple[J
     """
     if points.covariance is None or not measured(points.covariance):
         return job, solution, 0.0
-    stated = points.covariance if job.views.order is None else points.covariance[job.views.order]
     # From equal weights: residuals of a fit that a few points rule would confirm that they should.
-    share = 1.0
-    job, solution = _with_share(job, solution, stated, share)
+    noise = Noise(share=1.0)
+    job, solution = _weighed(job, solution, points, noise)
     for _ in range(_PASSES):
-        last, share = share, common_share(stated, of_points(job.views, solution.refined.state))
-        if abs(share - last) < _SETTLED:
+        residuals = of_points(job.views, solution.refined.state) * job.views.pixel_scale
+        last, noise = noise, noise_of(_stated(points, job.views), residuals, job.views.across)
+        if max(abs(noise.share - last.share), abs(noise.along - last.along)) < _SETTLED:
             break
-        job, solution = _with_share(job, solution, stated, share)
-    return job, solution, share
+        job, solution = _weighed(job, solution, points, noise)
+    return job, solution, noise.share
 
 
-def _with_share(job: Job, solution: Solution, stated: Array, share: float) -> tuple[Job, Solution]:
-    whitening = noise_model(with_common_share(stated, share))[1]
-    job = replace(job, views=replace(job.views, whitening=whitening), tally=job.tally)
+def weighed(points: Correspondences, residuals: Array) -> Views:
+    """Points arranged, and weighed as far as residuals (N, 2) [px] of a calibration bear out."""
+    views = arrange(points)
+    if points.covariance is None or not measured(points.covariance):
+        return views
+    rows = slice(None) if views.order is None else views.order
+    return _with_noise(views, points, noise_of(_stated(points, views), residuals[rows], views.across))
+
+
+def _stated(points: Correspondences, views: Views) -> Array:
+    """The stated covariances in the order of the views."""
+    assert points.covariance is not None
+    return points.covariance if views.order is None else points.covariance[views.order]
+
+
+def _with_noise(views: Views, points: Correspondences, noise: Noise) -> Views:
+    believed = with_common_share(_stated(points, views), noise.share, views.across)
+    whitening = noise_model(believed, views.across, noise.along)[1]
+    return replace(views, whitening=whitening, along=noise.along)
+
+
+def _weighed(job: Job, solution: Solution, points: Correspondences, noise: Noise) -> tuple[Job, Solution]:
+    job = replace(job, views=_with_noise(job.views, points, noise), tally=job.tally)
     return job, Solution(job.refine(solution.refined.state), job.tally)

@@ -39,7 +39,7 @@ class Covariance:
 
 
 def covariance(
-    normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: int, shared: Array | None = None
+    normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: float, shared: Array | None = None
 ) -> Covariance:
     """Invert the normal matrix of a refined calibration.
 
@@ -51,7 +51,7 @@ def covariance(
         Of A's entries and the lens's coefficients.
     free_pose : bool
     n_residuals : int
-        Twice the number of points.
+        Number of equations: two for most points; see `directions`.
     shared : (f, f) array, optional
         Covariance of what is free of A and the lens, where it comes from elsewhere; the poses' follows.
     """

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.directions import LEAST, equations, loosened
 from neurocal_cli.adjustment.tiles import Tiles, tile
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, similarity
@@ -43,6 +44,10 @@ class Views:
         (m - pixel_centre) / pixel_scale.
     weights : (N,) array
         Scalar importance, mean 1.
+    across : (N, 2) array or None
+        Direction in which each point was measured; see `directions`.
+    along : float
+        Say of such points in the other direction.
     whitening : (N, 3) array or None
         Upper triangular factor of the inverse covariance: entries (0, 0), (0, 1), (1, 1).
     centre : (V, 3) array
@@ -66,6 +71,7 @@ class Views:
     local: Array
     pixels: Array
     weights: Array
+    across: Array | None
     whitening: Array | None
     centre: Array
     scale: Array
@@ -73,11 +79,27 @@ class Views:
     extent: Array
     pixel_centre: Array
     pixel_scale: float
+    along: float = LEAST
 
     @property
     def n_views(self) -> int:
         """Number of views."""
         return len(self.names)
+
+    @cached_property
+    def equations(self) -> Array:
+        """(V,) equations that each view's points give."""
+        return np.asarray(np.add.reduceat(equations(self.across, len(self.index), self.along), self.first))
+
+    @property
+    def n_equations(self) -> float:
+        """Equations that all points give."""
+        return float(self.equations.sum())
+
+    @property
+    def n_distinct_equations(self) -> float:
+        """Equations that different points give; a point given twice is one."""
+        return float(np.minimum(2 * self.distinct, self.equations).sum())
 
     @property
     def exactly_flat(self) -> NDArray[np.bool_]:
@@ -117,6 +139,7 @@ class Views:
             local=self.local[rows],
             pixels=self.pixels[rows],
             weights=self.weights[rows],
+            across=None if self.across is None else self.across[rows],
             whitening=None if self.whitening is None else self.whitening[rows],
             centre=self.centre[views],
             scale=self.scale[views],
@@ -164,12 +187,13 @@ def arrange(points: Correspondences) -> Views:
         All pixels coincide.
     """
     index, V = points.view_index, points.n_views
-    world, pixels, covariance = points.world, points.pixels, points.covariance
+    world, pixels, covariance, across = points.world, points.pixels, points.covariance, points.across
     order = None
     if np.any(index[1:] < index[:-1]):
         order = np.argsort(index, kind="stable")
         index, world, pixels = index[order], world[order], pixels[order]
         covariance = None if covariance is None else covariance[order]
+        across = None if across is None else across[order]
     counts = np.bincount(index, minlength=V)
     first = np.cumsum(counts) - counts
     centre = np.add.reduceat(world, first) / counts[:, None]
@@ -181,13 +205,13 @@ def arrange(points: Correspondences) -> Views:
     if np.ptp(pixels, axis=0).max() == 0 and len(pixels) > 1:
         raise DegenerateGeometryError(f"{points.source}: all pixels u,v are the same; check the columns")
     basis, extent = _principal_axes(local, counts, first)
-    weights, whitening = noise_model(covariance)
+    weights, whitening = noise_model(covariance, across)
     if weights is None:
         weights = np.ones(len(index))
     return Views(
         points.view_names, order, index, counts, first, _distinct(local, index, V), local,
-        (pixels - pixel_centre) / pixel_scale, weights, whitening, centre, scale, basis, extent,
-        pixel_centre, pixel_scale,
+        (pixels - pixel_centre) / pixel_scale, weights, across, whitening, centre, scale, basis,
+        extent, pixel_centre, pixel_scale,
     )  # fmt: skip
 
 
@@ -215,16 +239,30 @@ def _distinct(local: Array, index: NDArray[np.intp], n_views: int) -> NDArray[np
     return np.bincount(view[fresh], minlength=n_views)
 
 
-def noise_model(covariance: Array | None) -> tuple[Array | None, Array | None]:
-    """Scalar weights (N,) and whitening factors (N, 3), both of mean square 1."""
+def noise_model(
+    covariance: Array | None, across: Array | None = None, along: float = LEAST
+) -> tuple[Array | None, Array | None]:
+    """Scalar weights (N,) of mean 1 and whitening factors (N, 3) of mean square 1 for each equation.
+
+    Parameters
+    ----------
+    covariance : (N, 3) array or None
+        suu, suv, svv; None: all the same.
+    across : (N, 2) array, optional
+        Direction in which each point was measured; see `directions`.
+    along : float
+        Their say in the other direction.
+    """
     if covariance is None:
-        return None, None
-    suu, suv, svv = covariance.T
+        if across is None:
+            return None, None
+        covariance = np.tile([1.0, 0.0, 1.0], (len(across), 1))
+    suu, suv, svv = loosened(covariance, across, along).T
     # Inverse covariance = U^T U with U upper triangular.
     v11 = 1.0 / np.sqrt(svv)
     u00 = 1.0 / np.sqrt(suu - suv**2 / svv)
     u01 = -u00 * suv / svv
     factors = np.column_stack([u00, u01, v11])
-    information = 0.5 * (factors**2).sum(axis=1)
-    mean = information.mean()
-    return information / mean, factors / np.sqrt(mean)
+    of_point, count = (factors**2).sum(axis=1), equations(across, len(factors), along)
+    information = of_point / count
+    return information / information.mean(), factors / np.sqrt(of_point.sum() / count.sum())

@@ -7,7 +7,9 @@ be: all leave residuals that are alike in neighbouring points. Noise does not.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.directions import measured_part, single, unit
 from neurocal_cli.adjustment.pixel_error import CameraState, residuals
 from neurocal_cli.adjustment.views import Views
 from neurocal_cli.geometry import Array
@@ -22,28 +24,49 @@ def correlation(views: Views, errors: Array) -> float:
     ----------
     views : Views
     errors : (N, 2) array
-        Residual of each point, in the order of `views`.
+        Residual of each point, in the order of `views`; what was not measured of it does not count.
 
     Returns
     -------
     float
         0 for noise, to 1 / sqrt(N); 1 for residuals that vary slowly over the image.
     """
+    group, n_groups = views.index, views.n_views
+    if views.across is not None:
+        # Mid-points of edges one way tell nothing of what those of edges the other way say.
+        group, n_groups = 2 * group + _other_way(views, views.across), 2 * n_groups
     # Strips of each view as high as neighbours are apart; along a strip they follow each other.
     low = np.minimum.reduceat(views.pixels, views.first)
     extent = np.maximum.reduceat(views.pixels, views.first) - low
-    strips = np.maximum(np.sqrt(views.counts), 1.0)
-    height = np.maximum(extent[:, 1], 1e-300) / strips
-    strip = np.floor((views.pixels[:, 1] - low[views.index, 1]) / height[views.index])
-    order = np.lexsort((views.pixels[:, 0], strip, views.index))
+    strips = np.maximum(np.sqrt(np.bincount(group, minlength=n_groups)), 1.0)[group]
+    height = np.maximum(extent[:, 1], 1e-300)[views.index] / strips
+    strip = np.floor((views.pixels[:, 1] - low[views.index, 1]) / height)
+    order = np.lexsort((views.pixels[:, 0], strip, group))
     one, two = order[:-1], order[1:]
-    same = (views.index[one] == views.index[two]) & (strip[one] == strip[two])
+    same = (group[one] == group[two]) & (strip[one] == strip[two])
     one, two = one[same], two[same]
-    power = (errors[one] ** 2).sum() + (errors[two] ** 2).sum()
+    errors = _counting(views, errors, np.arange(len(errors)))
+    shared = [_counting(views, errors[k], n) for k, n in ((one, two), (two, one))]
+    power = (shared[0] ** 2).sum() + (shared[1] ** 2).sum()
     return float(2 * (errors[one] * errors[two]).sum() / power) if power > 0 else 0.0
 
 
-def effective_number(n: int, rho: float) -> float:
+def _counting(views: Views, errors: Array, rows: NDArray[np.intp]) -> Array:
+    """What counts of errors where some points were measured."""
+    return measured_part(errors, None if views.across is None else views.across[rows], views.along)
+
+
+def _other_way(views: Views, across: Array) -> NDArray[np.int64]:
+    """0 or 1 for each point: the side of its edge among the two ways that a view's edges run."""
+    nu, nv = unit(across).T
+    # Four times the angle is the same for both ways, so its mean tells how the edges lie.
+    angle = 4 * np.arctan2(nv, nu)
+    c, s = (np.add.reduceat(f(angle) * single(across), views.first) for f in (np.cos, np.sin))
+    lie = (np.arctan2(s, c) / 4)[views.index]
+    return np.asarray(np.abs(nu * np.cos(lie) + nv * np.sin(lie)) > np.sqrt(0.5), dtype=np.int64)
+
+
+def effective_number(n: float, rho: float) -> float:
     """How many independent points n correlated ones are worth, in the plane."""
     rho = min(max(rho, 0.0), 0.99)
     return max(n * ((1 - rho) / (1 + rho)) ** 2, 1.0)

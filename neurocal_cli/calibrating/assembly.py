@@ -109,7 +109,7 @@ class _Assembly:
         views, known, solution = self.views, self.known, self.solution
         refined = solution.refined
         cov = covariance(
-            refined.normal, known.free_camera, known.free_poses, 2 * len(views.index), solution.shared
+            refined.normal, known.free_camera, known.free_poses, views.n_equations, solution.shared
         )
         refuse_undetermined(views, known, refined.state, cov)
         A = known.matrix(refined.state.entries[0], views)

@@ -15,11 +15,12 @@ good data is the same with and without this. Otherwise
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.directions import single, unit, variance_across
 from neurocal_cli.adjustment.noise import with_common_share
 from neurocal_cli.adjustment.odd_views import find_odd_view
 from neurocal_cli.adjustment.views import arrange
@@ -39,7 +40,7 @@ _WORST_VIEW = 3.0  # standard deviations of a view, in those of all: more does n
 _ENOUGH = 12  # points of a view that tell its standard deviation
 _PASSES = 12
 _MAJORITY = 0.5  # share of the points that must be left
-_LENGTH = 1.1774  # median length of two normal errors
+_LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 
 
 def fit_robustly(points: Correspondences, fitter: Fitter) -> tuple[Fit, Rejected]:
@@ -165,8 +166,8 @@ class _Search:
             known.add(state)
 
     def _explained(self) -> NDArray[np.bool_]:
-        error, index = _errors(self.fit, self.points), self.points.view_index
-        near = error < _limits(error, self.kept, self.points)[index]
+        errors, index = _errors(self.fit, self.points), self.points.view_index
+        near = errors.length < _limits(errors, self.kept, self.points)[index]
         share = np.bincount(index, near, self.points.n_views) / np.bincount(index)
         for view in np.flatnonzero(share <= _MAJORITY):
             name = self.points.view_names[view]
@@ -175,7 +176,7 @@ class _Search:
 
     def rejected(self) -> Rejected:
         """What was set aside."""
-        error = _errors(self.fit, self.points)
+        error = _errors(self.fit, self.points).length
         rows = np.flatnonzero(~self.kept)
         if not rows.size:
             return Rejected(views=dict(self.wrong_views))
@@ -183,46 +184,86 @@ class _Search:
         return Rejected(self.points.select(rows), known, dict(self.wrong_views))
 
 
-def _errors(fit: Fit, points: Correspondences) -> Array:
-    """(N,) length of each point's error [px], weighted; infinite where the fit does not see the point.
+@dataclass(frozen=True, eq=False)
+class _Errors:
+    """Errors of all points [px], weighted; infinite where the fit does not see the point.
 
     It sees none behind the camera, and none of views that it leaves out.
+
+    Attributes
+    ----------
+    length : (N,) array
+    parts : (N, 2) array
+        Two independent errors of a common standard deviation each. Of points that were measured across
+        an edge, the errors across and along it: the latter may be far smaller, but not larger.
     """
+
+    length: Array
+    parts: Array
+
+    def sigma(self, rows: NDArray[np.intp]) -> float:
+        """Standard deviation that the median error of some points tells."""
+        return float(np.median(self.parts[rows], axis=0).max()) / _ONE
+
+
+def _errors(fit: Fit, points: Correspondences) -> _Errors:
     seen = fit.seen
     place = {name: k for k, name in enumerate(fit.job.views.names)}
     view = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
     predicted, in_front = seen.predict(points.world, np.maximum(view, 0))
-    error = _lengths(predicted - points.pixels, points, fit.share)
-    return np.where(in_front & (view >= 0) & np.isfinite(error), error, np.inf)
+    residuals = predicted - points.pixels
+    length = _lengths(residuals, points, fit.share)
+    length = np.where(in_front & (view >= 0) & np.isfinite(length), length, np.inf)
+    return _Errors(length, _parts(length, residuals, points.across))
 
 
 def _lengths(residuals: Array, points: Correspondences, share: float) -> Array:
-    """Lengths of residuals (N, 2) [px], whitened where the points have covariances, on average unchanged."""
+    """Lengths of residuals (N, 2) [px], whitened where the points have covariances, on average unchanged.
+
+    Along an edge the camera may miss a mid-point by as much as across it: what is wrong shows in both.
+    """
     if points.covariance is None:
         return np.hypot(residuals[:, 0], residuals[:, 1])
-    suu, suv, svv = with_common_share(points.covariance, share).T
+    stated, across = with_common_share(points.covariance, share, points.across), points.across
+    if across is not None:
+        variance = variance_across(stated, across)[:, None]
+        stated = np.where(single(across)[:, None], variance * np.array([1.0, 0.0, 1.0]), stated)
+    suu, suv, svv = stated.T
     du, dv = residuals.T
     squared = (svv * du * du - 2 * suv * du * dv + suu * dv * dv) / (suu * svv - suv * suv)
     information = 0.5 * (suu + svv) / (suu * svv - suv * suv)
     return np.sqrt(squared / information.mean())
 
 
-def _limits(error: Array, kept: NDArray[np.bool_], points: Correspondences) -> Array:
+def _parts(length: Array, residuals: Array, across: Array | None) -> Array:
+    """Two independent errors of each point, of the same standard deviation; see `_Errors`."""
+    alike = np.repeat(length[:, None] * (_ONE / _LENGTH), 2, axis=1)
+    if across is None:
+        return alike
+    known = np.isfinite(length) & single(across)
+    residuals, n = np.where(known[:, None], residuals, 0.0), unit(across)
+    own = np.stack([(residuals * n).sum(axis=1), (residuals * n[:, ::-1] * [-1, 1]).sum(axis=1)], axis=1)
+    share = np.abs(own) / np.maximum(np.hypot(*residuals.T), 1e-300)[:, None]
+    return np.where(known[:, None], share * np.where(known, length, 0.0)[:, None], alike)
+
+
+def _limits(errors: _Errors, kept: NDArray[np.bool_], points: Correspondences) -> Array:
     """(V,) length of error that no point of so many normal ones should exceed.
 
     A view that is blurred has larger errors than others throughout, which is no fault of its points.
     """
     spread = np.sqrt(points.pixels.var(axis=0).sum())
-    overall = float(np.median(error[kept])) / _LENGTH
+    rows = np.flatnonzero(kept)
+    overall = errors.sigma(rows)
     by_view = np.full(points.n_views, overall)
-    index = points.view_index[kept]
+    index = points.view_index[rows]
     counts = np.bincount(index, minlength=points.n_views)
-    pieces = np.split(error[kept][np.argsort(index, kind="stable")], np.cumsum(counts)[:-1])
+    pieces = np.split(rows[np.argsort(index, kind="stable")], np.cumsum(counts)[:-1])
     for view, piece in enumerate(pieces):
         if len(piece) >= _ENOUGH:
-            by_view[view] = np.median(piece) / _LENGTH
+            by_view[view] = errors.sigma(piece)
     sigma = np.clip(by_view, overall, _WORST_VIEW * overall) + _FLOOR * spread
-    return np.asarray(sigma * np.sqrt(2 * np.log(len(error) / _CHANCE)))
+    return np.asarray(sigma * np.sqrt(2 * np.log(len(errors.length) / _CHANCE)))
 
 
 def _suspicious(fit: Fit) -> bool:
@@ -230,11 +271,12 @@ def _suspicious(fit: Fit) -> bool:
     if fit.refusal:
         return True
     points = fit.points
-    error = _errors(fit, points)
+    errors = _errors(fit, points)
+    error = errors.length
     if not np.isfinite(error).all():
         return True
     everything = np.ones(len(points), dtype=bool)
-    if (error >= _limits(error, everything, points)[points.view_index]).any():
+    if (error >= _limits(errors, everything, points)[points.view_index]).any():
         return True
     spread = np.sqrt(points.pixels.var(axis=0).sum())
     if np.sqrt((error**2).mean()) > _ROUGH * spread:

@@ -77,6 +77,9 @@ class Detection:
     pixels : (N, 2) array [px]
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
+    across : (N, 2) array or None
+        Direction in which each point was measured by itself: of mid-points across the edge, None for
+        vertices.
     image_size : (width, height) [px]
     located : tuple of Located
         The grids that were found on the board.
@@ -89,6 +92,7 @@ class Detection:
     world: Array
     pixels: Array
     covariance: Array
+    across: Array | None
     image_size: tuple[int, int]
     located: tuple[Located, ...]
     measured: tuple[Measured, ...]
@@ -142,6 +146,7 @@ def detect_points(
         joined(one.world for one in labels),
         joined(one.pixels for one in measured),
         joined(one.covariance for one in measured),
+        None if points == "vertices" else joined(_directions(one) for one in measured),
         (image.shape[1], image.shape[0]),
         located,
         measured,
@@ -156,6 +161,11 @@ def _check_enough(measured: Iterable[Measured]) -> None:
         raise NoBoardError(f"only {share} of the board can be measured; show it sharper or nearer")
 
 
+def _directions(measured: Measured) -> Array:
+    """Across each edge, (N, 2); to a millionth, which is more than is known of them."""
+    return np.zeros((0, 2)) if measured.across is None else np.round(measured.across, 6) + 0.0
+
+
 def _sound(measured: Measured) -> Measured:
     """Without points whose place or covariance is no number to calibrate with."""
     suu, suv, svv = measured.covariance.T
@@ -165,6 +175,8 @@ def _sound(measured: Measured) -> Measured:
     if good.all():
         return measured
     parts = {name: getattr(measured, name)[good] for name in ("kind", "index", "pixels", "covariance")}
+    if measured.across is not None:
+        parts["across"] = measured.across[good]
     return replace(measured, **parts, rejected=measured.rejected + int((~good).sum()))
 
 
@@ -218,6 +230,16 @@ def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Corresponde
         image_size=found[0].image_size,
         point=np.array([name for one in found for name in one.ids]),
         covariance=np.concatenate([one.covariance for one in found]),
+        across=_all_directions(found),
         unit=unit,
         source="detected points",
+    )
+
+
+def _all_directions(found: list[Detection]) -> Array | None:
+    """Of the points of all images; (0, 0) for vertices."""
+    if all(one.across is None for one in found):
+        return None
+    return np.concatenate(
+        [np.zeros((len(one.ids), 2)) if one.across is None else one.across for one in found]
     )

@@ -61,6 +61,8 @@ class Measured:
     pixels : (N, 2) array [px]
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
+    across : (N, 2) array or None
+        Unit vector across each mid-point's edge, in which it was measured by itself; None for vertices.
     vertices : (rows, cols, 2) array [px]
         The grid's vertices after refinement, nan where not seen or not fitted.
     rejected : int
@@ -74,6 +76,7 @@ class Measured:
     index: NDArray[np.int64]
     pixels: Array
     covariance: Array
+    across: Array | None
     vertices: Array
     rejected: int
     polarity: float

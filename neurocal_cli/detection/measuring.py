@@ -73,6 +73,7 @@ def measure(
         index=board.edges.index[good],
         pixels=pixels[good],
         covariance=covariance[good],
+        across=fitted.lines.normal[good],
         vertices=vertices,
         rejected=int((~good).sum()),
         polarity=_polarity(fitted),
@@ -83,7 +84,7 @@ def _nothing(grid: Grid) -> Measured:
     none = np.zeros(0)
     index = np.zeros((0, 2), dtype=np.int64)
     vertices = np.full(grid.pixels.shape, np.nan)
-    return Measured(index[:, 0], index, none.reshape(0, 2), none.reshape(0, 3), vertices, 0, 0.0)
+    return Measured(index[:, 0], index, none.reshape(0, 2), none.reshape(0, 3), None, vertices, 0, 0.0)
 
 
 def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
@@ -139,6 +140,7 @@ def _vertices(board: Board, fitted: Fitted, vertices: Array) -> Measured:
         index=index[good].astype(np.int64),
         pixels=pixels[good],
         covariance=covariance[good],
+        across=None,
         vertices=vertices,
         rejected=int((~good).sum()),
         polarity=_polarity(fitted),

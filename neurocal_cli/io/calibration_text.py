@@ -171,6 +171,9 @@ def _observation_lines(points: Correspondences) -> Iterator[str]:
     if points.covariance is not None:
         columns += ["suu", "suv", "svv"]
         blocks.append(points.covariance)
+    if points.across is not None:
+        columns += ["nu", "nv"]
+        blocks.append(points.across)
     yield "  observations:"
     yield f"    columns: [{', '.join(columns)}]"
     yield "    rows:" if heads else "    rows: []"

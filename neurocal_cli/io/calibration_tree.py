@@ -27,6 +27,7 @@ __all__ = [
 
 _NUMBER_COLUMNS = ("X", "Y", "Z", "u", "v")
 _COVARIANCE_COLUMNS = ("suu", "suv", "svv")
+_ACROSS_COLUMNS = ("nu", "nv")
 
 # camera_matrix repeats the parameters for ROS; a difference beyond rounding means an edit of one.
 _SAME = 1e-6
@@ -260,6 +261,7 @@ def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspon
         )
     center = block.get("image_center")
     has_covariance = all(name in columns for name in _COVARIANCE_COLUMNS)
+    has_across = all(name in columns for name in _ACROSS_COLUMNS)
     try:
         return Correspondences(
             numbers[:, :3],
@@ -267,6 +269,7 @@ def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspon
             view=labels.get("view"),
             point=labels.get("point"),
             covariance=_numbers(observations, columns, _COVARIANCE_COLUMNS) if has_covariance else None,
+            across=_numbers(observations, columns, _ACROSS_COLUMNS) if has_across else None,
             image_size=_image_size(root),
             image_center=None if center is None else tuple(center.array(2).tolist()),
             unit=block["unit"].text() if "unit" in block else "mm",

@@ -11,7 +11,7 @@ import numpy as np
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.files import write_whole
-from neurocal_cli.io.points_join import COVARIANCE, SETTINGS, correspondences
+from neurocal_cli.io.points_join import ACROSS, COVARIANCE, SETTINGS, correspondences
 from neurocal_cli.io.table import Schema, read_table
 from neurocal_cli.points import Correspondences
 
@@ -20,7 +20,7 @@ __all__ = ["POINTS", "format_points", "read_points", "write_points"]
 POINTS = Schema(
     kind="points",
     required=("X", "Y", "Z", "u", "v"),
-    optional=("view", "point", "sigma", *COVARIANCE, *SETTINGS),
+    optional=("view", "point", "sigma", *COVARIANCE, *ACROSS, *SETTINGS),
     labels=frozenset({"view", "point"}),
     headerless=("X", "Y", "Z", "u", "v"),
 )
@@ -78,6 +78,9 @@ def format_points(points: Correspondences) -> str:
     if points.covariance is not None:
         blocks.append(points.covariance)
         names += COVARIANCE
+    if points.across is not None:
+        blocks.append(points.across)
+        names += ACROSS
     numbers = json.dumps(np.hstack(blocks).tolist(), separators=(",", ":"))[2:-2].split("],[")
     rows = map(",".join, zip(*labels.values(), numbers, strict=True)) if labels else numbers
     return "\n".join([*_metadata_lines(points), ",".join(names), *rows, ""])

@@ -13,9 +13,10 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.table import Table
 from neurocal_cli.points import Correspondences
 
-__all__ = ["COVARIANCE", "SETTINGS", "correspondences"]
+__all__ = ["ACROSS", "COVARIANCE", "SETTINGS", "correspondences"]
 
 COVARIANCE = ("suu", "suv", "svv")
+ACROSS = ("nu", "nv")
 SETTINGS = ("zoom", "focus")
 
 
@@ -46,6 +47,7 @@ def _single(table: Table) -> Correspondences:
         view=table.labels.get("view"),
         point=_distinct(table),
         covariance=_covariance(table),
+        across=_across(table),
         image_size=table.metadata.image_size,
         image_center=table.metadata.image_center,
         unit=table.metadata.unit or "mm",
@@ -71,6 +73,7 @@ def _joined(tables: list[Table], notes: list[str]) -> Correspondences:
         view=np.concatenate(views),
         point=points,
         covariance=_joined_covariance(tables),
+        across=_joined_across(tables),
         image_size=_agreed("image_size", tables),
         image_center=_agreed("image_center", tables),
         unit=_agreed("unit", tables) or "mm",
@@ -182,6 +185,21 @@ def _joined_covariance(tables: list[Table]) -> Array | None:
         without = next(table.source for table, block in zip(tables, blocks, strict=True) if block is None)
         raise FormatError("has no sigma (or suu,suv,svv) as other files do; give it in all or none", without)
     return np.vstack(present) if present else None
+
+
+def _across(table: Table) -> Array | None:
+    """(N, 2) direction in which each point was measured, if there."""
+    given = [name for name in ACROSS if name in table.numbers]
+    if given and len(given) < len(ACROSS):
+        raise FormatError(f"has {given[0]} only; give both nu,nv", table.source)
+    return table.stack(ACROSS) if given else None
+
+
+def _joined_across(tables: list[Table]) -> Array | None:
+    blocks = [_across(table) for table in tables]
+    if all(block is None for block in blocks):
+        return None
+    return np.vstack([np.zeros((len(t), 2)) if b is None else b for t, b in zip(tables, blocks, strict=True)])
 
 
 def _distinct(table: Table) -> NDArray[Any] | None:

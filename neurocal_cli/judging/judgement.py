@@ -13,19 +13,16 @@ Everything follows from the calibration and its points, so a file can be judged 
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from neurocal_cli.adjustment.leave_out import disagreement, held_out
-from neurocal_cli.adjustment.noise import common_share, measured, with_common_share
 from neurocal_cli.adjustment.odd_views import free_networks, seen_from_behind
 from neurocal_cli.adjustment.pixel_error import ENTRIES
 from neurocal_cli.adjustment.problems import Known
 from neurocal_cli.adjustment.refine import refine
+from neurocal_cli.adjustment.reweighting import weighed
 from neurocal_cli.adjustment.uncertainty import covariance
 from neurocal_cli.adjustment.user_units import Seen, normalised
-from neurocal_cli.adjustment.views import Views, arrange, noise_model
 from neurocal_cli.adjustment.whiteness import correlation, of_points
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.judging.coverage import cover
@@ -38,7 +35,6 @@ from neurocal_cli.judging.projection_uncertainty import (
 from neurocal_cli.judging.repetition import repeated_views, scaled_views
 from neurocal_cli.judging.verdict import Verdict, pronounce
 from neurocal_cli.lens import Lens, coefficient_names
-from neurocal_cli.points import Correspondences
 
 __all__ = ["judge", "judged"]
 
@@ -77,7 +73,9 @@ class _Court:
             np.stack([view.pose.R for view in views]),
             np.stack([view.pose.t for view in views]),
         )
-        self.views, self.known = _weighed(self.points, self.seen), _known(calibration)
+        predicted, _ = self.seen.predict(self.points.world, self.points.view_index)
+        self.views = weighed(self.points, self.points.pixels - predicted)
+        self.known = _known(calibration)
         self.free = self.known.free_camera
         self.free_poses = not all(view.fixed for view in views)
         state = normalised(self.seen, self.views)
@@ -85,12 +83,12 @@ class _Court:
         self.state, self.normal = refined.state, refined.normal
         self.cost = float(self.normal[:, -1, -1].sum())
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
-        self.spare = max(2 * len(self.points) - self.unknowns, 1)
+        self.spare = max(self.views.n_equations - self.unknowns, 1)
 
     def evidence(self) -> Evidence:
         views, free, poses = self.views, self.free, self.free_poses
         errors = of_points(views, self.state)
-        cov = covariance(self.normal, free, poses, 2 * len(self.points))
+        cov = covariance(self.normal, free, poses, views.n_equations)
         precision, contradiction = self._precision()
         return Evidence(
             rmse_px=self.calibration.rmse_px,
@@ -113,7 +111,7 @@ class _Court:
 
     def _precision(self) -> tuple[float, float]:
         freedom = np.where(self.views.nearly_flat, 8, 11)
-        own_spare = 2 * len(self.points) - int(freedom.sum())
+        own_spare = self.views.n_equations - int(freedom.sum())
         if own_spare <= 0 or freedom.sum() <= self.unknowns:
             return np.nan, np.nan
         own = float(free_networks(self.views, self.state).sum()) / own_spare
@@ -143,18 +141,6 @@ class _Court:
             self.views, self.state, self.seen, self.normal, self.free, self.free_poses,
             self.cost / self.spare, image_grid(self.points.image_size), depths,
         )  # fmt: skip
-
-
-def _weighed(points: Correspondences, seen: Seen) -> Views:
-    """Arranged, and weighed as when they were calibrated; see `reweighting`."""
-    views = arrange(points)
-    if points.covariance is None or not measured(points.covariance):
-        return views
-    order = slice(None) if views.order is None else views.order
-    stated = points.covariance[order]
-    predicted, _ = seen.predict(points.world, points.view_index)
-    share = common_share(stated, (points.pixels - predicted)[order])
-    return replace(views, whitening=noise_model(with_common_share(stated, share))[1])
 
 
 def _known(calibration: Calibration) -> Known:

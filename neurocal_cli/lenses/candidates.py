@@ -97,7 +97,7 @@ def supported(known: Known, model: str, views: Views) -> Known | None:
     # Coefficients that stay as they are belong to another model.
     fixed = known.fixed & set(INTRINSIC_NAMES)
     with_lens = replace(known, lens=Lens(model), free_lens=model != "none", fixed=fixed)
-    equations = 2 * int(views.distinct.sum())
+    equations = views.n_distinct_equations
     if model != "none" and equations < _SPARE * parameter_count(with_lens, views.n_views) + 4:
         return None
     return with_lens
@@ -214,7 +214,7 @@ class _Bench:
             if state.lens != "none":
                 return None
             lost = np.full_like(lost, np.inf)
-        cov = covariance(refined.normal, known.free_camera, known.free_poses, 2 * len(views.index))
+        cov = covariance(refined.normal, known.free_camera, known.free_poses, views.n_equations)
         noise = _noise(known, state, self.reach, cov.entries)
         folds = folds_back(Lens(state.lens, state.k), known.matrix(state.entries[0], views), self.points)
         determined = _determined(views, known, state, cov)
@@ -243,7 +243,7 @@ def worth(views: Views, fitted: Collection[Candidate]) -> float:
     if not fitted:
         return 1.0
     closest = min(fitted, key=lambda candidate: candidate.cost).refined.state
-    return 2 * effective_number(len(views.index), correlation(views, of_points(views, closest)))
+    return effective_number(views.n_equations, correlation(views, of_points(views, closest)))
 
 
 def _determined(views: Views, known: Known, state: CameraState, cov: Covariance) -> bool:

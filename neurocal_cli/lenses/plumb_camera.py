@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from neurocal_cli.adjustment.directions import rounded
 from neurocal_cli.adjustment.job import Job, Solution
 from neurocal_cli.adjustment.pixel_error import POSE, CameraState, camera_columns, derivatives, normal_blocks
 from neurocal_cli.adjustment.refine import Refined
@@ -77,10 +78,11 @@ def lens_and_camera(
     views = job.views
     order = slice(None) if views.order is None else views.order
     seen = replace(views, pixels=(points.pixels[order] - views.pixel_centre) / views.pixel_scale)
-    whitening = views.whitening
-    if whitening is not None and views.order is not None:
-        whitening = np.empty_like(whitening)
-        whitening[views.order] = views.whitening
+    weighed = whitening = views.whitening
+    if weighed is not None:
+        rows = np.arange(len(points)) if views.order is None else views.order
+        whitening = np.empty_like(weighed)
+        whitening[rows] = rounded(weighed, views.across)
     lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
     start = solution.refined.state
     start = replace(start, lens=MODEL, k=_same_lens(start.entries[0], seen.pixels, views.pixels))
@@ -219,7 +221,7 @@ class _Together:
         taken = float(np.trace(_solve(by_k.T @ by_k, M)))
         of_lines = float(r @ r) / max(len(r) - 2 * len(lines) - taken, 1.0)
         unknowns = n + _K + (6 * self.job.views.n_views if known.free_poses else 0)
-        of_points = float(refined.cost.sum()) / max(2 * len(self.job.views.index) - unknowns, 1)
+        of_points = float(refined.cost.sum()) / max(self.job.views.n_equations - unknowns, 1)
         noise = np.zeros_like(B)
         noise[:n, :n], noise[n:, n:] = of_points * points.square, of_lines * M
         return _solve(B, _solve(B, noise).T)

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.directions import rounded
 from neurocal_cli.adjustment.views import noise_model
 from neurocal_cli.calibration import StraightLines
 from neurocal_cli.errors import DegenerateGeometryError
@@ -122,7 +123,9 @@ def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> Plum
         )
     middle, scale = _frame(points)
     start = (np.asarray(centre) - middle) / scale if centre is not None else np.zeros(2)
-    seen = lines_in_pixels(points, lines, middle, scale, noise_model(points.covariance)[1])
+    whitening = noise_model(points.covariance, points.across)[1]
+    whitening = None if whitening is None else rounded(whitening, points.across)
+    seen = lines_in_pixels(points, lines, middle, scale, whitening)
     curves = bent_lines(seen, np.array([1.0, 0.0, 1.0, *start]), Lens(_MODEL))
     free = _COEFFICIENTS if centre is not None else _CENTRE + _COEFFICIENTS
     spare = equations - len(free)

@@ -12,16 +12,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.adjustment.directions import unit
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
 __all__ = ["FEWEST_ON_LINE", "LinesSeen", "find_lines"]
 
 FEWEST_ON_LINE = 4
+_FEWEST_OF_EDGES = 3  # of points that are seen across their edges, for which only lines along these count
 
 # Points off a line by this share of the target's size are on it: 2 micrometres of a 200 mm board.
 _TOLERANCE = 1e-5
 _LINES_A_POINT = 4  # rows, columns and diagonals of a board
+_OF_EDGES = 8  # and more where only those along the edges count
+_ALONG = 0.25  # sine of the angle between an edge and a line that it lies on
 _ALL_PAIRS = 700  # points of a target whose pairs are all looked at
 _MOST_PAIRS = 500_000  # of larger targets: pairs of some points with all others
 _MOST_PLACES = 200_000  # places on lines; more tell nothing that these do not
@@ -59,12 +63,16 @@ class LinesSeen:
 
 
 def find_lines(points: Correspondences) -> LinesSeen:
-    """Find the lines of at least `FEWEST_ON_LINE` known points in each view.
+    """Find the lines of at least `FEWEST_ON_LINE` known points in each view, or of three along edges.
 
-    Each point is used on the four longest lines through it, so rows, columns and diagonals of a board.
+    Each point is used on the four longest lines through it, so rows, columns and diagonals of a board;
+    one that was measured across an edge, on lines along that edge.
     """
     ids, target = _distinct(points.world)
-    line, member = _longest(*_lines_of(target), len(target))
+    fewest, most = FEWEST_ON_LINE, _LINES_A_POINT
+    if points.across is not None:
+        fewest, most = _FEWEST_OF_EDGES, _OF_EDGES
+    line, member = _longest(*_lines_of(target, fewest), len(target), most)
     # Each line in each view: join the rows with the lines through their points.
     order = np.argsort(member, kind="stable")
     line, through = line[order], np.bincount(member, minlength=len(target))
@@ -76,7 +84,26 @@ def find_lines(points: Correspondences) -> LinesSeen:
     label = label * points.n_views + points.view_index[row]
     order = np.argsort(label, kind="stable")
     row, first = row[order], _run_starts(label[order])
-    return _thinned(*_enough(row, first))
+    return _thinned(*_along_edges(points, *_enough(row, first, fewest)))
+
+
+def _along_edges(points: Correspondences, row: Index, first: Index) -> tuple[Index, Index]:
+    """Drop lines that points were not measured across: where along its edge one lies is not its own word."""
+    if points.across is None or not first.size:
+        return row, first
+    counts = np.diff(first, append=len(row))
+    pixels, line = points.pixels, np.repeat(np.arange(len(first)), counts)
+    chord = pixels[row[first + counts - 1]] - pixels[row[first]]
+    order = np.lexsort(((pixels[row] * chord[line]).sum(axis=1), line))
+    row = row[order]
+    # The line runs from the place before each to the one after it: a lens may bend it much in all.
+    place = np.arange(len(row))
+    before = np.maximum(place - 1, first[line])
+    after = np.minimum(place + 1, (first + counts - 1)[line])
+    n = unit(points.across)[row]
+    slant = np.abs((n * unit(pixels[row[after]] - pixels[row[before]])).sum(axis=1))
+    keep = ~np.logical_or.reduceat(slant > _ALONG, first)
+    return row[np.repeat(keep, counts)], np.cumsum(counts[keep]) - counts[keep]
 
 
 def _run_starts(sorted_labels: NDArray[np.int64]) -> Index:
@@ -85,10 +112,10 @@ def _run_starts(sorted_labels: NDArray[np.int64]) -> Index:
     return np.flatnonzero(np.concatenate([[True], sorted_labels[1:] != sorted_labels[:-1]]))
 
 
-def _enough(row: Index, first: Index) -> tuple[Index, Index]:
+def _enough(row: Index, first: Index, fewest: int) -> tuple[Index, Index]:
     """Drop lines with too few points."""
     counts = np.diff(first, append=len(row))
-    keep = counts >= FEWEST_ON_LINE
+    keep = counts >= fewest
     kept = counts[keep]
     return row[np.repeat(keep, counts)], np.cumsum(kept) - kept
 
@@ -122,20 +149,21 @@ def _clusters(values: Array, gap: float) -> Index:
     return labels
 
 
-def _lines_of(target: Array) -> tuple[Index, Index]:
+def _lines_of(target: Array, fewest: int) -> tuple[Index, Index]:
     """Line and point of each place on the lines of a target."""
     n = len(target)
     if n <= _ALL_PAIRS:
         a, b = np.triu_indices(n, 1)
-        line, member, _ = _through_pairs(target, a, b)
+        line, member, _ = _through_pairs(target, a, b, fewest)
         return line, member
     anchors = np.linspace(0, n - 1, int(np.clip(_MOST_PAIRS // n, 4, 64))).astype(np.intp)
     a, b = np.repeat(anchors, n), np.tile(np.arange(n), len(anchors))
-    line, member, directions = _through_pairs(target, a[a != b], b[a != b])
-    return _parallels(target, _commonest(directions, np.bincount(line), int(np.clip(10**7 // n, 6, 24))))
+    line, member, directions = _through_pairs(target, a[a != b], b[a != b], fewest)
+    common = _commonest(directions, np.bincount(line), int(np.clip(10**7 // n, 6, 24)))
+    return _parallels(target, common, fewest)
 
 
-def _through_pairs(target: Array, a: Index, b: Index) -> tuple[Index, Index, Array]:
+def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Index, Index, Array]:
     """Lines on which some pairs of points agree: line and point of each place, direction of each line."""
     along = target[b] - target[a]
     along /= np.linalg.norm(along, axis=1)[:, None]
@@ -146,11 +174,11 @@ def _through_pairs(target: Array, a: Index, b: Index) -> tuple[Index, Index, Arr
     # Gaps in the offset count only among pairs of one direction.
     labels = _clusters(4.0 * by_direction + place, _TOLERANCE)
     counts = np.bincount(labels)
-    common = counts[labels] >= FEWEST_ON_LINE - 1
+    common = counts[labels] >= fewest - 1
     labels, a, b, along = labels[common], a[common], b[common], along[common]
     key = np.unique(np.concatenate([labels, labels]) * len(target) + np.concatenate([a, b]))
     line, member = np.divmod(key, len(target))
-    return _checked(line, member, target, labels, along)
+    return _checked(line, member, target, labels, along, fewest)
 
 
 def _sign(along: Array) -> Array:
@@ -162,7 +190,7 @@ def _sign(along: Array) -> Array:
 
 
 def _checked(
-    line: Index, member: Index, target: Array, labels: Index, along: Array
+    line: Index, member: Index, target: Array, labels: Index, along: Array, fewest: int
 ) -> tuple[Index, Index, Array]:
     """Keep the lines with enough points, if these are indeed collinear; number them anew."""
     names, first, counts = np.unique(line, return_index=True, return_counts=True)
@@ -173,7 +201,7 @@ def _checked(
     off = target[member] - start[index]
     off -= (off * direction[index]).sum(axis=1)[:, None] * direction[index]
     astray = np.linalg.norm(off, axis=1) > 3 * _TOLERANCE
-    good = (counts >= FEWEST_ON_LINE) & (np.bincount(index, astray, len(names)) == 0)
+    good = (counts >= fewest) & (np.bincount(index, astray, len(names)) == 0)
     number = np.cumsum(good) - 1
     keep = good[index]
     return number[index[keep]], member[keep], direction[good]
@@ -187,7 +215,7 @@ def _commonest(directions: Array, members: Index, most: int) -> Array:
     return directions[first[np.argsort(-weight, kind="stable")[:most]]]
 
 
-def _parallels(target: Array, directions: Array) -> tuple[Index, Index]:
+def _parallels(target: Array, directions: Array, fewest: int) -> tuple[Index, Index]:
     """All lines along some directions."""
     lines, members, total = [], [], 0
     for direction in directions:
@@ -195,7 +223,7 @@ def _parallels(target: Array, directions: Array) -> tuple[Index, Index]:
         labels = _clusters(offset @ np.array([0.7321, 0.2361, 0.6458]), _TOLERANCE)
         order = np.argsort(labels, kind="stable")
         along = np.broadcast_to(direction, (len(target), 3))
-        line, member, kept = _checked(labels[order], order, target, labels, along)
+        line, member, kept = _checked(labels[order], order, target, labels, along, fewest)
         lines.append(line + total)
         members.append(member)
         total += len(kept)
@@ -203,8 +231,8 @@ def _parallels(target: Array, directions: Array) -> tuple[Index, Index]:
     return np.concatenate([none, *lines]), np.concatenate([none, *members])
 
 
-def _longest(line: Index, member: Index, n: int) -> tuple[Index, Index]:
-    """Keep the lines that are among the four with the most points for at least half of their points."""
+def _longest(line: Index, member: Index, n: int, most: int) -> tuple[Index, Index]:
+    """Keep the lines that are among those `most` with the most points for at least half of their points."""
     if not line.size:
         return line, member
     counts = np.bincount(line)
@@ -212,5 +240,5 @@ def _longest(line: Index, member: Index, n: int) -> tuple[Index, Index]:
     through = np.bincount(member, minlength=n)
     rank = np.empty(len(line), dtype=np.intp)
     rank[order] = np.arange(len(line)) - np.repeat(np.cumsum(through) - through, through)
-    chosen = np.bincount(line, rank < _LINES_A_POINT) >= 0.5 * counts
+    chosen = np.bincount(line, rank < most) >= 0.5 * counts
     return line[chosen[line]], member[chosen[line]]

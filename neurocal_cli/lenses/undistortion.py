@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from neurocal_cli.adjustment.directions import unit
 from neurocal_cli.adjustment.problems import KnownCamera
 from neurocal_cli.camera import Intrinsics
 from neurocal_cli.errors import InputError
@@ -56,13 +57,24 @@ class Undistortion:
 
         To first order, ``C' = M C M^T`` with M the derivative of the corrected pixel by the seen one.
         """
+        M = np.linalg.inv(self._seen_by_corrected(corrected))
+        C = covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+        return (M @ C @ np.swapaxes(M, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
+
+    def across(self, corrected: Array, across: Array) -> Array:
+        """Directions (N, 2) in which corrected pixels are measured, from those of the pixels as seen.
+
+        What is known of a pixel m is n . m, and so of the corrected one n^T M^-1 m'.
+        """
+        n = (across[:, None, :] @ self._seen_by_corrected(corrected))[:, 0]
+        return unit(n)
+
+    def _seen_by_corrected(self, corrected: Array) -> Array:
+        """(N, 2, 2) derivative of the pixels as seen by the corrected ones."""
         x, y = _normalised(self.new.A, corrected)
         _, (xx, xy, yx, yy), _ = bend(self.lens.model, self.lens.coefficients, x, y)
         bent = np.stack([np.broadcast_to(e, x.shape) for e in (xx, xy, yx, yy)], axis=-1).reshape(-1, 2, 2)
-        seen_by_corrected = self.A[:2, :2] @ bent @ np.linalg.inv(self.new.A[:2, :2])
-        M = np.linalg.inv(seen_by_corrected)
-        C = covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
-        return (M @ C @ np.swapaxes(M, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
+        return np.asarray(self.A[:2, :2] @ bent @ np.linalg.inv(self.new.A[:2, :2]))
 
     def sources(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Where pixels (u, v) of a corrected image come from; ``nan`` beyond the lens's fold.
@@ -226,6 +238,8 @@ def undistort_points(
     points = replace(points, pixels=corrected)
     if points.covariance is not None:
         points = replace(points, covariance=step.covariance(corrected, points.covariance))
+    if points.across is not None:
+        points = replace(points, across=step.across(corrected, points.across))
     if points.image_center is not None:
         u0, v0 = step.points(np.array([points.image_center]))[0].tolist()
         points = replace(points, image_center=(u0, v0) if np.isfinite(u0 + v0) else None)

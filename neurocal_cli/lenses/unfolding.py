@@ -139,8 +139,8 @@ def unfolded(
     refined, restraint
         None when the data contradict every such lens.
     """
-    cost, n = float(found.cost.sum()), len(views.index)
-    effective = 2 * effective_number(n, correlation(views, of_points(views, found.state)))
+    cost = float(found.cost.sum())
+    effective = effective_number(views.n_equations, correlation(views, of_points(views, found.state)))
     most = cost * (1 + max(2 * _TIE, _CHANCE / effective))
     for asked in _LEAST:
         result = _with_slope(views, known, found, points, most, asked)
@@ -159,7 +159,7 @@ def _with_slope(
 ) -> tuple[Refined, Unfolded] | None:
     """The best lens with some slope as far as the corners; None when it costs more than `most`."""
     least, beyond, guess = asked
-    weight = float(np.sqrt(found.cost.sum() / (2 * len(views.index)))) / _SLACK
+    weight = float(np.sqrt(found.cost.sum() / views.n_equations)) / _SLACK
     corner = beyond * _farthest(views, known, found.state, points)
     refined, last = found, min(_fold(found.state), corner)
     last += max(corner - _bent(found.state, last), 0.0) / guess

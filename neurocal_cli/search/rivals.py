@@ -45,7 +45,7 @@ def reaches_bound(job: Job, refined: Refined, groups: Sequence[Group]) -> bool:
     bound = sum(float(g.bound.sum()) for g in groups)
     freedom = sum(len(g.views) * _FREEDOM[g.flat] for g in groups)
     conditions = freedom - parameter_count(job.known, job.views.n_views)
-    return bool(_explained(refined.cost.sum(), bound, conditions, 2 * len(job.views.index) - freedom))
+    return bool(_explained(refined.cost.sum(), bound, conditions, job.views.n_equations - freedom))
 
 
 def short_of_bound(job: Job, refined: Refined, groups: Sequence[Group]) -> NDArray[np.bool_]:
@@ -53,14 +53,12 @@ def short_of_bound(job: Job, refined: Refined, groups: Sequence[Group]) -> NDArr
     short = np.zeros(job.views.n_views, dtype=bool)
     for group in groups:
         freedom = _FREEDOM[group.flat]
-        spare = 2 * job.views.counts[group.views] - freedom
+        spare = job.views.equations[group.views] - freedom
         short[group.views] = ~_explained(refined.cost[group.views], group.bound, freedom - 6, spare)
     return short
 
 
-def _explained(
-    cost: Array, bound: Array | float, conditions: int, spare: NDArray[np.int64] | int
-) -> NDArray[np.bool_]:
+def _explained(cost: Array, bound: Array | float, conditions: int, spare: Array | float) -> NDArray[np.bool_]:
     """Whether an excess over the bound is what `conditions` imposed on noise would cost.
 
     The excess over the residual variance is chi-squared distributed; the limit is its mean and six

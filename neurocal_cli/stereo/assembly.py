@@ -85,9 +85,9 @@ class _RigAssembly:
                 "spread them in depth, or give more of the cameras (--no-skew, --left-intrinsics, "
                 "--right-intrinsics)"
             )
-        n_points = sum(seen.n_points for seen in problem.sightings)
+        n_equations = sum(seen.n_equations for seen in problem.sightings)
         unknowns = len(self.shared) + 6 * len(problem.frames.scale)
-        variance = refined.cost / max(2 * n_points - unknowns, 1)
+        variance = refined.cost / max(n_equations - unknowns, 1)
         self.covariance = _scaled(inverse, variance)
 
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:

@@ -61,6 +61,8 @@ class Sightings:
     weight : float
         Of a squared normalised residual: whitened pixels, (pixel_scale / sigma)^2.
     n_points : int
+    n_equations : float
+        Two of most points; see `directions`.
     """
 
     tiles: Tiles
@@ -69,6 +71,7 @@ class Sightings:
     pixel_scale: float
     weight: float
     n_points: int
+    n_equations: float
 
 
 @dataclass(frozen=True, eq=False)

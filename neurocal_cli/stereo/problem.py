@@ -7,16 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.noise import common_share, measured, with_common_share
 from neurocal_cli.adjustment.pixel_error import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.adjustment.reweighting import weighed
 from neurocal_cli.adjustment.tiles import tile
-from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.adjustment.views import Views
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera import Pose
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import coefficient_names
-from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.pixel_error import Frames, RigState, Sightings
 
@@ -92,7 +91,7 @@ def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
 
 def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigProblem:
     """Bring two calibrations of one world unit together."""
-    arranged = arrange(_believed(left)), arrange(_believed(right))
+    arranged = _arranged(left), _arranged(right)
     names = arranged[0].names, arranged[1].names
     place = {b: names[0].index(a) for a, b in views.both}
     n_left = len(names[0])
@@ -118,9 +117,7 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
     sightings, costs = [], []
     for (seen, _, cost, _), s, own in zip(sides, noise, real, strict=True):
         weight = 1.0 / (s * max(1.0, _LEAST_SHARE * max(real) / own)) ** 2
-        sightings.append(
-            Sightings(seen.tiles, seen.view, seen.pixel_centre, seen.pixel_scale, weight, seen.n_points)
-        )
+        sightings.append(replace(seen, weight=weight))
         costs.append(weight * cost)
     paired_right = np.flatnonzero(through[frame] & (frame < n_left))
     paired = frame[paired_right]
@@ -131,13 +128,9 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
     )  # fmt: skip
 
 
-def _believed(calibration: Calibration) -> Correspondences:
+def _arranged(calibration: Calibration) -> Views:
     """A camera's points, their covariances as far as its residuals bear them out."""
-    points = calibration.points
-    if points.covariance is None or not measured(points.covariance):
-        return points
-    share = common_share(points.covariance, evaluate_camera(calibration).residuals)
-    return replace(points, covariance=with_common_share(points.covariance, share))
+    return weighed(calibration.points, evaluate_camera(calibration).residuals)
 
 
 def _side(
@@ -160,9 +153,11 @@ def _side(
         np.array(calibration.distortion, dtype=float),
     )
     cost = normal_blocks(tiles, state)[0][:, -1, -1]
-    spare = 2 * len(views.index) - int(free_parameters(calibration).sum()) - 6 * views.n_views
+    spare = views.n_equations - int(free_parameters(calibration).sum()) - 6 * views.n_views
     noise = float(np.sqrt(cost.sum() / max(spare, 1)))
-    seen = Sightings(tiles, frame, views.pixel_centre, views.pixel_scale, 1.0, len(views.index))
+    seen = Sightings(
+        tiles, frame, views.pixel_centre, views.pixel_scale, 1.0, len(views.index), views.n_equations
+    )
     return seen, state, cost, noise
 
 

@@ -64,7 +64,7 @@ def refine_rig(
     """
     columns = Columns.of(start)
     shared = np.flatnonzero(free)
-    floor = _FLOOR**2 * sum(2 * seen.n_points * seen.weight for seen in sightings)
+    floor = _FLOOR**2 * sum(seen.n_equations * seen.weight for seen in sightings)
     state = start
     normal, _ = rig_normal_blocks(frames, sightings, state, columns)
     cost = float(normal[:, -1, -1].sum())
