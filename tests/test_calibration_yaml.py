@@ -93,7 +93,7 @@ def rejections(draw, points):
         return Rejected(views=views)
     lines = np.arange(7, 7 + len(points)) if draw(st.booleans()) else None
     return Rejected(
-        replace(points, covariance=None, image_size=None, image_center=None, lines=lines),
+        replace(points, covariance=None, across=None, image_size=None, image_center=None, lines=lines),
         np.where(np.arange(len(points)) % 2, np.nan, 3.5),
         views,
     )
@@ -113,6 +113,7 @@ def calibrations(draw):
         image_center=draw(st.none() | st.tuples(COORDINATES, COORDINATES)),
         point=draw(st.none() | st.lists(NAMES, min_size=n, max_size=n)),
         covariance=draw(st.none() | st.just(np.tile([0.1 + 0.2, 1e-5, 1.0], (n, 1)))),
+        across=draw(st.none() | st.just(np.tile([0.1 + 0.2, -1e-5], (n, 1)))),
         unit=draw(NAMES),
     )
     angles, shifts = st.floats(-1.5, 1.5), st.floats(-1e9, 1e9)

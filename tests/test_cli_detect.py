@@ -66,8 +66,8 @@ def test_points_of_all_images_go_to_a_file(folder: Path, tmp_path: Path) -> None
     assert (result.exit_code, result.stdout) == (0, "")
     assert result.stderr == "found the board in 3 of 3 images: 279 points, 0 rejected\n"
     text = (tmp_path / "p.csv").read_text()
-    head = "# image_size: 400 300\n# unit: mm\nview,point,X,Y,Z,u,v,suu,suv,svv,nu,nv\nboard01,h:0:0,12.5,0.0,0.0,"
-    assert text.startswith(head)
+    head = "# image_size: 400 300\n# unit: mm\nview,point,X,Y,Z,u,v,suu,suv,svv,nu,nv\n"
+    assert text.startswith(head + "board01,h:0:0,12.5,0.0,0.0,")
     points = read_points(tmp_path / "p.csv")
     assert points.view_names == ("board01", "board02", "board03")
     assert points.covariance is not None

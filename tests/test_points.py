@@ -104,6 +104,7 @@ def test_selecting_rows_keeps_everything_that_belongs_to_them() -> None:
         image_size=(640, 480),
         point=list("uvwxyz"),
         covariance=np.tile([2.0, 0.5, 1.0], (N, 1)) * np.arange(1, N + 1)[:, None],
+        across=np.arange(2.0 * N).reshape(N, 2),
         unit="m",
         lines=np.arange(N),
     )
@@ -114,5 +115,7 @@ def test_selecting_rows_keeps_everything_that_belongs_to_them() -> None:
     assert list(rows.point) == ["y", "v", "x"]
     assert rows.covariance is not None
     assert rows.covariance[:, 0].tolist() == [10.0, 4.0, 8.0]
+    assert rows.across is not None
+    assert rows.across.tolist() == [[8, 9], [2, 3], [6, 7]]
     assert (rows.image_size, rows.unit, len(rows)) == ((640, 480), "m", 3)
     assert points.select(slice(None)).view_names == points.view_names

@@ -59,6 +59,8 @@ def same(a, b):
     assert a.point is None or list(map(str, a.point)) == list(map(str, b.point))
     assert (a.covariance is None) == (b.covariance is None)
     assert a.covariance is None or a.covariance.tobytes() == b.covariance.tobytes()
+    assert (a.across is None) == (b.across is None)
+    assert a.across is None or a.across.tobytes() == b.across.tobytes()
     assert (a.image_size, a.image_center, a.unit) == (b.image_size, b.image_center, b.unit)
 
 
@@ -117,6 +119,19 @@ def test_quoted_labels_may_hold_separators_and_quotes(read):
 
 def test_labels_of_any_alphabet_are_read(read):
     assert read("view,X,Y,Z,u,v\né 1,1,2,3,4,5\n左,1,2,3,4,5\n").view_names == ("é 1", "左")
+
+
+def test_a_direction_of_measurement_is_kept(read):
+    points = read("X,Y,Z,u,v,nu,nv\n1,2,3,4,5,0.6,-0.8\n1,2,4,4,6,0,0\n")
+    assert points.across.tolist() == [[0.6, -0.8], [0, 0]]
+    assert read("X,Y,Z,u,v,nu,nv\n1,2,3,4,5,0,0\n").across is None
+
+
+def test_files_with_and_without_directions_are_read_as_one(tmp_path):
+    (tmp_path / "a.csv").write_text("X,Y,Z,u,v,nu,nv\n1,2,3,4,5,0,1\n")
+    (tmp_path / "b.csv").write_text("X,Y,Z,u,v\n1,2,3,4,5\n")
+    points = read_points([tmp_path / "a.csv", tmp_path / "b.csv"])
+    assert points.across.tolist() == [[0, 1], [0, 0]]
 
 
 def test_sigma_becomes_a_round_covariance(read):
@@ -178,6 +193,8 @@ FAULTS = {
     "X,Y,Z,u,v,sigma\n1,2,3,4,5,1e200\n": "a.csv:2: the pixel's covariance",
     "X,Y,Z,u,v,suu,suv,svv\n1,2,3,4,5,1,2,1\n": "a.csv:2: the pixel's covariance",
     "X,Y,Z,u,v,suu\n1,2,3,4,5,1\n": "a.csv: has suu only",
+    "X,Y,Z,u,v,nu\n1,2,3,4,5,1\n": "a.csv: has nu only; give both nu,nv",
+    "X,Y,Z,u,v,nu,nv\n1,2,3,4,5,1,1e200\n": "a.csv:2: the direction nu,nv in which the point was measured",
     "X,Y,Z,u,v,sigma,suu,suv,svv\n1,2,3,4,5,1,1,0,1\n": "a.csv: has both sigma and suu,suv,svv",
     "view,X,Y,Z,u,v\n,1,2,3,4,5\n": "a.csv:2: view is empty",
     'view,X,Y,Z,u,v\n"a,1,2,3,4,5\n': 'a.csv:2: a quote (") is not closed',
@@ -257,6 +274,7 @@ def correspondences(draw):
         view=views,
         point=ids,
         covariance=covariance,
+        across=draw(st.none() | arrays(float, (n, 2), elements=NUMBERS)),
         image_size=draw(st.none() | st.tuples(st.integers(1, 99999), st.integers(1, 99999))),
         image_center=draw(st.none() | st.tuples(NUMBERS, NUMBERS)),
         unit=draw(st.sampled_from(["mm", "m", "square", "µm", "my unit"])),

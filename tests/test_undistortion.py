@@ -118,6 +118,18 @@ def test_covariances_are_those_of_many_points(model: str) -> None:
     assert step.covariance(step.points(seen), C)[0] == pytest.approx(expected, abs=0.04 * expected[0])
 
 
+@pytest.mark.parametrize("model", BENDING)
+def test_a_direction_of_measurement_stays_across_the_edge(model: str) -> None:
+    step = undistortion(camera(model, True), 0.3, SIZE)
+    seen, edge = np.array([[600.0, 30.0]]), np.array([0.6, 0.8])
+    ends = step.points(seen + 0.01 * np.outer([-1, 1], edge))
+    turned = step.across(step.points(seen), 7.0 * np.array([[-0.8, 0.6]]))
+    along = ends[1] - ends[0]
+    assert np.hypot(*turned[0]) == pytest.approx(1)
+    assert turned[0] @ along == pytest.approx(0, abs=1e-5 * np.hypot(*along))
+    assert step.across(step.points(seen), np.zeros((1, 2))).tolist() == [[0, 0]]
+
+
 def test_what_belongs_to_points_is_carried_over() -> None:
     n = 4
     points = Correspondences(
@@ -128,6 +140,7 @@ def test_what_belongs_to_points_is_carried_over() -> None:
         image_center=(300.0, 260.0),
         point=["1", "2", "1", "2"],
         covariance=np.tile([0.1, 0.0, 0.1], (n, 1)),
+        across=np.tile([1.0, 1.0], (n, 1)),
         unit="inch",
     )
     cam = camera("plumb_bob")
@@ -137,6 +150,7 @@ def test_what_belongs_to_points_is_carried_over() -> None:
     assert np.array_equal(done.world, points.world)
     assert done.covariance is not None
     assert not np.allclose(done.covariance, points.covariance)
+    assert done.across is not None
     assert done.image_center == pytest.approx(undistortion(cam).points(np.array([[300.0, 260.0]]))[0])
 
 

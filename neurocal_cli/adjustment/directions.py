@@ -30,13 +30,12 @@ def equations(across: Array | None, n: int, along: float = LEAST) -> Array:
     return np.where(single(across), 1.0 + along, 2.0)
 
 
-def measured_part(errors: Array, across: Array | None, along: float = 0.0) -> Array:
-    """The part of pixels' errors (N, 2) in the measured directions, and as much as counts of the rest."""
+def measured_part(errors: Array, across: Array | None) -> Array:
+    """The part of pixels' errors (N, 2) in the measured directions; (N, 2)."""
     if across is None:
         return errors
     n = unit(across)
-    seen = (errors * n).sum(axis=1, keepdims=True) * n
-    return np.where(single(across)[:, None], seen + np.sqrt(along) * (errors - seen), errors)
+    return np.where(single(across)[:, None], (errors * n).sum(axis=1, keepdims=True) * n, errors)
 
 
 def variance_across(covariance: Array, across: Array) -> Array:

@@ -16,6 +16,8 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["correlation", "effective_number", "of_points"]
 
+_SOME_SAY = 0.5  # from which on what points say along their edges counts
+
 
 def correlation(views: Views, errors: Array) -> float:
     """Correlation of the residuals of points that are neighbours in their view.
@@ -32,9 +34,10 @@ def correlation(views: Views, errors: Array) -> float:
         0 for noise, to 1 / sqrt(N); 1 for residuals that vary slowly over the image.
     """
     group, n_groups = views.index, views.n_views
-    if views.across is not None:
+    across = views.across if views.along < _SOME_SAY else None
+    if across is not None:
         # Mid-points of edges one way tell nothing of what those of edges the other way say.
-        group, n_groups = 2 * group + _other_way(views, views.across), 2 * n_groups
+        group, n_groups = 2 * group + _other_way(views, across), 2 * n_groups
     # Strips of each view as high as neighbours are apart; along a strip they follow each other.
     low = np.minimum.reduceat(views.pixels, views.first)
     extent = np.maximum.reduceat(views.pixels, views.first) - low
@@ -45,15 +48,12 @@ def correlation(views: Views, errors: Array) -> float:
     one, two = order[:-1], order[1:]
     same = (group[one] == group[two]) & (strip[one] == strip[two])
     one, two = one[same], two[same]
-    errors = _counting(views, errors, np.arange(len(errors)))
-    shared = [_counting(views, errors[k], n) for k, n in ((one, two), (two, one))]
+    errors = measured_part(errors, across)
+    shared = [
+        measured_part(errors[k], None if across is None else across[n]) for k, n in ((one, two), (two, one))
+    ]
     power = (shared[0] ** 2).sum() + (shared[1] ** 2).sum()
     return float(2 * (errors[one] * errors[two]).sum() / power) if power > 0 else 0.0
-
-
-def _counting(views: Views, errors: Array, rows: NDArray[np.intp]) -> Array:
-    """What counts of errors where some points were measured."""
-    return measured_part(errors, None if views.across is None else views.across[rows], views.along)
 
 
 def _other_way(views: Views, across: Array) -> NDArray[np.int64]:
