@@ -49,7 +49,7 @@ def choose_model(lens: LensPoints, options: Options, reject: bool, report: Progr
 
 def _explains_more(rich: Start, simple: Start) -> bool:
     """Whether the residual variance falls by more than chance makes it."""
-    freedom = 2 * len(rich.lens.points)
+    freedom = rich.data.views.n_equations
     return rich.variance < simple.variance * (1 - _CHANCE * np.sqrt(2 / freedom))
 
 

@@ -53,8 +53,7 @@ _VERTICES = click.IntRange(2, 1000)
     "--points",
     type=click.Choice(["midpoints", "vertices"]),
     default="midpoints",
-    help="Measure the mid-points of the squares' edges, or the inner vertices, whose errors are independent "
-    "of each other: take these where standard deviations matter.",
+    help="Measure the mid-points of the squares' edges, or the inner vertices.",
 )
 @click.option(
     "--gamma",
@@ -100,8 +99,9 @@ def detect(
     where OpenCV's findChessboardCorners begins; if the number of columns and rows are both even or
     both odd, a board looks the same after a turn, and a warning says so.
 
-    The points, CSV with the covariance of each, go to standard output or to -o. Images without the
-    board are named on standard error with the reason.
+    The points, CSV with the covariance of each and the direction across its edge (nu,nv), in which a
+    mid-point is measured by itself, go to standard output or to -o. Images without the board are named
+    on standard error with the reason.
 
     \b
     Examples:

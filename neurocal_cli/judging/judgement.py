@@ -118,7 +118,8 @@ class _Court:
         px = self.views.pixel_scale
         floor = (1e-9 * px) ** 2
         ratio = np.sqrt((self.cost / self.spare + floor) / (own + floor))
-        return float(np.sqrt(2 * own)) * px, float(ratio)
+        of_point = self.views.n_equations / len(self.points)
+        return float(np.sqrt(of_point * own)) * px, float(ratio)
 
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:

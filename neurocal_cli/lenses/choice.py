@@ -94,7 +94,7 @@ def choose_lens(
         fitted = {"none": fitted["none"]}  # a lens would only hide that the points leave the camera open
     chosen = fitted[_best(fitted, views)]
     job.tally.refinements += chosen.refined.iterations
-    n, px = 0.5 * views.n_equations, views.pixel_scale
+    n, px = len(views.index), views.pixel_scale
     table = {name: float(np.sqrt(c.lost.sum() / n)) * px for name, c in fitted.items()}
     refined = Solution(chosen.refined, job.tally)
     job = replace(job, known=chosen.known, restraint=chosen.restraint)
