@@ -42,7 +42,7 @@ _NODES = 48
 # corner's radius is guessed with: first as much as lenses have, then hardly any.
 _LEAST = ((0.1, 1.02, 0.5), (0.02, 1.0, 1.0))
 _GUESS = 0.5  # slope with which a corner's radius is corrected
-_ROUNDS, _STEPS = 12, 60
+_ROUNDS, _STEPS, _MORE_STEPS = 12, 60, 600
 _CHANCE = 10.8  # chi-squared that one condition exceeds in one case of a thousand
 _TIE = 0.009  # of the rms error, that makes no difference
 
@@ -172,10 +172,21 @@ def _with_slope(
         if not refined.cost.sum() <= most:
             return None
         if folds_back(Lens(state.lens, state.k), known.matrix(state.entries[0], views), points) is None:
-            return (refined, restraint) if refined.converged else None
+            return _settled(views, known, refined, restraint)
         corner = beyond * _farthest(views, known, state, points)
         last += max(corner - _bent(state, last), 0.01 * corner) / _GUESS
     return None
+
+
+def _settled(
+    views: Views, known: Known, refined: Refined, restraint: Unfolded
+) -> tuple[Refined, Unfolded] | None:
+    """The end of the descent, which creeps along the condition's edge where several coefficients share it."""
+    if not refined.converged:
+        refined = refine(
+            views.tiles, refined.state, known.free_camera, known.free_poses, _MORE_STEPS, restraint
+        )
+    return (refined, restraint) if refined.converged else None
 
 
 def _fold(state: CameraState) -> float:
