@@ -17,15 +17,18 @@ from neurocal_cli.adjustment.user_units import Seen, normalised
 from neurocal_cli.adjustment.views import Views, arrange
 from neurocal_cli.calibration import StraightLines
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.lenses.asked_for import with_lens_asked_for
 from neurocal_cli.lenses.candidates import supported
-from neurocal_cli.lenses.choice import choose_lens
+from neurocal_cli.lenses.choice import LensChoice, choose_lens
 from neurocal_cli.lenses.given_lens import check_lens, straighten
 from neurocal_cli.points import Correspondences
 from neurocal_cli.search.neuro import solve
+from neurocal_cli.search.rivals import try_mirrored
 
 __all__ = ["Fit", "Fitter"]
 
 _FIRST_LENS = "k1k2"  # where no pinhole can be found, the lens must bend strongly
+_FAR_WORSE = 4.0  # times the mean squared error of most views
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +97,9 @@ class Fitter:
         views = arrange(straighten(points, self.known))
         job = self._job(views, self.known)
         if not self.lens:
-            return self._finished(job, solve(job), points)
+            found = solve(job)
+            found = with_lens_asked_for(job, found, points, lambda: self._bent_starts(views, points))
+            return self._finished(job, _turned(job, found), points)
         try:
             solution = solve(job)
         except DegenerateGeometryError:
@@ -124,12 +129,20 @@ class Fitter:
         """With its lens, and weights that the residuals bear out."""
         choice, refusal = None, ""
         if self.lens == "auto":
-            found = choose_lens(job, solution, points, lambda: self._bent_starts(job.views, points))
+            found = self._chosen(job, solution, points)
             job, solution, choice, refusal = found.job, found.solution, found.held_out_px, found.refusal
         job, solution, share = reweighted(job, solution, points)
         if self.lens != "auto" or points.covariance is not None:  # weighed anew, it may have moved
             job, solution = check_lens(job, solution, points)
         return Fit(job, solution, points, share, choice, refusal=refusal)
+
+    def _chosen(self, job: Job, solution: Solution, points: Correspondences) -> LensChoice:
+        def more_starts() -> Iterator[CameraState]:
+            return self._bent_starts(job.views, points)
+
+        found = choose_lens(job, solution, points, more_starts)
+        turned = _turned(found.job, found.solution)
+        return found if turned is found.solution else choose_lens(job, turned, points, more_starts)
 
     def _with_first_lens(self, views: Views) -> Job | None:
         known = supported(self.known, _FIRST_LENS, views)
@@ -163,3 +176,16 @@ class Fitter:
         job, solution = lens_and_camera(job, solution, plumb, points)
         job, solution = check_lens(job, solution, points)
         return Fit(job, solution, points, share, None, plumb.record)
+
+
+def _turned(job: Job, solution: Solution) -> Solution:
+    """With views far worse than the others in the other one of a flat board's two poses, if that is better.
+
+    Before the lens was known, the wrong one may have looked better.
+    """
+    refined = solution.refined
+    error = refined.cost / job.views.counts
+    if refined.state.lens == "none" or error.max() <= _FAR_WORSE * np.median(error):
+        return solution
+    turned = try_mirrored(job, refined)
+    return solution if turned is refined else Solution(turned, job.tally, solution.shared)

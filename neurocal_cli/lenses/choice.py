@@ -22,6 +22,7 @@ from neurocal_cli.adjustment.job import Job, Solution
 from neurocal_cli.adjustment.leave_out import FOLDS, held_out_views
 from neurocal_cli.adjustment.pixel_error import CameraState
 from neurocal_cli.adjustment.views import Views
+from neurocal_cli.adjustment.whiteness import correlation, of_points
 from neurocal_cli.geometry import Array
 from neurocal_cli.lens import MODELS
 from neurocal_cli.lenses.candidates import Candidate, falls_short, fit_candidates, worth
@@ -35,6 +36,7 @@ _WORTH = 1.05  # times the rms error: what coefficients that cancel each other m
 _CHANCE = 4.6  # standard errors, of five folds, that chance exceeds in one case of a hundred
 _MORE = 2  # coefficients
 _DECISIVE = 10.0  # of the criterion: odds of 150
+_ALIKE = 0.3  # correlation of neighbours' residuals
 _FAR_BELOW = 2.0  # times the squared error of the pinhole
 
 
@@ -82,7 +84,7 @@ def choose_lens(
     """
     views, by_views = job.views, _views_can_spare_any(job, solution)
     fitted = fit_candidates(job, solution.refined.state, points, by_views)
-    if not fitted or falls_short(views, fitted.values()):
+    if not fitted or _lost_its_way(views, fitted):
         for start in more_starts():
             for model, candidate in fit_candidates(job, start, points, by_views).items():
                 if model not in fitted or candidate.cost < fitted[model].cost:
@@ -99,6 +101,13 @@ def choose_lens(
     refined = Solution(chosen.refined, job.tally)
     job = replace(job, known=chosen.known, restraint=chosen.restraint)
     return LensChoice(job, refined, table, _refusal(fitted, chosen))
+
+
+def _lost_its_way(views: Views, fitted: dict[str, Candidate]) -> bool:
+    """Whether the closest model leaves what a camera with another lens might not."""
+    closest = min(fitted.values(), key=lambda c: c.cost).refined.state
+    alike = correlation(views, of_points(views, closest)) > _ALIKE
+    return alike or falls_short(views, fitted.values())
 
 
 def _views_can_spare_any(job: Job, solution: Solution) -> bool:
