@@ -154,7 +154,7 @@ class Fitter:
         if job is None:
             return
         with suppress(DegenerateGeometryError):
-            yield solve(job).refined.state
+            yield _turned(job, solve(job)).refined.state
         if points.image_size is None or not job.known.free[3:].all():
             return
         known = job.known
@@ -162,7 +162,8 @@ class Fitter:
         entries[3:], free[3:] = (np.array(points.image_size) - 1) / 2, False
         held = replace(known, entries=entries, free=free, fixed=known.fixed | {"u0", "v0"})
         with suppress(DegenerateGeometryError):
-            yield solve(self._job(views, held)).refined.state
+            state = solve(self._job(views, held)).refined.state
+            yield _turned(job, Solution(job.refine(state), job.tally)).refined.state
 
     def _lines_first(self, points: Correspondences) -> Fit:
         """The lens from straight lines, then the pinhole camera, then both together."""
