@@ -13,7 +13,8 @@ from neurocal_cli.errors import DegenerateGeometryError
 ASTRAY = (
     ("k1k2", 35), ("k1k2", 73), ("k1k2", 74), ("k1k2", 151), ("k1k2", 40155), ("k1k2", 80150),
     ("k1k2p1p2", 35), ("k1k2p1p2", 20038), ("k1k2p1p2", 40178), ("k1k2p1p2", 40180),
-    ("plumb_bob", 40141), ("plumb_bob", 80093), ("fisheye", 27), ("fisheye", 60),
+    ("plumb_bob", 40141), ("plumb_bob", 80093),
+    ("fisheye", 27), ("fisheye", 60), ("fisheye", 100161),
 )  # fmt: skip
 _EXPLAINED = 0.33  # px, of two coordinates with a noise of 0.2
 
@@ -41,17 +42,16 @@ def test_a_wrong_minimum_is_left(model: str, seed: int) -> None:
 @pytest.mark.parametrize("model", [model for model in BENT if model != "none"])
 def test_no_lens_of_many_ends_in_a_wrong_minimum(model: str) -> None:
     """One in many folds back in a corner whatever one does, and is refused by its name; never by default."""
-    refused = 0
+    messages = []
     for seed in range(80000, 80200):
         for distortion in (model, "auto"):
             try:
                 one = found(model, seed, distortion, "reject")
             except DegenerateGeometryError as error:
-                assert "folds back inside the image" in str(error)
-                assert distortion == model
-                refused += 1
+                messages.append(str(error))
                 continue
             assert one.converged
             assert one.rmse_px < _EXPLAINED, (seed, distortion)
             assert not one.rejected.views
-    assert refused <= 1
+    assert len(messages) <= 1
+    assert all(f"the distortion {model} folds back inside the image" in one for one in messages)

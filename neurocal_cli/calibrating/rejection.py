@@ -39,6 +39,7 @@ _ROUGH = 0.005  # an rms error of this share of the image's spread may hide anyt
 _WORST_VIEW = 3.0  # standard deviations of a view, in those of all: more does not excuse its points
 _ENOUGH = 12  # points of a view that tell its standard deviation
 _PASSES = 12
+_NO_WORSE = 1.05  # times the rms error with a view that is taken back
 _MAJORITY = 0.5  # share of the points that must be left
 _LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 
@@ -137,7 +138,18 @@ class _Search:
                 self._drop_odd_views(pinhole, pinhole.fit(self.points.select(self.kept)))
             if len(self.wrong_views) > before:
                 self.fit = self.fitter.fit(self.points.select(self.kept))
+                self._readmit(list(self.wrong_views)[before:])
         self.fit = self._drop_odd_views(self.fitter, self.fit)
+
+    def _readmit(self, names: list[str]) -> None:
+        """Take back views that only a pinhole could not explain."""
+        for name in names:
+            kept = self.kept | (self.points.view_index == self.points.view_names.index(name))
+            with suppress(DegenerateGeometryError):
+                fit = self.fitter.fit(self.points.select(kept))
+                if not fit.refusal and _rms(fit) <= _NO_WORSE * _rms(self.fit):
+                    self.fit, self.kept = fit, kept
+                    del self.wrong_views[name]
 
     def _drop_odd_views(self, fitter: Fitter, fit: Fit) -> Fit:
         """Set odd views aside one by one; the calibration without them."""
@@ -264,6 +276,11 @@ def _limits(errors: _Errors, kept: NDArray[np.bool_], points: Correspondences) -
             by_view[view] = errors.sigma(piece)
     sigma = np.clip(by_view, overall, _WORST_VIEW * overall) + _FLOOR * spread
     return np.asarray(sigma * np.sqrt(2 * np.log(len(errors.length) / _CHANCE)))
+
+
+def _rms(fit: Fit) -> float:
+    """Error [px], weighted."""
+    return float(np.sqrt((_errors(fit, fit.points).length ** 2).mean()))
 
 
 def _suspicious(fit: Fit) -> bool:
