@@ -141,7 +141,7 @@ def test_edge_model_has_the_derivatives_it_says(sharp: bool) -> None:
         )
         # The error function's own error is 1e-9, and differences of it over the box make more of that.
         atol = 2e-4 if sharp else 3e-6
-        np.testing.assert_allclose(linear.jacobian[:, k], (behind - ahead) / (2 * STEP), atol=atol)
+        np.testing.assert_allclose(linear.rows[:, k], (behind - ahead) / (2 * STEP), atol=atol)
 
 
 def some_vertices() -> tuple[VertexData, Array, Shape, tuple[Array, Array]]:
@@ -174,7 +174,7 @@ def test_vertex_model_has_the_derivatives_it_says(sharp: bool) -> None:
             for sign in (1, -1)
         )
         atol = 2e-4 if sharp else 3e-6
-        np.testing.assert_allclose(linear.jacobian[:, k], (behind - ahead) / (2 * STEP), atol=atol)
+        np.testing.assert_allclose(linear.rows[:, k], (behind - ahead) / (2 * STEP), atol=atol)
 
 
 @pytest.mark.parametrize("angle", [0.3, 0.6, 1.0])
@@ -211,7 +211,7 @@ def test_map_has_the_derivatives_it_says() -> None:
     grid = np.random.default_rng(5).uniform(0, 8, (20, 2))
     direction = np.random.default_rng(6).normal(size=(2, 20))
     direction /= np.hypot(*direction)
-    value, jacobian = now.along(now.places(grid), direction)
+    value, jacobian = now.along(now.places(grid, direction))
     np.testing.assert_allclose(value, (now.at(grid).T * direction).sum(axis=0), atol=1e-10)
     for k in range(len(now.parameters)):
         h = np.zeros(len(now.parameters))

@@ -70,7 +70,7 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
     information = np.tile(1e6 * np.eye(5), (60, 1, 1))
     prior = Prior(np.ones((60, 3)), np.zeros((60, 3, 3)))
     nothing = np.zeros((60, 1), dtype=np.float32)
-    linear = Linear(np.zeros((60, 5, 1), dtype=np.float32), nothing, nothing, nothing)
+    linear = Linear(np.zeros((60, 6, 1), dtype=np.float32), nothing, nothing)
     ones = np.ones(60)
     fit = Fit(values, information, prior, ones, ones.astype(np.int64), ones, linear)
     blur = BoardBlur.of(fit, normal, ones.astype(bool))
@@ -83,17 +83,16 @@ def test_fits_settle_where_their_steps_are_too_long() -> None:
     def model_of(part: Part) -> Callable[[Array], Linear]:
         def model(values: Array) -> Linear:
             place = values[:, :1]
-            jacobian = np.zeros((len(values), 4, 1), dtype=np.float32)
-            jacobian[:, 0] = 1 / (1 + place**2)
-            residual = (-np.arctan(place)).astype(np.float32)
-            return Linear(jacobian, residual, residual, residual)
+            rows = np.zeros((len(values), 5, 1), dtype=np.float32)
+            rows[:, 0] = 100 / (1 + place**2)
+            rows[:, -1] = -100 * np.arctan(place)
+            return Linear(rows, rows[:, -1], rows[:, -1])
 
         return model
 
     start = np.array([[0.3, 0, 1, 5.0]] * 19 + [[4.0, 0, 1, 5.0]])
     prior = Prior(start[:, 1:].copy(), np.tile(np.eye(3) * 1e3, (20, 1, 1)))
-    weight = np.full((20, 1), 1e4, dtype=np.float32)
-    fit = gauss_newton(model_of, start, prior, weight, 6)
+    fit = gauss_newton(model_of, start, prior, np.ones(20, dtype=np.int64), 6)
     np.testing.assert_allclose(fit.values[:, 0], 0, atol=0.01)
     assert fit.step.max() < 0.5
 

@@ -234,21 +234,21 @@ def _fine_fit(
     """Fits to all pixels, with levels, blur, profile and noise from the whole board."""
     n, half_length = len(first.good), 0.5 * lines.length
     shape = profile_shape(first.data, first.fit, first.shape, first.good)
-    noise = Noise.of(first.fit, first.data.weight, board.floor)
+    noise = Noise.of(first.fit, first.data.root, board.floor)
     blur = BoardBlur.of(first.fit, lines.normal, first.good)
     sigma = blur.along(lines.normal)
     data = edge_pixels(board.image, lines, sigma, shading, REACH * sigma, 1)
     prior = level_prior(shading, lines.middle, sigma, blur.spread, noise.edge)
     offset = first.map.residual[:n] + first.map.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
-    data = with_weight(data, noise.weighted(light_at(data, start), data.weight))
+    data = with_weight(data, noise.weights(light_at(data, start)))
     fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
     usual = median(sigma)
     if usual < SHARP or median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # So precise, or so sharp, that the profile from a share of the pixels is what is worst known.
         shape = profile_shape(data, fit, shape, first.good)
-        noise = Noise.of(fit, data.weight, board.floor)
-        data = with_weight(data, noise.weighted(fit.linear.x, data.weight))
+        noise = Noise.of(fit, data.root, board.floor)
+        data = with_weight(data, noise.weights(fit.linear.x))
         fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
     return fit, data, shape, noise
 
@@ -271,10 +271,10 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
     prior = level_prior(fitted.shading, place, sigma, blur.spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     half = (0.5 * lines[0].length, 0.5 * lines[1].length)
-    unit = replace(data, weight=data.weight / np.float32(fitted.noise.edge))
+    unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_vertices(unit, start, prior, half, shape, _STEPS)
-    weight = fitted.noise.weighted(fit.linear.x, data.weight)
-    fit = fit_vertices(replace(data, weight=weight), fit.values, prior, half, shape, _STEPS)
+    root = np.sqrt(fitted.noise.weights(fit.linear.x)) * (data.root > 0)
+    fit = fit_vertices(replace(data, root=root), fit.values, prior, half, shape, _STEPS)
     fit = fit.scaled(max(median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.detection.fitting.profile import Real, erf_and_density, profile, tails_of
+from neurocal_cli.detection.fitting.profile import Real, erf_and_density, profile, tails_of, with_sign
 from neurocal_cli.geometry import Array
 
 __all__ = ["PIXEL", "box_profile", "half_widths", "sharp_profile"]
@@ -55,13 +55,13 @@ def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
     size = np.abs(d)
     ramp = np.minimum(size, a - b) / a
     beyond = np.clip(size - (a - b), 0, 2 * b)
-    value = np.copysign(ramp + beyond * (4 * b - beyond) * share, d)
+    value = with_sign(ramp + beyond * (4 * b - beyond) * share, d)
     slope = np.where(size < a + b, (2 * b - beyond) * (2 * share), 0)
     widening = np.zeros_like(d)
     for x, sign in ((d + (a + b), 1), (d + (a - b), -1), (d - (a - b), -1), (d - (a + b), 1)):
         z = x / psf
         e, p = erf_and_density(z)
-        rest = e - np.copysign(kind.type(1), x)
+        rest = e - with_sign(np.ones_like(x), x)
         weight = sign * share
         p *= psf
         value += weight * (0.5 * (x * x * rest + psf * psf * e) + x * p)
@@ -71,8 +71,13 @@ def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
     return value, slope, widening
 
 
-def sharp_profile(z: Real, sigma: Real, tails: Real, half: Array | None) -> tuple[Real, Real, Real, Real]:
-    """E(z), its derivatives by z and by the logarithm of sigma, and the normal density.
+def sharp_profile(
+    z: Real, sigma: Real, tails: Real, half: Array | None
+) -> tuple[Real, Real, Real | None, Real]:
+    """E(z), its derivative by z, how it changes with sigma but for being stretched, and the normal density.
+
+    The derivative of E(d / sigma) by the logarithm of sigma is -z times that by z, and for the pixel's box,
+    which does not grow with the blur, the third result as well.
 
     Parameters
     ----------
@@ -85,14 +90,14 @@ def sharp_profile(z: Real, sigma: Real, tails: Real, half: Array | None) -> tupl
     """
     if half is None:
         value, slope, density = profile(z, tails)
-        return value, slope, -z * slope, density
+        return value, slope, None, density
     value, slope, widening = box_profile(z * sigma, sigma, half)
     slope *= sigma
     widening *= sigma
+    widening += z * slope
     density = erf_and_density(z)[1]
     if tails.any():
         more, steeper = tails_of(z, density, tails)
         value += more
         slope += steeper
-        widening -= z * steeper
     return value, slope, widening, density

@@ -21,8 +21,6 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fitting.box import sharp_profile
 from neurocal_cli.detection.fitting.newton import (
     BLUR,
-    CONTRAST,
-    MEAN,
     MORE_STEPS,
     Fit,
     Linear,
@@ -66,8 +64,8 @@ class EdgeData:
     gain : array
         B(u, v) relative to the edge's own.
     Q, R : arrays
-    weight : array [1/DN^2]
-        Inverse variance of the noise; 0 for pixels that are not used.
+    root : array [1/DN]
+        Inverse standard deviation of the noise; 0 for pixels that are not used.
     beyond : (E,) array
         Share of the strip's pixels that lie outside the image.
     """
@@ -78,8 +76,13 @@ class EdgeData:
     gain: Single
     Q: Single
     R: Single
-    weight: Single
+    root: Single
     beyond: Array
+
+    @property
+    def count(self) -> NDArray[np.int64]:
+        """(E,) number of pixels that are used."""
+        return np.count_nonzero(self.root, axis=1)
 
     def part(self, which: Part) -> EdgeData:
         """The pixels of some edges."""
@@ -191,7 +194,7 @@ def fit_edges(
         pixels, levers, form = data.part(part), lever[part], shape.part(part)
         return lambda values: linearised(pixels, levers, values, form)
 
-    return gauss_newton(model_of, start, prior, data.weight, steps, more)
+    return gauss_newton(model_of, start, prior, data.count, steps, more)
 
 
 def light_at(data: EdgeData, values: Array) -> Single:
@@ -202,35 +205,44 @@ def light_at(data: EdgeData, values: Array) -> Single:
 
 def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Linear:
     """The model and its derivatives; ``lever`` is s over the half length."""
-    offset, tilt, mean, contrast, sigma = (x.astype(data.value.dtype)[:, None] for x in values.T)
+    offset, tilt, mean, contrast, sigma = np.ascontiguousarray(values.T, data.value.dtype)[:, :, None]
     z = data.d - offset
     z -= tilt * lever
     z /= sigma
-    E, slope, widening, density = sharp_profile(z, sigma, shape.tails, shape.half)
-    widening *= data.Q
-    widening += z * z * density * data.R
-    x = E * data.Q
-    x += density * data.R
+    x, slope, spread, density = sharp_profile(z, sigma, shape.tails, shape.half)
+    # x = E Q + phi R, and its derivative by z.
+    density *= data.R
+    x *= data.Q
+    x += density
+    density *= z
     slope *= data.Q
-    slope -= z * density * data.R
-    factor = data.gain * (-contrast / sigma)
+    slope -= density
+    gain = data.gain * data.root
+    rows = np.empty((len(z), 6, z.shape[1]), dtype=x.dtype)
+    by_offset, by_tilt, by_mean, by_contrast, by_blur, residual = rows.swapaxes(0, 1)
+    factor = gain * (-contrast / sigma)
     if shape.bend.any():
         F, steep = response(x, shape.bend)
         factor *= steep
     else:
         F = x
-    slope *= factor
-    jacobian = np.empty((len(z), 5, z.shape[1]), dtype=x.dtype)
-    jacobian[:, OFFSET] = slope
-    np.multiply(slope, lever, out=jacobian[:, TILT])
-    jacobian[:, MEAN] = 1
-    np.multiply(F, data.gain, out=jacobian[:, CONTRAST])
-    np.multiply(widening, -factor, out=jacobian[:, BLUR])
-    residual = data.value - mean
-    residual -= contrast * jacobian[:, CONTRAST]
-    return Linear(jacobian, residual, z, x)
+    np.multiply(slope, factor, out=by_offset)
+    np.multiply(by_offset, lever, out=by_tilt)
+    by_mean[...] = data.root
+    np.multiply(F, gain, out=by_contrast)
+    np.multiply(by_offset, z, out=by_blur)
+    if spread is not None:
+        spread *= data.Q
+        spread *= factor
+        by_blur -= spread
+    np.subtract(data.value, mean, out=residual)
+    residual *= data.root
+    residual -= contrast * by_contrast
+    return Linear(rows, z, x)
 
 
 def with_weight(data: EdgeData, weight: Single) -> EdgeData:
-    """The same pixels with other weights; those not used stay unused."""
-    return replace(data, weight=np.where(data.weight > 0, weight, np.float32(0)))
+    """The same pixels with other weights [1/DN^2]; those not used stay unused."""
+    root = np.sqrt(weight)
+    root *= data.root > 0
+    return replace(data, root=root)

@@ -94,7 +94,7 @@ def _begun(
     """A few steps, to see what the blur is; known (E, 3) are mean level, contrast and blur."""
     blur, half_length = known[:, 2], 0.5 * lines.length
     data = edge_pixels(image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
-    data = with_weight(data, np.full_like(data.weight, 1 / noise))
+    data = with_weight(data, np.full_like(data.root, 1 / noise))
     spread = known * [0.0, 0.0, _LOOSE_BLUR] + known[:, 1:2] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
     prior = Prior(known.copy(), (1 / spread**2)[:, :, None] * np.eye(3))
     shape = _blurred(lines, float(blur[0]))[-1]

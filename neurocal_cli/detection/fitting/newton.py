@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,26 +85,33 @@ class Linear:
 
     Attributes
     ----------
-    jacobian : (E, P, N) array
-        Derivatives of the model by the values.
-    residual : (E, N) array [DN]
+    rows : (E, P + 1, N) array
+        Derivatives of the model by the values, and the residual, in standard deviations of the pixels' noise.
     z, x : (E, N) arrays
         Distance from the edge in sigma, and light between the levels.
     """
 
-    jacobian: Single
-    residual: Single
+    rows: Single
     z: Single
     x: Single
 
+    @property
+    def residual(self) -> Single:
+        """(E, N) values less the model, in standard deviations of the noise."""
+        return self.rows[:, -1]
+
+    @property
+    def products(self) -> Array:
+        """(E, P + 1, P + 1) sums over pixels: the information, the gradient beside it, chi2 in the corner."""
+        return (self.rows @ self.rows.swapaxes(1, 2)).astype(float)
+
     def part(self, which: NDArray[np.intp]) -> Linear:
         """That of some fits."""
-        return Linear(self.jacobian[which], self.residual[which], self.z[which], self.x[which])
+        return Linear(self.rows[which], self.z[which], self.x[which])
 
     def put(self, which: NDArray[np.intp], part: Linear) -> None:
         """Replace that of some fits, in place."""
-        for name in ("jacobian", "residual", "z", "x"):
-            getattr(self, name)[which] = getattr(part, name)
+        self.rows[which], self.z[which], self.x[which] = part.rows, part.z, part.x
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,15 +141,15 @@ class Fit:
     step: Array
     linear: Linear
 
-    @property
+    @cached_property
     def covariance(self) -> Array:
         """(E, P, P) of the values."""
         total = self.information.copy()
         total[:, MEAN:, MEAN:] += self.prior.precision
-        diagonal = range(total.shape[1])
+        diagonal = np.einsum("eii->ei", total)  # a view
         # Sums of single precision are not exactly positive where the values can hardly be told apart.
-        total[:, diagonal, diagonal] *= 1 + _SINGLE
-        total[:, diagonal, diagonal] += _NOTHING
+        diagonal *= 1 + _SINGLE
+        diagonal += _NOTHING
         return np.asarray(np.linalg.inv(total), dtype=float)
 
     @property
@@ -158,7 +166,7 @@ def gauss_newton(
     model_of: Callable[[Part], Callable[[Array], Linear]],
     start: Array,
     prior: Prior,
-    weight: Single,
+    count: NDArray[np.int64],
     steps: int,
     more: int = MORE_STEPS,
 ) -> Fit:
@@ -171,48 +179,47 @@ def gauss_newton(
     start : (E, P) array
         Values to begin with.
     prior : Prior
-    weight : (E, N) array [1/DN^2]
+    count : (E,) array
         Of the pixels.
     steps, more : int
         Of all, and then of those that have not settled, at most.
     """
-    every = slice(None)
-    state = _State.of(model_of(every), start, prior, weight)
+    model = model_of(slice(None))
+    state = _State.of(model, start, prior)
     # What most fits still lack is little; those that cannot settle must not hold up the others.
-    state.settle(model_of(every), prior, weight, steps, _MOST)
+    state.settle(model, prior, steps, _MOST)
     restless = np.flatnonzero(state.size >= _SETTLED)
     if len(restless) and more:
         part = state.part(restless)
-        part.settle(model_of(restless), prior.part(restless), weight[restless], more, 1.0)
+        part.settle(model_of(restless), prior.part(restless), more, 1.0)
         state.put(restless, part)
-    linear = state.linear
-    information, _ = _normal(linear, weight)
-    chi2 = np.einsum("en,en,en->e", linear.residual, linear.residual, weight).astype(float)
-    count = (weight > 0).sum(axis=1).astype(np.int64)
-    return Fit(state.values, information, prior, chi2, count, state.size, linear)
+    information, chi2 = state.products[:, :-1, :-1], state.products[:, -1, -1]
+    return Fit(state.values, information, prior, chi2, count, state.size, state.linear)
 
 
 @dataclass(eq=False)
 class _State:
-    """Fits on their way: values, model there, cost, damping, and size of the last step."""
+    """Fits on their way: values, model there and its products, cost, damping, and size of the last step."""
 
     values: Array
     linear: Linear
+    products: Array
     cost: Array
     damping: Array
     size: Array
 
     @classmethod
-    def of(cls, model: Callable[[Array], Linear], values: Array, prior: Prior, weight: Single) -> _State:
+    def of(cls, model: Callable[[Array], Linear], values: Array, prior: Prior) -> _State:
         linear = model(values)
-        none = np.zeros(len(values))
-        return cls(values, linear, _cost(linear, weight, values, prior), none, none)
+        products, none = linear.products, np.zeros(len(values))
+        return cls(values, linear, products, _cost(products, values, prior), none, none)
 
     def part(self, which: NDArray[np.intp]) -> _State:
         """Some of the fits, to go on with."""
         return _State(
             self.values[which],
             self.linear.part(which),
+            self.products[which],
             self.cost[which],
             self.damping[which],
             self.size[which],
@@ -222,37 +229,38 @@ class _State:
         """Take over what has become of some of the fits."""
         self.values[which], self.size[which] = part.values, part.size
         self.linear.put(which, part.linear)
+        self.products[which] = part.products
 
-    def settle(
-        self, model: Callable[[Array], Linear], prior: Prior, weight: Single, steps: int, most: float
-    ) -> None:
+    def settle(self, model: Callable[[Array], Linear], prior: Prior, steps: int, most: float) -> None:
         """Levenberg-Marquardt steps until a share of the fits has settled."""
         for _ in range(steps):
-            step = self._step(prior, weight)
-            tried = _moved(self.values, step)
+            tried = _moved(self.values, self._step(prior))
             ahead = model(tried)
-            cost = _cost(ahead, weight, tried, prior)
+            products = ahead.products
+            cost = _cost(products, tried, prior)
             # Edges sharper than a pixel bend the model within a step: one that leads up is taken back.
             worse = ~(cost <= self.cost * (1 + _SINGLE) + _SINGLE)
             if worse.any():
                 back = np.flatnonzero(worse)
                 tried[back], cost[back] = self.values[back], self.cost[back]
+                products[back] = self.products[back]
                 ahead.put(back, self.linear.part(back))
-            shorter = np.maximum(10 * self.damping, _DAMPING)
-            longer = np.where(self.damping > _LEAST_DAMPING, 0.1 * self.damping, 0.0)
-            self.damping = np.where(worse, shorter, longer)
-            self.values, self.linear, self.cost = tried, ahead, cost
+            if worse.any() or self.damping.any():
+                shorter = np.maximum(10 * self.damping, _DAMPING)
+                longer = np.where(self.damping > _LEAST_DAMPING, 0.1 * self.damping, 0.0)
+                self.damping = np.where(worse, shorter, longer)
+            self.values, self.linear, self.products, self.cost = tried, ahead, products, cost
             if (self.size < _SETTLED).mean() >= most:
                 break
 
-    def _step(self, prior: Prior, weight: Single) -> Array:
+    def _step(self, prior: Prior) -> Array:
         """The next step; `size` becomes that of the undamped one."""
-        information, gradient = _normal(self.linear, weight)
+        information, gradient = self.products[:, :-1, :-1].copy(), self.products[:, :-1, -1].copy()
         pull = self.values[:, MEAN:] - prior.mean
         gradient[:, MEAN:] -= (prior.precision @ pull[:, :, None])[:, :, 0]
         information[:, MEAN:, MEAN:] += prior.precision
-        diagonal = range(information.shape[1])
-        information[:, diagonal, diagonal] += _NOTHING
+        diagonal = np.einsum("eii->ei", information)  # a view
+        diagonal += _NOTHING
         step = _solved(information, gradient)
         sharpest = (self.values[:, BLUR] <= _LEAST_BLUR) & (step[:, BLUR] < 0)
         if sharpest.any():
@@ -262,36 +270,29 @@ class _State:
             gradient[sharpest, BLUR] = 0.0
             information[sharpest, BLUR, BLUR] = 1.0
             step = _solved(information, gradient)
-        self.size = np.sqrt(np.maximum((step * gradient).sum(axis=1), 0))
-        damped = np.flatnonzero(self.damping)
-        if len(damped):
-            part = information[damped]
-            part[:, diagonal, diagonal] *= 1 + self.damping[damped, None]
-            step[damped] = _solved(part, gradient[damped])
+        self.size = np.sqrt(np.maximum(np.einsum("ei,ei->e", step, gradient), 0))
+        if self.damping.any():
+            diagonal *= 1 + self.damping[:, None]
+            damped = np.flatnonzero(self.damping)
+            step[damped] = _solved(information[damped], gradient[damped])
         return step
 
 
-def _cost(linear: Linear, weight: Single, values: Array, prior: Prior) -> Array:
-    chi2 = np.einsum("en,en,en->e", linear.residual, linear.residual, weight).astype(float)
+def _cost(products: Array, values: Array, prior: Prior) -> Array:
     pull = values[:, MEAN:] - prior.mean
-    return chi2 + np.einsum("ei,eij,ej->e", pull, prior.precision, pull)
+    return np.asarray(products[:, -1, -1] + np.einsum("ei,eij,ej->e", pull, prior.precision, pull))
 
 
 def _solved(information: Array, gradient: Array) -> Array:
     return np.asarray(np.linalg.solve(information, gradient[:, :, None])[:, :, 0], dtype=float)
 
 
-def _normal(linear: Linear, weight: Single) -> tuple[Array, Array]:
-    weighted = linear.jacobian * weight[:, None, :]
-    information = weighted @ linear.jacobian.swapaxes(1, 2)
-    gradient = weighted @ linear.residual[:, :, None]
-    return information.astype(float), gradient[:, :, 0].astype(float)
-
-
 def _moved(values: Array, step: Array) -> Array:
     """Values after a step, kept from leaving the range where the model is nearly linear."""
     sigma = values[:, BLUR]
-    places = np.clip(step[:, :MEAN], -sigma[:, None], sigma[:, None])
-    moved = values + np.concatenate([places, step[:, MEAN:]], axis=1)
-    moved[:, BLUR] = np.clip(moved[:, BLUR], np.maximum(0.6 * sigma, _LEAST_BLUR), 1.6 * sigma)
+    most = sigma[:, None]
+    moved = values + step
+    moved[:, :MEAN] = values[:, :MEAN] + np.minimum(np.maximum(step[:, :MEAN], -most), most)
+    least = np.maximum(0.6 * sigma, _LEAST_BLUR)
+    moved[:, BLUR] = np.minimum(np.maximum(moved[:, BLUR], least), 1.6 * sigma)
     return moved

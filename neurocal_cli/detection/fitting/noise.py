@@ -36,6 +36,7 @@ _ENOUGH = 10000  # pixels to learn the profile's shape from
 _TAILS, _BENDS = 0.01, 0.06
 _RIDGE = 1e-5
 _LEAST_SPREAD = 0.0002  # of levels, in variances of the noise
+_TINY = np.float32(1e-30)
 
 
 @dataclass(frozen=True)
@@ -47,19 +48,19 @@ class Noise:
     light: float
 
     @classmethod
-    def of(cls, fit: Fit, weight: Single, floor: float) -> Noise:
+    def of(cls, fit: Fit, root: Single, floor: float) -> Noise:
         """From the residuals of fits.
 
         Parameters
         ----------
         fit : Fit
-        weight : (E, N) array
-            0 for pixels not used.
+        root : (E, N) array [1/DN]
+            With which they were fitted, 0 for pixels not used.
         floor : float [DN^2]
             Variance that rounding makes at least.
         """
-        x, used = fit.linear.x, weight > 0
-        square = fit.linear.residual**2
+        x, used = fit.linear.x, root > 0
+        square = np.square(fit.linear.residual / np.maximum(root, _TINY))
         variances = []
         for part in (x < -_FLAT, np.abs(x) <= _FLAT, x > _FLAT):
             mine = part & used
@@ -74,11 +75,12 @@ class Noise:
         """All of it more by a factor."""
         return Noise(factor * self.dark, factor * self.edge, factor * self.light)
 
-    def weighted(self, x: Single, used: Single) -> Single:
-        """Inverse variances [1/DN^2] of pixels at a light x between the levels; 0 where not used."""
-        at = np.clip(x, -1, 1)
-        variance = self.edge + np.where(at < 0, self.edge - self.dark, self.light - self.edge) * at
-        return np.where(used > 0, 1 / variance, 0).astype(np.float32)
+    def weights(self, x: Single) -> Single:
+        """Inverse variances [1/DN^2] of pixels at a light x between the levels."""
+        variance = np.minimum(np.maximum(x, 0), 1) * np.float32(self.light - self.edge)
+        variance += np.maximum(np.minimum(x, 0), -1) * np.float32(self.edge - self.dark)
+        variance += np.float32(self.edge)
+        return np.reciprocal(variance, out=variance)
 
 
 def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_]) -> Shape:
@@ -96,27 +98,28 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
         Edges to use.
     """
     # A share of the pixels is enough for a dozen numbers.
-    step = max(1, int((data.weight[good] > 0).sum()) // _ENOUGH)
+    step = max(1, int(data.count[good].sum()) // _ENOUGH)
     edges = np.flatnonzero(good)[:, None]
     # Each edge another share, or all of them would be from the same places across the edges.
     some = (edges, np.arange(0, data.s.shape[1] - step + 1, step) + 7 * edges % step)
     z, x, Q = fit.linear.z[some], fit.linear.x[some], data.Q[some]
     _, density = erf_and_density(z)
-    scale = fit.values[good, CONTRAST].astype(np.float32)[:, None] * data.gain[some]
+    root = data.root[some]
+    scale = data.gain[some] * root
+    scale *= fit.values[good, CONTRAST].astype(np.float32)[:, None]
     steep = scale * Q if not shape.bend.any() else response(x, shape.bend)[1] * Q * scale
     # Edge by edge: small products, for which no threads are started.
-    columns = np.empty((len(z), RESPONSE_TERMS + 6, z.shape[1]), dtype=np.float32)
+    columns = np.empty((len(z), RESPONSE_TERMS + 7, z.shape[1]), dtype=np.float32)
     tails, bends, others = np.split(columns, [2, 2 + RESPONSE_TERMS], axis=1)
     tail_terms(z, density, out=tails)
     tails *= steep[:, None]
     response_terms(x, scale, out=bends)
-    others[:, 0] = fit.linear.jacobian[:, OFFSET][some]
-    others[:, 1] = fit.linear.jacobian[:, BLUR][some]
+    others[:, 0], others[:, 1] = (fit.linear.rows[:, k][some] for k in (OFFSET, BLUR - 1))
     np.multiply(x, scale, out=others[:, 2])
-    others[:, 3] = 1
-    weighted = columns * data.weight[some][:, None]
-    normal = (weighted @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
-    right = (weighted @ fit.linear.residual[some][:, :, None]).sum(axis=(0, 2), dtype=float)
+    others[:, 3] = root
+    others[:, 4] = fit.linear.residual[some]
+    products = (columns @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
+    normal, right = products[:-1, :-1].copy(), products[:-1, -1].copy()
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
     # Blur, contrast, tails and the odd terms of the response can nearly stand in for one another.
     believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _BENDS)]) ** -2

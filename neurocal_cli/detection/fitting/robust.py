@@ -69,8 +69,8 @@ class Rows:
     @property
     def telling(self) -> NDArray[np.bool_]:
         """(N,) rows that tell something about the map; anchors, which may be more than half, do not."""
-        typical = np.sort(self.variance)[len(self.variance) // 4]
-        return np.asarray(self.variance < 100 * typical)
+        quarter = len(self.variance) // 4
+        return np.asarray(self.variance < 100 * np.partition(self.variance, quarter)[quarter])
 
     def and_(self, other: Rows) -> Rows:
         """Both together."""
@@ -144,42 +144,48 @@ def settled_map(start: SmoothMap, rows: Rows, shift: Array, steps: int, worth: f
     free, m = start.free, len(start.free)
     prior = np.concatenate([start.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
     values = np.concatenate([start.parameters[free], shift])
-    rows_there = _Rows.of(start, rows)
-    residual, jacobian = rows_there.residual(start, shift, free)
+    seen = _Rows.of(start, rows)
+    residual, jacobian = seen.residual(start, shift, free)
     # Before the first step everything may be off, the shifts above all.
-    precision, telling = 1 / rows.variance, rows.telling
+    precision, telling = seen.steep * seen.steep, rows.telling
     weight, damping, least = precision, _DAMPING, 0.0
+    square = residual * residual
     for _ in range(steps):
-        normal = (jacobian * weight) @ jacobian.T
-        gradient = jacobian @ (weight * residual) - prior * values
+        weighted = jacobian * weight
+        gradient = weighted @ residual - prior * values
+        normal = weighted @ jacobian.T
         normal.ravel()[:: len(values) + 1] += prior
-        step = _solved(normal, gradient, damping)
-        tried, moved = replace(start, parameters=start.parameters.copy()), values + step
+        moved = values + _solved(normal, gradient, damping)
+        tried = replace(start, parameters=start.parameters.copy())
         tried.parameters[free] = moved[:m]
-        ahead, slopes = rows_there.residual(tried, moved[m:], free)
-        before = weight @ residual**2 + prior @ values**2
-        after = weight @ ahead**2 + prior @ moved**2
+        ahead, slopes = seen.residual(tried, moved[m:], free)
+        square_ahead = ahead * ahead
+        before = weight @ square + prior @ (values * values)
+        after = weight @ square_ahead + prior @ (moved * moved)
         if not after <= before:
             # Where parameters can stand in for one another, it would be so again.
             damping = least = 10 * damping
             continue
-        start, values, residual, jacobian = tried, moved, ahead, slopes
+        start, values, residual, jacobian, square = tried, moved, ahead, slopes, square_ahead
         damping = max(0.1 * damping, least)
         if before - after < worth:
             break
         worth = 0.0
-        z = residual * rows_there.steep
+        z = residual * seen.steep
         scale = usual_scale(z[telling])
-        weight = _tukey(z / scale) * precision
         if before - after < max(_SETTLED * scale**2, _CREEPING * after) and damping <= max(_DAMPING, least):
             break
+        weight = _tukey(z / scale) * precision
     return Settled(start, values[m:], residual, jacobian)
 
 
 def median(x: Array) -> float:
     """The median, of an even number the upper one; numpy's takes ten times as long for a few hundred."""
-    flat = np.sort(x, axis=None)
-    return float(flat[len(flat) // 2]) if len(flat) else float("nan")
+    flat = x.flatten()
+    if not len(flat):
+        return float("nan")
+    flat.partition(len(flat) // 2)
+    return float(flat[len(flat) // 2])
 
 
 def loss_of(z: Array) -> float:
@@ -188,7 +194,8 @@ def loss_of(z: Array) -> float:
 
 
 def _tukey(z: Array) -> Array:
-    return np.asarray(np.clip(1 - (z / _TUKEY) ** 2, 0, None) ** 2)
+    weight = np.maximum(1 - np.square(z * (1 / _TUKEY)), 0)
+    return np.square(weight, out=weight)
 
 
 def usual_scale(z: Array) -> float:
@@ -205,18 +212,18 @@ class _Rows:
 
     rows: Rows
     places: Places
-    direction: Array
     steep: Array  # inverse standard deviations
 
     @classmethod
     def of(cls, form: SmoothMap, rows: Rows) -> _Rows:
         direction = np.ascontiguousarray(rows.direction.T)
-        return cls(rows, form.places(rows.grid), direction, 1 / np.sqrt(rows.variance))
+        return cls(rows, form.places(rows.grid, direction), 1 / np.sqrt(rows.variance))
 
     def residual(self, now: SmoothMap, shift: Array, free: NDArray[np.intp]) -> tuple[Array, Array]:
         """Residuals (N,), and derivatives (P, N) of what they are compared with."""
-        value, along = now.along(self.places, self.direction)
-        residual = self.rows.value - value - self.rows.shift @ shift
+        value, along = now.along(self.places)
+        residual = self.rows.value - value
+        residual -= self.rows.shift @ shift
         return residual, np.concatenate([along[free], self.rows.shift.T])
 
 

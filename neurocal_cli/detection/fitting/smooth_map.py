@@ -13,6 +13,7 @@ degree from 2 on.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,18 +63,23 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Grid points as maps of one form need them.
+    """Grid points, each with a direction in the image, as maps of one form need them.
 
     Attributes
     ----------
-    x, y : (N,) arrays
-        Scaled coordinates.
-    rest : (m, N) array or None
-        Values of the polynomials there.
+    ground : (3, N) array
+        Scaled coordinates x and y, and 1.
+    way : (2, N) array [px]
+        Unit vectors, times the frame's unit.
+    origin : (N,) array [px]
+        The frame's centre along them.
+    rest : (2 m, N) array or None [px]
+        What the polynomials' coefficients change there, along u and along v.
     """
 
-    x: Array
-    y: Array
+    ground: Array
+    way: Array
+    origin: Array
     rest: Array | None
 
 
@@ -139,20 +145,25 @@ class SmoothMap:
             q = q + terms @ values[_REST:].reshape(2, -1).T
         return np.asarray(frame.centre + frame.unit * q)
 
-    def places(self, grid: Array) -> Places:
-        """Grid points (N, 2), prepared for maps of this form."""
-        x, y = ((grid - self.frame.origin) / self.frame.half).T
-        return Places(x, y, _rest(self.degree, self.frame, x, y).T if self.degree else None)
+    def places(self, grid: Array, direction: Array) -> Places:
+        """Grid points (N, 2) and unit vectors (2, N), prepared for maps of this form."""
+        frame = self.frame
+        ground = np.ones((3, len(grid)))
+        ground[:2] = ((grid - frame.origin) / frame.half).T
+        way = frame.unit * direction
+        rest = None
+        if self.degree:
+            terms = _rest(self.degree, frame, ground[0], ground[1]).T
+            rest = (way[:, None] * terms).reshape(-1, len(grid))
+        return Places(ground, way, frame.centre @ direction, rest)
 
-    def along(self, places: Places, direction: Array) -> tuple[Array, Array]:
-        """Pixels along one direction for each place, and what they change by.
+    def along(self, places: Places) -> tuple[Array, Array]:
+        """Pixels along the places' directions, and what they change by.
 
         Parameters
         ----------
         places : Places
-            Of N grid points.
-        direction : (2, N) array
-            Unit vectors.
+            N of them.
 
         Returns
         -------
@@ -160,38 +171,51 @@ class SmoothMap:
         derivatives : (P, N) array
             By the parameters; 0 for those of the lens that are held.
         """
-        frame, values = self.frame, self.parameters
-        x, y = places.x, places.y
-        w = 1 / (1 + values[6] * x + values[7] * y)
-        q_u = (values[0] * x + values[1] * y + values[2]) * w
-        q_v = (values[3] * x + values[4] * y + values[5]) * w
-        d_u, d_v = frame.unit * direction
-        value = frame.centre @ direction + d_u * q_u + d_v * q_v
-        out = np.zeros((len(values), len(x)))
+        values, way = self.parameters, places.way
+        out = np.empty((len(values), way.shape[1]))
+        homogeneous = np.append(values[:_HOMOGRAPHY], 1.0).reshape(3, 3) @ places.ground
+        depth = 1 / homogeneous[2]
+        q = homogeneous[:2] * depth
+        value = (way * q).sum(axis=0)
+        value += places.origin
         if places.rest is not None:
-            m = len(places.rest)
-            np.multiply(places.rest, d_u, out=out[_REST : _REST + m])
-            np.multiply(places.rest, d_v, out=out[_REST + m :])
-            value += values[_REST:] @ out[_REST:]
+            out[_REST:] = places.rest
+            value += values[_REST:] @ places.rest
         if self.radial:
-            (c_u, c_v, k1, k2), metric = values[8:12], self._metric
-            e_u, e_v = q_u - c_u, q_v - c_v
-            slope_u, slope_v = metric @ np.stack([e_u, e_v])
-            rho = e_u * slope_u + e_v * slope_v
-            length = d_u * e_u + d_v * e_v
-            stretch, growth = rho * (k1 + k2 * rho), (k1 + 2 * k2 * rho) * length
-            value += length * stretch
-            bent_u, bent_v = d_u * stretch + 2 * growth * slope_u, d_v * stretch + 2 * growth * slope_v
-            out[8], out[9] = -bent_u, -bent_v
-            out[10], out[11] = length * rho, length * rho**2
-            out[12], out[13] = growth * (e_u * e_u - e_v * e_v), growth * (2 * e_u * e_v)
-            d_u, d_v = d_u + bent_u, d_v + bent_v
-        ground_x, ground_y = x * w, y * w
-        out[0], out[1], out[2] = d_u * ground_x, d_u * ground_y, d_u * w
-        out[3], out[4], out[5] = d_v * ground_x, d_v * ground_y, d_v * w
-        towards = d_u * q_u + d_v * q_v
-        out[6], out[7] = -towards * ground_x, -towards * ground_y
+            further, bent = self._lens(q, way, out[_HOMOGRAPHY:_REST])
+            value += further
+            way = way + bent
+        else:
+            out[_HOMOGRAPHY:_REST] = 0.0
+        ground = places.ground * depth
+        np.multiply(way[:, None], ground, out=out[:6].reshape(2, 3, -1))
+        towards = (way * q).sum(axis=0)
+        np.multiply(ground[:2], -towards, out=out[6:8])
         return value, out
+
+    def _lens(self, q: Array, way: Array, out: Array) -> tuple[Array, Array]:
+        """What the lens adds along ways (2, N), and to these; out (6, N) takes its derivatives."""
+        (k1, k2), metric = self.parameters[10:12], self._metric
+        e = q - self.parameters[8:10, None]
+        slope = metric @ e
+        rho = (e * slope).sum(axis=0)
+        length = (way * e).sum(axis=0)
+        stretch = rho * k2
+        growth = stretch * 2
+        stretch += k1
+        stretch *= rho
+        growth += k1
+        growth *= length
+        bent = way * stretch
+        slope *= 2 * growth
+        bent += slope
+        np.negative(bent, out=out[:2])
+        np.multiply(length, rho, out=out[2])
+        np.multiply(out[2], rho, out=out[3])
+        e_u, e_v = e
+        np.multiply(growth, e_u * e_u - e_v * e_v, out=out[4])
+        np.multiply(growth, 2 * e_u * e_v, out=out[5])
+        return length * stretch, bent
 
     @property
     def _metric(self) -> Array:
@@ -201,7 +225,7 @@ class SmoothMap:
     def variance(self, grid: Array, direction: Array) -> Array:
         """Variance [px^2] of the map along unit vectors (N, 2) at grid points (N, 2)."""
         assert self.covariance is not None
-        _, along = self.along(self.places(grid), direction.T)
+        _, along = self.along(self.places(grid, direction.T))
         return np.asarray((along * (self.covariance @ along)).sum(axis=0))
 
 
@@ -224,15 +248,20 @@ def _project(values: Array, x: Array, y: Array) -> Array:
     return np.stack([u, v], axis=-1)
 
 
-def _orders(degree: int, frame: Frame) -> list[tuple[int, int]]:
+def _orders(degree: int, frame: Frame) -> tuple[tuple[int, int], ...]:
     """Orders (i, j) of the polynomials in x and in y.
 
     Edges tell a place along a line only at the line's vertices. An order as high as their number less
     one can be anything between them.
     """
-    most_x, most_y = np.maximum(2 * frame.half - 1, 0)
+    most_x, most_y = (2 * frame.half - 1).tolist()
+    return _orders_up_to(degree, max(most_x, 0), max(most_y, 0))
+
+
+@lru_cache(maxsize=64)
+def _orders_up_to(degree: int, most_x: float, most_y: float) -> tuple[tuple[int, int], ...]:
     orders = [(i, total - i) for total in range(2, degree + 1) for i in range(total + 1)]
-    return [(i, j) for i, j in orders if i <= most_x and j <= most_y]
+    return tuple((i, j) for i, j in orders if i <= most_x and j <= most_y)
 
 
 def _rest(degree: int, frame: Frame, x: Array, y: Array) -> Array:

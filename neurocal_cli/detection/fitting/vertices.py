@@ -52,7 +52,8 @@ class VertexData:
     Q : array
         With the sign of the square.
     rho : (V, 1) array
-    weight : array [1/DN^2]
+    root : array [1/DN]
+        Inverse standard deviation of the noise; 0 for pixels that are not used.
     beyond : (V,) array
         Share of the strips' pixels that lie outside the image.
     """
@@ -65,7 +66,7 @@ class VertexData:
     gain: Single
     Q: Single
     rho: Single
-    weight: Single
+    root: Single
     beyond: Array
 
     def part(self, which: Part) -> VertexData:
@@ -183,7 +184,7 @@ def fit_vertices(
         some = (levers[0][part], levers[1][part])
         return lambda values: linearised(pixels, some, values, form)
 
-    return gauss_newton(model_of, start, prior, data.weight, steps)
+    return gauss_newton(model_of, start, prior, np.count_nonzero(data.root, axis=1), steps)
 
 
 def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, shape: Shape) -> Linear:
@@ -194,26 +195,28 @@ def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, s
     z1 = (data.d1 - offset1 - tilt1 * levers[0]) / sigma
     z2 = (data.d2 - offset2 - tilt2 * levers[1]) / sigma
     halves = (None, None) if shape.half is None else (shape.half[:, 0], shape.half[:, 1])
-    E1, slope1, widening1, density1 = sharp_profile(z1, sigma, shape.tails, halves[0])
-    E2, slope2, widening2, density2 = sharp_profile(z2, sigma, shape.tails, halves[1])
+    E1, slope1, spread1, density1 = sharp_profile(z1, sigma, shape.tails, halves[0])
+    E2, slope2, spread2, density2 = sharp_profile(z2, sigma, shape.tails, halves[1])
     rho = data.rho
     series, bent1, bent2 = _crossed(z1, z2, rho, density1 * density2)
     x = np.asarray((E1 * E2 + series) * data.Q, dtype=data.value.dtype)
     by_z1, by_z2 = (slope1 * E2 + bent1) * data.Q, (slope2 * E1 + bent2) * data.Q
-    widening = (widening1 * E2 + E1 * widening2 - z1 * bent1 - z2 * bent2) * data.Q
     F, steep = response(x, shape.bend)
-    factor = -contrast / sigma * steep * data.gain
+    gain = data.gain * data.root
+    factor = -contrast / sigma * steep * gain
     by_z1 *= factor
     by_z2 *= factor
-    jacobian = np.empty((len(x), 7, x.shape[1]), dtype=data.value.dtype)
-    jacobian[:, FIRST], jacobian[:, FIRST + 1] = by_z1, by_z1 * levers[0]
-    jacobian[:, SECOND], jacobian[:, SECOND + 1] = by_z2, by_z2 * levers[1]
-    jacobian[:, 4] = 1
-    jacobian[:, 5] = F * data.gain
-    jacobian[:, 6] = -factor * widening
-    residual = data.value - mean - contrast * jacobian[:, 5]
+    rows = np.empty((len(x), 8, x.shape[1]), dtype=data.value.dtype)
+    rows[:, FIRST], rows[:, FIRST + 1] = by_z1, by_z1 * levers[0]
+    rows[:, SECOND], rows[:, SECOND + 1] = by_z2, by_z2 * levers[1]
+    rows[:, 4] = data.root
+    rows[:, 5] = F * gain
+    rows[:, 6] = z1 * by_z1 + z2 * by_z2
+    if spread1 is not None and spread2 is not None:
+        rows[:, 6] -= factor * (spread1 * E2 + E1 * spread2) * data.Q
+    rows[:, 7] = (data.value - mean) * data.root - contrast * rows[:, 5]
     z = np.where(np.abs(z1) < np.abs(z2), z1, z2)
-    return Linear(jacobian, residual, z, x)
+    return Linear(rows, z, x)
 
 
 def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, Real]:

@@ -62,92 +62,114 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
     grey : (height, width) array
     grid : Grid
     """
-    return {direction: _judge(_side(grey, grid, direction)) for direction in DIRECTIONS}
+    with np.errstate(invalid="ignore"):  # what is not known is nan
+        sides = _opposite(grey, grid.pixels.transpose(1, 0, 2), grid.dark)
+        sides += _opposite(grey, grid.pixels, grid.dark)
+        return {direction: _judge(side) for direction, side in zip(DIRECTIONS, sides, strict=True)}
 
 
 def _judge(side: _Side) -> End:
     ring = side.profile[:, _RING].mean(axis=1)
-    beyond = side.profile[:, _BEYOND].mean(axis=1)
-    with np.errstate(invalid="ignore"):
-        valid = np.abs(ring - side.light) < _SAME
-    if valid.sum() < max(_FEWEST, 0.6 * len(valid)):
+    valid = np.abs(ring - side.light) < _SAME
+    count = np.count_nonzero(valid)
+    if count < max(_FEWEST, 0.6 * len(valid)):
         return End.UNKNOWN
-    ring, beyond, light = ring[valid], beyond[valid], side.light[valid]
+    profile, ring, light = side.profile[valid], ring[valid], side.light[valid]
     if light.all() or not light.any():
         return End.UNKNOWN
+    beyond = profile[:, _BEYOND].mean(axis=1)
     turns = np.abs(beyond - ring) > _SAME
-    at_line = np.abs(_crossings(side.profile[valid], ring, beyond) - 1) < _AT_THE_LINE
-    step = float(np.median(beyond[~light]) - np.median(beyond[light]))
-    if step > _DIFFERENT and (turns & at_line).mean() >= _SHARE:
+    at_line = np.abs(_crossings(profile, ring, beyond) - 1) < _AT_THE_LINE
+    agreeing, turning = np.count_nonzero(turns & at_line), np.count_nonzero(turns)
+    step = _median(beyond[~light]) - _median(beyond[light])
+    if step > _DIFFERENT and agreeing >= _SHARE * count:
         return End.PATTERN
-    if abs(step) < _SAME and turns.sum() >= _FEWEST and at_line[turns].mean() >= _SHARE:
+    if abs(step) < _SAME and turning >= _FEWEST and agreeing >= _SHARE * turning:
         return End.BOARD
     return End.UNKNOWN
+
+
+def _median(x: Array) -> float:
+    """The median; nan where anything is."""
+    ordered = np.sort(x)  # nan comes last
+    middle = 0.5 * (ordered[(len(x) - 1) // 2] + ordered[len(x) // 2])
+    return float("nan") if np.isnan(ordered[-1]) else float(middle)
 
 
 def _crossings(profile: Array, ring: Array, beyond: Array) -> Array:
     """Where each profile is halfway between its ends [squares]; meaningless where those are equal."""
     rise = np.where(beyond > ring, 1.0, -1.0)[:, None]
     height = rise * (profile - 0.5 * (ring + beyond)[:, None])
-    above = height[:, 1:] > 0
-    k = np.argmax(above, axis=1)  # the first step that is past the middle
+    k = np.argmax(height[:, 1:] > 0, axis=1)  # the first step that is past the middle
     rows = np.arange(len(k))
     low, high = height[rows, k], height[rows, k + 1]
-    share = np.clip(-low / np.where(high == low, 1.0, high - low), 0.0, 1.0)
+    share = np.minimum(np.maximum(-low / np.where(high == low, 1.0, high - low), 0.0), 1.0)
     return _STEPS[k] + share * (_STEPS[k + 1] - _STEPS[k])
 
 
-def _side(grey: NDArray[np.generic], grid: Grid, direction: tuple[int, int]) -> _Side:
-    """Profiles across one side, from the ring's squares outwards."""
-    # Rows of vertices parallel to the side, the outermost first; vertices along it in image order.
-    rows = grid.pixels.transpose(1, 0, 2) if direction[0] else grid.pixels
-    rows = rows[::-1] if max(direction) > 0 else rows
-    along = np.arange(rows.shape[1] - 1)
-    outer = -1 if min(direction) < 0 else (grid.shape[0] if direction[0] else grid.shape[1]) - 1
-    light = (along + outer + grid.dark) % 2 == 1  # a square's colour is that of its first vertex
-    inner = _between(rows[0] + 0.5 * (rows[1] - rows[0]), np.array([0.5]))  # centres of the squares inside
-    level = _sample(grey, inner)[:, 0]
-    padded = np.concatenate([[np.nan], level, [np.nan]])
-    neighbours = np.stack([padded[:-2], padded[2:]])
-    known = np.isfinite(neighbours)
-    with np.errstate(invalid="ignore"):
-        same = np.where(known, neighbours, 0).sum(axis=0) / known.sum(axis=0)  # of the ring's colour
-        contrast = np.where(light, same - level, level - same)
-        dark = np.where(light, level, same)
-        contrast = np.where(contrast > 0, contrast, np.nan)
-    outwards = _beyond(rows)
-    places = np.stack([_between(line, _ACROSS) for line in outwards], axis=1)  # (N, steps, across, 2)
-    values = _sample(grey, places).mean(axis=-1)
-    return _Side(light, (values - dark[:, None]) / contrast[:, None])
+def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[_Side]:
+    """Profiles across two opposite sides, from the ring's squares outwards.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+    rows : (rows, n, 2) array [px]
+        Of vertices parallel to the sides, those along each in image order.
+    dark : int
+        The grid's.
+    """
+    few = min(len(rows), 3)
+    ends = np.stack([rows[:few], rows[: -few - 1 : -1]])  # (2, few, n, 2), the outermost first
+    outer = np.array([[-1], [len(rows) - 1]])
+    # A square's colour is that of its first vertex.
+    light = (np.arange(rows.shape[1] - 1) + outer + dark) % 2 == 1
+    inner = _between(0.5 * (ends[:, 0] + ends[:, 1]), np.array([0.5]))  # centres of the squares inside
+    places = _between(_beyond(ends), _ACROSS)  # (2, steps, n - 1, across, 2)
+    values = _sample(grey, np.concatenate([inner.reshape(-1, 2), places.reshape(-1, 2)]))
+    level, values = values[: light.size].reshape(light.shape), values[light.size :].reshape(places.shape[:-1])
+    padded = np.full((2, light.shape[1] + 2), np.nan)
+    padded[:, 1:-1] = level
+    # Of the ring's colour is what lies beside the square inside: one neighbour may be missing.
+    before, after = padded[:, :-2], padded[:, 2:]
+    same = 0.5 * (np.where(np.isnan(before), after, before) + np.where(np.isnan(after), before, after))
+    contrast = np.where(light, same - level, level - same)
+    darker = np.where(light, level, same)
+    contrast[~(contrast > 0)] = np.nan
+    profile = (values.mean(axis=-1).swapaxes(1, 2) - darker[..., None]) / contrast[..., None]
+    return [_Side(*side) for side in zip(light, profile, strict=True)]
 
 
-def _beyond(rows: Array) -> Array:
-    """Points beyond the outer row at ``_STEPS``, by a parabola through three rows or a line through two."""
+def _beyond(ends: Array) -> Array:
+    """Points (2, steps, n, 2) beyond the outer rows at ``_STEPS``, by parabolas through three rows or lines.
+
+    Parameters
+    ----------
+    ends : (2, 2 or 3, n, 2) array
+    """
     t = -_STEPS[:, None, None]
-    line = rows[0] + t * (rows[1] - rows[0])
-    if len(rows) < 3:
+    first, second = ends[:, :1], ends[:, 1:2]
+    line = first + t * (second - first)
+    if ends.shape[1] < 3:
         return line
-    bend = 0.5 * t * (t - 1) * (rows[2] - 2 * rows[1] + rows[0])
-    return line + np.where(np.isfinite(bend), bend, 0.0)
+    bend = ends[:, 2:] - 2 * second + first
+    return line + 0.5 * t * (t - 1) * np.where(np.isnan(bend), 0.0, bend)
 
 
 def _between(line: Array, shares: Array) -> Array:
-    """Points between neighbours on a line; (N - 1, shares, 2) array."""
-    return line[:-1, None] + shares[:, None] * (line[1:, None] - line[:-1, None])
+    """Points between neighbours on lines (..., n, 2); (..., n - 1, shares, 2) array."""
+    return line[..., :-1, None, :] + shares[:, None] * (line[..., 1:, None, :] - line[..., :-1, None, :])
 
 
 def _sample(grey: NDArray[np.generic], places: Array) -> Array:
-    """Image between its pixels, linearly; NaN outside."""
+    """Image between its pixels, linearly, at places (N, 2); NaN outside."""
     height, width = grey.shape
     if height < 2 or width < 2:
-        return np.full(places.shape[:-1], np.nan)
-    u, v = places[..., 0], places[..., 1]
-    with np.errstate(invalid="ignore"):
-        inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
+        return np.full(len(places), np.nan)
+    u, v = places.T
+    inside = (u >= 0) & (v >= 0) & (u <= width - 1) & (v <= height - 1)
     u, v = np.where(inside, u, 0.0), np.where(inside, v, 0.0)
     i = np.minimum(u.astype(np.intp), width - 2)
     j = np.minimum(v.astype(np.intp), height - 2)
     a, b = u - i, v - j
-    corners = [grey[j + dj, i + di].astype(float) for dj in (0, 1) for di in (0, 1)]
-    weights = [(1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b]
-    return np.where(inside, sum(w * c for w, c in zip(weights, corners, strict=True)), np.nan)
+    upper, lower = ((1 - a) * grey[j + k, i] + a * grey[j + k, i + 1] for k in (0, 1))
+    return np.where(inside, (1 - b) * upper + b * lower, np.nan)

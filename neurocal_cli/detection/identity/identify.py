@@ -154,7 +154,8 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
     for size in sorted({tuple(sorted((plane.cols, plane.rows))) for plane in board.planes}):
         room = sum(tuple(sorted((plane.cols, plane.rows))) == size for plane in board.planes)
         alike = [c for c in candidates if c.whole and tuple(sorted(c.grid.shape)) == size]
-        alike.sort(key=lambda c: -_square(c.grid))
+        if len(alike) > 1:
+            alike.sort(key=lambda c: -_square(c.grid))
         if len(alike) > room and _square(alike[room - 1].grid) < _NEARER * _square(alike[room].grid):
             raise NoBoardError(
                 f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices found; show only one of them"

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from neurocal_cli.board import Plane
 from neurocal_cli.detection.grid import Grid
@@ -83,33 +83,41 @@ def placements(
     mirrored : bool
         Whether the plane may be seen from the side its axes turn the other way on.
     """
-    last = np.array([plane.cols, plane.rows]) - 1
+    last = plane.cols - 1, plane.rows - 1
+    cols, rows = grid.shape
     for matrix in (*_TURNS, *(_MIRRORED if mirrored else ())):
-        corners = np.array([[0, 0], np.array(grid.shape) - 1]) @ np.array(matrix).T
-        low, size = corners.min(axis=0), np.ptp(corners, axis=0)
-        if (size > last).any():
-            continue
-        for shift in product(*(range(int(room) + 1) for room in last - size)):
-            start = np.array(shift)
-            if _allowed(matrix, start, start + size, last, ends):
-                offset = start - low
-                yield Placement(index, matrix, (int(offset[0]), int(offset[1])))
+        corner = [a * (cols - 1) + b * (rows - 1) for a, b in matrix]  # opposite to (0, 0)
+        size = abs(corner[0]), abs(corner[1])
+        for start in product(*(range(most - long + 1) for most, long in zip(last, size, strict=True))):
+            stop = start[0] + size[0], start[1] + size[1]
+            if _allowed(matrix, (start, stop), last, ends):
+                yield Placement(index, matrix, (start[0] - min(corner[0], 0), start[1] - min(corner[1], 0)))
 
 
 def _allowed(
     matrix: Matrix,
-    start: NDArray[np.int64],
-    stop: NDArray[np.int64],
-    last: NDArray[np.int64],
+    reach: tuple[tuple[int, ...], tuple[int, int]],
+    last: tuple[int, int],
     ends: Mapping[tuple[int, int], End],
 ) -> bool:
-    """Whether the sides of a grid lie at the plane's ends where the board ends, and not where it goes on."""
+    """Whether the sides of a grid lie at the plane's ends where the board ends, and not where it goes on.
+
+    Parameters
+    ----------
+    matrix : 2 x 2 ints
+    reach : pair of pairs of ints
+        Least and greatest coordinates of the grid on the plane.
+    last : pair of ints
+        Greatest coordinates of the plane.
+    ends : dict of End
+    """
+    start, stop = reach
     for direction, end in ends.items():
         if end is End.UNKNOWN:
             continue
-        outwards = np.array(matrix) @ np.array(direction)
-        axis = int(np.flatnonzero(outwards)[0])
-        at_end = bool(start[axis] == 0 if outwards[axis] < 0 else stop[axis] == last[axis])
+        outwards = [a * direction[0] + b * direction[1] for a, b in matrix]
+        axis = 0 if outwards[0] else 1
+        at_end = start[axis] == 0 if outwards[axis] < 0 else stop[axis] == last[axis]
         if at_end != (end is End.BOARD):
             return False
     return True
