@@ -6,6 +6,7 @@ import numpy as np
 
 from neurocal_cli.detection.finding.grow import Lattice, signs
 from neurocal_cli.detection.finding.levels import Level, sampled
+from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
 
 __all__ = ["edges_seen", "has_block", "is_smooth"]
@@ -37,8 +38,8 @@ def roughness(level: Level, lattice: Lattice) -> float:
     """How far vertices are from where their neighbours put them, over what is tolerated."""
     row, col, at = lattice.known
     off = at.in_squares(lattice.pixels[row, col] - at.points) / np.maximum(at.spread, 1.0)[:, None]
-    contrast = max(float(np.nanmedian(lattice.contrast)), 1e-3)
-    tolerated = _OFF + (_OFF_PX + _OFF_NOISE * level.noise / contrast) / max(float(np.median(at.width)), 1.0)
+    contrast = max(median(lattice.contrast), 1e-3)
+    tolerated = _OFF + (_OFF_PX + _OFF_NOISE * level.noise / contrast) / max(median(at.width), 1.0)
     return float(np.sqrt((off**2).mean())) / tolerated
 
 

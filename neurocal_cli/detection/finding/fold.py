@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.grow import Lattice, cropped
+from neurocal_cli.detection.medians import median, quantile
 from neurocal_cli.geometry import Array
 
-__all__ = ["joined", "unfolded"]
+__all__ = ["folded", "joined", "restricted", "unfolded"]
 
 # The least bend that is a fold [squares] and its ratio to the bends of the rows far from it: paper
 # is bent too, and the less the better the board is otherwise.
@@ -51,12 +52,19 @@ def unfolded(lattice: Lattice) -> list[Lattice]:
         kept = np.where(side[:, None, None], pixels, np.nan)
         if pixels is not lattice.pixels:
             kept = kept.transpose(1, 0, 2)
-        part = _restricted(lattice, np.isfinite(kept[..., 0]))
+        part = restricted(lattice, np.isfinite(kept[..., 0]))
         parts += unfolded(part) if part.seen.any() else []
     return parts
 
 
-def _restricted(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:
+def folded(lattice: Lattice) -> bool:
+    """Whether a lattice runs over a fold."""
+    row, col = _folds(lattice)
+    return row[1] > 0 or col[1] > 0
+
+
+def restricted(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:
+    """Some of a lattice's vertices."""
     pixels = np.where(kept[..., None], lattice.pixels, np.nan)
     return cropped(replace(lattice, pixels=pixels, contrast=np.where(kept, lattice.contrast, np.nan)))
 
@@ -66,20 +74,18 @@ def joined(lattice: Lattice) -> list[Lattice]:
     count, label = cv2.connectedComponents(lattice.seen.astype(np.uint8), connectivity=4)
     if count == 2:
         return [cropped(lattice)]
-    return [_restricted(lattice, label == k) for k in range(1, count)]
+    return [restricted(lattice, label == k) for k in range(1, count)]
 
 
 def _folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
     """The sharpest folds along a row and along a column, see `_fold`."""
     pixels = lattice.pixels
     row, col, at = lattice.known
-    width = max(float(np.median(at.width)), 1.0)
+    width = max(median(at.width), 1.0)
     folds = []
-    for axis in (0, 1):
-        line = np.moveaxis(pixels, axis, 0)
-        second = np.full(line.shape, np.nan)
-        second[1:-1] = line[2:] - 2 * line[1:-1] + line[:-2]
-        index = (row, col) if axis == 0 else (col, row)
+    for lines, index in ((pixels, (row, col)), (pixels.swapaxes(0, 1), (col, row))):
+        second = np.full(lines.shape, np.nan)
+        second[1:-1] = lines[2:] - 2 * lines[1:-1] + lines[:-2]
         second[index] = at.in_squares(second[index])
         folds.append(_fold(second, width))
     return folds[0], folds[1]
@@ -108,11 +114,12 @@ def _fold(second: Array, width: float) -> tuple[float, float]:
     at = _size(_against_one_or_both(second, before, after))
     # Between row i and i + 1.
     between = _BETWEEN * _size(0.5 * (second + after - before - far))
-    size = np.stack([at, between], axis=-1).ravel()
+    size = np.empty(2 * rows)
+    size[::2], size[1::2] = at, between
     best = int(size.argmax())
     others = np.abs(np.arange(2 * rows) - best) > 3
     far_off = size[others & (size > 0)]
-    usual = float(np.percentile(far_off, 25)) if len(far_off) else _UNKNOWN
+    usual = quantile(far_off, 0.25) if len(far_off) else _UNKNOWN
     least = (max(bend + _BENT_PX / width, ratio * usual) for bend, ratio in _FOLDS)
     if size[best] < min(least):
         return 0.0, 0.0
@@ -128,11 +135,8 @@ def _against_one_or_both(values: Array, first: Array, second: Array) -> Array:
 
 def _size(values: Array) -> Array:
     """Median length of each row's vectors; 0 where fewer than two are known."""
-    length = np.sqrt((values**2).sum(axis=-1))
-    count = np.isfinite(length).sum(axis=1)
-    size = np.zeros(len(length))
-    # Unknown ones come last.
-    ordered, row = np.sort(length, axis=1), np.arange(len(length))
-    median = 0.5 * (ordered[row, (count - 1) // 2] + ordered[row, count // 2])
-    size[count >= 2] = median[count >= 2]
-    return size
+    ordered = np.hypot(values[..., 0], values[..., 1])
+    ordered.sort(axis=1)  # unknown ones come last
+    count, row = (ordered >= 0).sum(axis=1), np.arange(len(ordered))
+    middle = 0.5 * (ordered[row, (count - 1) // 2] + ordered[row, count // 2])
+    return np.where(count >= 2, middle, 0.0)

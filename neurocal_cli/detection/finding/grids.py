@@ -17,10 +17,11 @@ from neurocal_cli.detection.finding.claims import disputed, distinct, touching
 from neurocal_cli.detection.finding.fold import joined, unfolded
 from neurocal_cli.detection.finding.grow import Lattice, cleaned, grown, smoothing
 from neurocal_cli.detection.finding.levels import Level, levels_of
+from neurocal_cli.detection.finding.linked import linked
 from neurocal_cli.detection.finding.merge import merged
 from neurocal_cli.detection.finding.refine import settle
 from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
-from neurocal_cli.detection.finding.seeds import find_links, find_seeds, find_slim_seeds
+from neurocal_cli.detection.finding.seeds import Links, find_links, find_seeds, find_slim_seeds
 from neurocal_cli.detection.finding.stretch import stretched
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
@@ -103,14 +104,19 @@ def _new(level: Level, saddles: Saddles, first: bool) -> list[Lattice]:
         return []
     links = find_links(level, saddles)
     seeds, _ = find_seeds(saddles, links)
-    found = _sprouted(level, saddles, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES)
+    found = _sprouted(level, saddles, links, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES)
     if not found and first and level.scale == 1:
-        found = _sprouted(level, saddles, *find_slim_seeds(saddles, links), _SLIM_TRIES)
+        found = _sprouted(level, saddles, links, *find_slim_seeds(saddles, links), _SLIM_TRIES)
     return found
 
 
 def _sprouted(
-    level: Level, saddles: Saddles, seeds: NDArray[np.intp], dark: NDArray[np.intp], tries: int
+    level: Level,
+    saddles: Saddles,
+    links: Links,
+    seeds: NDArray[np.intp],
+    dark: NDArray[np.intp],
+    tries: int,
 ) -> list[Lattice]:
     """Grids that grow from seeds, until some of these have come to nothing."""
     found: list[Lattice] = []
@@ -119,7 +125,9 @@ def _sprouted(
         if not free[seed].all():
             continue
         free[seed] = False
-        planted = Lattice(saddles.points[seed], saddles.contrast[seed], int(parity))
+        planted = linked(level, saddles, links, int(seed[1, 1])) if len(seed) == 3 else None
+        if planted is None:
+            planted = Lattice(saddles.points[seed], saddles.contrast[seed], int(parity))
         grid = cleaned(level, grown(level, planted))
         boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_seen(level, x)]
         if boards:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,9 +13,21 @@ from neurocal_cli.detection.finding.levels import Level, sampled
 from neurocal_cli.detection.finding.predict import Expected, expected
 from neurocal_cli.detection.finding.refine import settle
 from neurocal_cli.detection.finding.verify import look
+from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
 
-__all__ = ["Lattice", "cleaned", "cropped", "framed", "frontier", "grown", "signs", "smoothing"]
+__all__ = [
+    "Lattice",
+    "cleaned",
+    "cropped",
+    "framed",
+    "frontier",
+    "grown",
+    "judged",
+    "signs",
+    "smoothing",
+    "squared",
+]
 
 Index = NDArray[np.intp]
 
@@ -25,6 +38,7 @@ _OFF, _OFF_SPREAD, _OFF_PX = 0.045, 0.025, 0.45  # squares, squares per spread, 
 _WEAKEST = 0.55  # least contrast over the neighbours'
 _EVEN_ALONE, _OFF_ALONE = 0.88, 0.3  # of a vertex that closes no square; the latter over the tolerance
 _LAYERS = 200
+_ROUNDS = 12  # of taking out wrong vertices, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,15 +70,21 @@ class Lattice:
         row, col = np.nonzero(self.seen)
         return row, col, expected(self.pixels, row, col)
 
+    def with_contrast(self, contrast: Array) -> Lattice:
+        """The same vertices, with contrasts (rows, cols) that have been looked at again."""
+        result = replace(self, contrast=contrast)
+        vars(result).update({name: x for name, x in vars(self).items() if name == "known"})
+        return result
+
     @property
     def width(self) -> float:
         """Median of the squares' narrower widths [px]."""
         p = self.pixels
         c, r = p[:-1, 1:] - p[:-1, :-1], p[1:, :-1] - p[:-1, :-1]
         area = np.abs(c[..., 0] * r[..., 1] - c[..., 1] * r[..., 0])
-        longest = np.sqrt(np.maximum((c**2).sum(axis=-1), (r**2).sum(axis=-1)))
-        known = np.isfinite(area) & (longest > 0)
-        return float(np.median(area[known] / longest[known])) if known.any() else 0.0
+        longest = np.maximum(np.hypot(c[..., 0], c[..., 1]), np.hypot(r[..., 0], r[..., 1]))
+        known = longest > 0
+        return median(area[known] / longest[known]) if known.any() else 0.0
 
 
 def signs(row: Index, col: Index, dark: int) -> Array:
@@ -74,7 +94,7 @@ def signs(row: Index, col: Index, dark: int) -> Array:
 
 def smoothing(width: float) -> float:
     """Smoothing of derivatives for squares of a width, a few values only [px]."""
-    return float(np.clip(np.round(0.15 * width / 0.25) * 0.25, 0.75, 2.0))
+    return min(max(round(0.15 * width / 0.25) * 0.25, 0.75), 2.0)
 
 
 def grown(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) -> Lattice:
@@ -82,43 +102,39 @@ def grown(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1)
 
     With a reach of 2, one vertex in a row may be hidden and the next still be found.
     """
-    sigma = smoothing(lattice.width)
+    sigma, start = smoothing(lattice.width), lattice
     tried: set[tuple[int, int, int]] = set()
-    origin = np.zeros(2, dtype=np.intp)
+    top, left = 0, 0  # how far its vertices have moved
     for _ in range(_LAYERS):
         if outwards:
             lattice, shift = framed(lattice)
-            origin = origin + shift
-        row, col = frontier(lattice, reach)
+            top, left = top + shift[0], left + shift[1]
+        row, col, support = _frontier(lattice.seen, reach)
         # A place is looked at again only when it has more neighbours than before.
-        support = _around(lattice.seen)[row, col]
-        keys = list(
-            zip((row - origin[0]).tolist(), (col - origin[1]).tolist(), support.tolist(), strict=True)
-        )
-        fresh = np.array([key not in tried for key in keys], dtype=bool)
+        keys = list(zip((row - top).tolist(), (col - left).tolist(), support.tolist(), strict=True))
+        fresh = [k for k, key in enumerate(keys) if key not in tried]
+        if not fresh:
+            break
         tried.update(keys)
-        row, col = row[fresh], col[fresh]
-        if not len(row):
-            break
-        lattice, added = _layer(level, lattice, row, col, sigma, reach)
-        if not added and not fresh.any():
-            break
-    return cropped(lattice)
+        if len(fresh) < len(keys):
+            row, col = row[fresh], col[fresh]
+        lattice = _layer(level, lattice, row, col, sigma, reach)
+    return cropped(lattice if lattice.seen.sum() > start.seen.sum() else start)
 
 
-def framed(lattice: Lattice) -> tuple[Lattice, Index]:
+def framed(lattice: Lattice) -> tuple[Lattice, tuple[int, int]]:
     """Give a lattice room of one place on every side; how far its vertices moved."""
     rows, cols = lattice.contrast.shape
     seen = lattice.seen
     top, left = int(seen[0].any()), int(seen[:, 0].any())
     bottom, right = int(seen[-1].any()), int(seen[:, -1].any())
     if top + left + bottom + right == 0:
-        return lattice, np.zeros(2, dtype=np.intp)
+        return lattice, (0, 0)
     pixels = np.full((rows + top + bottom, cols + left + right, 2), np.nan)
     contrast = np.full(pixels.shape[:2], np.nan)
     pixels[top : top + rows, left : left + cols] = lattice.pixels
     contrast[top : top + rows, left : left + cols] = lattice.contrast
-    return Lattice(pixels, contrast, (lattice.dark + top + left) % 2), np.array([top, left])
+    return Lattice(pixels, contrast, (lattice.dark + top + left) % 2), (top, left)
 
 
 def cropped(lattice: Lattice) -> Lattice:
@@ -136,51 +152,63 @@ def cropped(lattice: Lattice) -> Lattice:
 
 def _around(values: NDArray[np.generic]) -> Array:
     """Sum over the 3 x 3 places around each."""
-    framed = np.zeros((values.shape[0] + 2, values.shape[1] + 2))
-    framed[1:-1, 1:-1] = values
-    rows = framed[:-2] + framed[1:-1] + framed[2:]
-    return np.asarray(rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:])
+    whole = values.astype(float)
+    return np.asarray(cv2.boxFilter(whole, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
-def frontier(lattice: Lattice, reach: int = 1) -> tuple[Index, Index]:
+def frontier(lattice: Lattice) -> tuple[Index, Index]:
     """Unknown places with a known neighbour along an edge and another one near."""
-    seen = lattice.seen
-    if reach > 1:
-        row, col = np.nonzero(~seen & (_around(_around(seen)) > 0))
-        return row, col
-    beside = np.zeros_like(seen)
-    beside[1:] |= seen[:-1]
-    beside[:-1] |= seen[1:]
-    beside[:, 1:] |= seen[:, :-1]
-    beside[:, :-1] |= seen[:, 1:]
-    row, col = np.nonzero(~seen & beside & (_around(seen) >= 2))
-    return row, col
+    return _frontier(lattice.seen, 1)[:2]
 
 
-def _layer(
-    level: Level, lattice: Lattice, row: Index, col: Index, sigma: float, reach: int
-) -> tuple[Lattice, int]:
+_BESIDE = 16  # what a neighbour along an edge counts more than one at a corner
+_COUNTS = np.array([[1, _BESIDE + 1, 1], [_BESIDE + 1, 1, _BESIDE + 1], [1, _BESIDE + 1, 1]], dtype=np.uint8)
+
+
+def _frontier(seen: NDArray[np.bool_], reach: int) -> tuple[Index, Index, NDArray[np.generic]]:
+    """See `frontier`; with the number of known places around each.
+
+    With a reach of 2, all unknown places at most two from a known one.
+    """
+    counts = cv2.filter2D(seen.view(np.uint8), -1, _COUNTS, borderType=cv2.BORDER_CONSTANT)
+    around = counts % _BESIDE
+    near = (counts >= _BESIDE) & (around >= 2) if reach == 1 else _around(_around(seen)) > 0
+    row, col = np.nonzero(near & ~seen)
+    return row, col, around[row, col]
+
+
+def _layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: float, reach: int) -> Lattice:
     """Look for vertices at places of a lattice."""
     at = expected(lattice.pixels, row, col)
     worth = (at.spread < _MOST_SPREAD * reach) & (at.area > 4) & _inside(level, at.points)
-    row, col, at = row[worth], col[worth], at[worth]
+    if not worth.all():
+        row, col, at = row[worth], col[worth], at[worth]
     if not len(row):
-        return lattice, 0
+        return lattice
     dark = signs(row, col, lattice.dark)
     points = settle(level.image, _searched(level, at, dark), sigma)
     good = np.isfinite(points[:, 0])
     points = np.where(good[:, None], points, at.points)
-    off = np.abs(at.in_squares(points - at.points)).max(axis=1)
-    good &= off < _tolerance(at)
+    good &= _off(at, points) < _tolerance(at)
     sight = look(level, points, at, dark)
-    known = np.where(lattice.seen, lattice.contrast, 0.0)
-    weight = _around(_around(lattice.seen))[row, col]
-    usual = _around(_around(known))[row, col] / np.maximum(weight, 1)
-    good &= sight.like & (sight.contrast > _WEAKEST * usual)
+    good &= sight.like & (sight.contrast > _WEAKEST * _usual(lattice)[row, col])
     row, col = row[good], col[good]
     pixels, contrast = lattice.pixels.copy(), lattice.contrast.copy()
     pixels[row, col], contrast[row, col] = points[good], sight.contrast[good]
-    return replace(lattice, pixels=pixels, contrast=contrast), len(row)
+    return Lattice(pixels, contrast, lattice.dark)
+
+
+def _usual(lattice: Lattice) -> Array:
+    """(rows, cols) mean contrast of the known vertices at most two away, the nearer ones counting more."""
+    seen = lattice.seen
+    known = np.where(seen, lattice.contrast, 0.0)
+    return np.asarray(_around(_around(known)) / np.maximum(_around(_around(seen)), 1))
+
+
+def _off(at: Expected, points: Array) -> Array:
+    """(N,) how far points are from where they are expected, along the farther way [squares]."""
+    away = np.abs(at.in_squares(points - at.points))
+    return np.maximum(away[:, 0], away[:, 1])
 
 
 def _tolerance(at: Expected) -> Array:
@@ -190,7 +218,8 @@ def _tolerance(at: Expected) -> Array:
 
 def _inside(level: Level, points: Array) -> NDArray[np.bool_]:
     height, width = level.image.shape
-    return np.asarray(((points > 1) & (points < np.array([width, height]) - 2)).all(axis=1))
+    u, v = points.T
+    return np.asarray((u > 1) & (v > 1) & (u < width - 2) & (v < height - 2))
 
 
 _SHARES = np.stack(np.meshgrid(*[np.linspace(-_SEARCHED, _SEARCHED, _STEPS)] * 2), axis=-1).reshape(-1, 2)
@@ -199,44 +228,61 @@ _PRIOR = 1 - 0.4 * np.abs(_SHARES).max(axis=1) / _SEARCHED
 
 def _searched(level: Level, at: Expected, dark: Array) -> Array:
     """Places near the expected ones where a saddle of the right colours is steepest; (N, 2) [px]."""
-    places = at.points[:, None] + _SHARES[:, :1] * at.c[:, None] + _SHARES[:, 1:] * at.r[:, None]
-    uu, uv, vv = (sampled(x, places) for x in level.curvature)
-    c, r = at.c, at.r
-    product = (c[:, 0] * r[:, 0])[:, None] * uu + (c[:, 1] * r[:, 1])[:, None] * vv
-    product += (c[:, 0] * r[:, 1] + c[:, 1] * r[:, 0])[:, None] * uv
-    steepness = -product * dark[:, None] * _PRIOR
+    places = at.around(_SHARES, at.points)
+    maps = places.astype(np.float32)
+    uu, uv, vv = (sampled(x, maps) for x in level.curvature)
+    (c_u, c_v), (r_u, r_v) = -dark * at.c.T, at.r.T
+    steepness = (c_u * r_u)[:, None] * uu
+    steepness += (c_v * r_v)[:, None] * vv
+    steepness += (c_u * r_v + c_v * r_u)[:, None] * uv
+    steepness *= _PRIOR
     return np.asarray(places[np.arange(len(places)), steepness.argmax(axis=1)])
+
+
+def judged(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
+    """The lattice with its vertices' contrasts, and which of them look right and are where they should be."""
+    row, col, at = lattice.known
+    points = lattice.pixels[row, col]
+    sight = look(level, points, at, signs(row, col, lattice.dark))
+    contrast = lattice.contrast.copy()
+    contrast[row, col] = sight.contrast
+    result = lattice.with_contrast(contrast)
+    right = sight.like & (_off(at, points) < _tolerance(at)) & (at.area > 4) & (at.spread < 2 * _MOST_SPREAD)
+    right &= sight.contrast > _WEAKEST * _usual(result)[row, col]
+    good = np.zeros(contrast.shape, dtype=bool)
+    good[row, col] = right
+    return result, good
 
 
 def cleaned(level: Level, lattice: Lattice) -> Lattice:
     """Take out vertices that look wrong or are not where their neighbours put them."""
-    pixels = lattice.pixels.copy()
-    contrast = lattice.contrast.copy()
-    for _ in range(12):
-        row, col = np.nonzero(np.isfinite(pixels[..., 0]))
+    for _ in range(_ROUNDS):
+        row, col, at = lattice.known
         if not len(row):
             break
+        pixels, contrast, seen = lattice.pixels, lattice.contrast.copy(), lattice.seen
         points = pixels[row, col]
-        at = expected(pixels, row, col)
-        off = np.abs(at.in_squares(points - at.points)).max(axis=1) / _tolerance(at)
+        off = _off(at, points) / _tolerance(at)
         off = np.where((at.area > 0) & (at.spread < 2 * _MOST_SPREAD), off, np.inf)
         sight = look(level, points, at, signs(row, col, lattice.dark))
         # One that closes no square has little that speaks for it.
-        closes = _squared(np.isfinite(pixels[..., 0]))[row, col]
+        closes = squared(seen)[row, col]
         plain = sight.like & (closes | ((sight.even > _EVEN_ALONE) & (off < _OFF_ALONE)))
         off = np.where(plain, off, np.inf)
         contrast[row, col] = sight.contrast
         if not (off > 1).any():
+            lattice = lattice.with_contrast(contrast)
             break
         # Next to a bad vertex good ones look bad too: only the worst of each place goes.
         worst = np.zeros(pixels.shape[:2])
         worst[row, col] = off
-        pixels[(worst > 1) & (worst >= _largest_around(worst))] = np.nan
-    contrast[np.isnan(pixels[..., 0])] = np.nan
-    return cropped(replace(lattice, pixels=pixels, contrast=contrast))
+        bad = (worst > 1) & (worst >= _largest_around(worst))
+        pixels = np.where(bad[..., None], np.nan, pixels)
+        lattice = Lattice(pixels, np.where(bad, np.nan, contrast), lattice.dark)
+    return cropped(lattice)
 
 
-def _squared(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def squared(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which vertices are corners of a square with four known corners."""
     whole = seen[:-1, :-1] & seen[:-1, 1:] & seen[1:, :-1] & seen[1:, 1:]
     squared = np.zeros_like(seen)

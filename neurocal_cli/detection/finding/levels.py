@@ -22,6 +22,7 @@ _SMOOTHING = 1.0  # px; of the picture that is looked at, against noise and jagg
 _SMALLEST = 100  # px; the shorter side of the smallest level
 _LARGE = 30_000_000  # pixels of a picture whose noise is looked for in bands only ...
 _BANDS, _BAND = 24, 64  # ... of so many rows
+_ROWS = 32000  # of places that are looked at in one go
 _LEAST_NOISE = 0.12  # DN of a second derivative; what rounding to 8 bits leaves
 
 
@@ -106,15 +107,14 @@ def _grey(image: NDArray[np.generic]) -> Image:
     return np.asarray(np.nan_to_num(scaled), dtype=np.float32)
 
 
-def sampled(image: Image, points: Array) -> Array:
+def sampled(image: Image, points: NDArray[np.floating]) -> Array:
     """Interpolate an image at points of any shape (..., 2) [px]; outside the border goes on."""
     flat = points.reshape(-1, points.shape[-2], 2) if points.ndim > 2 else points.reshape(-1, 1, 2)
-    maps = flat.astype(np.float32)
-    out = np.empty(maps.shape[:2], dtype=np.float32)
+    maps = flat.astype(np.float32, copy=False)
     # The interpolation's tables count rows in 16 bits.
-    for start in range(0, len(maps), 32000):
-        part = np.ascontiguousarray(maps[start : start + 32000])
-        out[start : start + 32000] = cv2.remap(
-            image, part[..., 0], part[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-    return out.reshape(points.shape[:-1]).astype(float)
+    parts = [
+        cv2.remap(image, maps[k : k + _ROWS], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        for k in range(0, len(maps), _ROWS)
+    ]
+    values = parts[0] if len(parts) == 1 else np.concatenate([np.zeros((0, maps.shape[1])), *parts])
+    return values.astype(float).reshape(points.shape[:-1])

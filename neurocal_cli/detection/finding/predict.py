@@ -8,6 +8,7 @@ distortion, so that few neighbours give a plane map and many a curved one.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,9 +24,11 @@ _HELD_BACK = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])
 _c, _r = (x.ravel().astype(float) for x in np.meshgrid(*[np.arange(-_REACH, _REACH + 1)] * 2))
 _BASIS = np.stack([np.ones_like(_c), _c, _r, 0.5 * _c**2, _c * _r, 0.5 * _r**2], axis=-1)
 _WEIGHT = np.exp(-0.5 * (_c**2 + _r**2) / _WIDTH**2) * (_c**2 + _r**2 > 0)
-# Products of the basis with itself and its weights, a row for each neighbour.
+# Products of the basis with itself and its weights, a row for each neighbour; then 1, for their number.
 _PRODUCTS = (_WEIGHT[:, None, None] * _BASIS[:, :, None] * _BASIS[:, None, :]).reshape(len(_c), -1)
+_PRODUCTS = np.concatenate([_PRODUCTS, np.ones((len(_c), 1))], axis=1)
 _RIGHT = _WEIGHT[:, None] * _BASIS
+_FIRST, _ONES = np.eye(6)[0], np.ones(len(_c))
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,22 +38,31 @@ class Expected:
     Attributes
     ----------
     points : (N, 2) array [px]
-    c, r : (N, 2) array [px]
-        The ways to the next vertex along a row and along a column.
+    ways : (N, 2, 2) array [px]
+        To the next vertex along a row, and along a column.
     spread : (N,) array
         Standard deviation of the point per standard deviation of a vertex.
     """
 
     points: Array
-    c: Array
-    r: Array
+    ways: Array
     spread: Array
 
     def __getitem__(self, which: NDArray[np.generic]) -> Expected:
         """Some of them."""
-        return Expected(self.points[which], self.c[which], self.r[which], self.spread[which])
+        return Expected(self.points[which], self.ways[which], self.spread[which])
 
     @property
+    def c(self) -> Array:
+        """(N, 2) ways along a row [px]."""
+        return self.ways[:, 0]
+
+    @property
+    def r(self) -> Array:
+        """(N, 2) ways along a column [px]."""
+        return self.ways[:, 1]
+
+    @cached_property
     def area(self) -> Array:
         """(N,) of a square [px^2]; negative when mirrored."""
         return np.asarray(self.c[:, 0] * self.r[:, 1] - self.c[:, 1] * self.r[:, 0])
@@ -58,16 +70,23 @@ class Expected:
     @property
     def width(self) -> Array:
         """(N,) distance between opposite sides of a square, the smaller one [px]."""
-        longest = np.maximum(np.hypot(*self.c.T), np.hypot(*self.r.T))
+        length = np.hypot(self.ways[..., 0], self.ways[..., 1])
+        longest = np.maximum(length[:, 0], length[:, 1])
         return np.asarray(np.abs(self.area) / np.maximum(longest, 1e-9))
+
+    def around(self, shares: Array, points: Array) -> Array:
+        """Places (N, K, 2) around points (N, 2), at shares (K, 2) of `c` and `r`."""
+        return np.asarray(points[:, None] + shares @ self.ways)
 
     def in_squares(self, away: Array) -> Array:
         """Pixel offsets (N, 2) as shares of `c` and `r`."""
         area = self.area
         area = np.where(np.abs(area) > 1e-9, area, 1e-9)
-        along = (away[:, 0] * self.r[:, 1] - away[:, 1] * self.r[:, 0]) / area
-        across = (self.c[:, 0] * away[:, 1] - self.c[:, 1] * away[:, 0]) / area
-        return np.stack([along, across], axis=-1)
+        out = np.empty(away.shape)
+        np.subtract(away[:, 0] * self.r[:, 1], away[:, 1] * self.r[:, 0], out=out[:, 0])
+        np.subtract(self.c[:, 0] * away[:, 1], self.c[:, 1] * away[:, 0], out=out[:, 1])
+        out /= area[:, None]
+        return out
 
 
 def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Expected:
@@ -80,20 +99,24 @@ def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Exp
     row, col : (N,) int arrays
     """
     rows, cols = pixels.shape[:2]
-    framed = np.full((2, rows + 2 * _REACH, cols + 2 * _REACH), np.nan)
-    framed[:, _REACH:-_REACH, _REACH:-_REACH] = pixels.transpose(2, 0, 1)
+    framed = np.zeros((3, rows + 2 * _REACH, cols + 2 * _REACH))
+    inner = framed[:, _REACH:-_REACH, _REACH:-_REACH]
+    seen = ~np.isnan(pixels[..., 0])
+    np.copyto(inner[:2], pixels.transpose(2, 0, 1), where=seen)
+    inner[2] = seen
     size, width = np.arange(2 * _REACH + 1), framed.shape[2]
     window = (size[:, None] * width + size).ravel()
-    near = framed.reshape(2, -1)[:, (row * width + col)[:, None] + window]
-    seen = ~np.isnan(near[0])
-    known = seen.astype(float)
+    near = framed.reshape(3, -1).take((row * width + col)[:, None] + window, axis=1)
+    known = near[2]
+    sums = known @ _PRODUCTS
+    normal = sums[:, :-1].reshape(-1, 6, 6) + _HELD_BACK
     # About the mean of the neighbours, for the sake of rounding.
-    near = np.where(seen, near, 0.0)
-    origin = near.sum(axis=2) / np.maximum(known.sum(axis=1), 1.0)
-    near -= origin[:, :, None] * known
-    normal = (known @ _PRODUCTS).reshape(-1, 6, 6)
-    normal += _HELD_BACK
-    inverse = np.linalg.inv(normal)
-    right = (near.reshape(-1, len(window)) @ _RIGHT).reshape(2, -1, 6)
-    solution = inverse @ right.transpose(1, 2, 0)
-    return Expected(solution[:, 0] + origin.T, solution[:, 1], solution[:, 2], np.sqrt(inverse[:, 0, 0]))
+    origin = near[:2] @ _ONES
+    origin /= np.maximum(sums[:, -1], 1.0)
+    offset = near[:2]
+    offset -= origin[:, :, None] * known
+    right = np.empty((len(row), 6, 3))
+    right[:, :, :2] = (offset @ _RIGHT).transpose(1, 2, 0)
+    right[:, :, 2] = _FIRST
+    solution = np.linalg.solve(normal, right)
+    return Expected(solution[:, 0, :2] + origin.T, solution[:, 1:3, :2], np.sqrt(solution[:, 0, 2]))

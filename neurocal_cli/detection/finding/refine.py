@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.levels import Image
 from neurocal_cli.geometry import Array
@@ -30,6 +31,13 @@ def _derivatives(sigma: float) -> tuple[int, Array]:
     return half, np.stack([k.ravel() for k in kernels], axis=-1).astype(np.float32)
 
 
+@lru_cache(maxsize=32)
+def _window(half: int, width: int) -> NDArray[np.intp]:
+    """From a pixel to those of a window around it, in the flat image of a width."""
+    offset = np.arange(-half, half + 1)
+    return (offset[:, None] * width + offset).ravel()
+
+
 def settle(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
     """Move points to the saddle points next to them.
 
@@ -47,28 +55,48 @@ def settle(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
     points : (N, 2) array [px]
         nan where there is no saddle point or the window leaves the image.
     """
-    half, kernels = _derivatives(sigma)
+    half, _ = _derivatives(sigma)
     height, width = image.shape
     if min(height, width) < 2 * half + 1:
         return np.full(start.shape, np.nan)
-    offset = np.arange(-half, half + 1)
-    window = (offset[:, None] * width + offset).ravel()
-    low, high = np.full((2, 1), half), np.array([[width], [height]]) - 1 - half
     # Both coordinates in rows: sums over many short rows take longer.
-    flat, given = image.ravel(), start.T
-    point = np.nan_to_num(given)
-    good = np.ones(len(start), dtype=bool)
-    for _ in range(rounds):
-        centre = np.minimum(np.maximum(np.rint(point), low), high)
-        place = (centre[1] * width + centre[0]).astype(np.intp)
-        u, v, uu, uv, vv = (flat[place[:, None] + window] @ kernels).T.astype(float)
-        determinant = uu * vv - uv * uv
-        good = determinant < 0
-        step = np.stack([uv * v - vv * u, uv * u - uu * v])
-        step /= np.where(good, determinant, -1.0)
-        length = np.maximum(np.hypot(step[0], step[1]), 1e-12)
-        step *= np.minimum(1.0, _LONGEST_STEP / length)
-        point = centre + step
-    close, framed = np.abs(point - centre) < 1, (given >= low) & (given <= high)
-    good &= close[0] & close[1] & framed[0] & framed[1]
-    return np.where(good, point, np.nan).T
+    given = start.T
+    low, high = half, np.array([[width - 1 - half], [height - 1 - half]])
+    framed = (given >= low) & (given <= high)
+    good = framed[0] & framed[1]
+    step = np.where(good, given, low)
+    centre = _within(step, low, high)
+    step, saddle = _newton(image, centre, sigma)
+    # A step is the same from wherever a pixel is nearest: only those that lead to another one go on.
+    for _ in range(rounds - 1):
+        ahead = _within(centre + step, low, high)
+        moved = np.flatnonzero((ahead[0] != centre[0]) | (ahead[1] != centre[1]))
+        if not len(moved):
+            break
+        centre[:, moved] = ahead[:, moved]
+        step[:, moved], saddle[moved] = _newton(image, ahead[:, moved], sigma)
+    close = np.abs(step) < 1
+    good &= saddle & close[0] & close[1]
+    return np.where(good, centre + step, np.nan).T
+
+
+def _within(point: Array, low: int, high: Array) -> Array:
+    """Nearest whole pixels (2, N) whose windows lie in the image."""
+    return np.minimum(np.maximum(np.rint(point), low), high)
+
+
+def _newton(image: Image, centre: Array, sigma: float) -> tuple[Array, NDArray[np.bool_]]:
+    """Steps (2, N) from whole pixels (2, N) to where the gradient vanishes, and whether that is a saddle."""
+    width = image.shape[1]
+    half, kernels = _derivatives(sigma)
+    place = (centre[1] * width + centre[0]).astype(np.intp)
+    u, v, uu, uv, vv = (image.ravel().take(place[:, None] + _window(half, width)) @ kernels).T.astype(float)
+    determinant = uu * vv - uv * uv
+    saddle = determinant < 0
+    step = np.empty(centre.shape)
+    np.subtract(uv * v, vv * u, out=step[0])
+    np.subtract(uv * u, uu * v, out=step[1])
+    step /= np.where(saddle, determinant, -1.0)
+    length = np.maximum(np.hypot(step[0], step[1]), 1e-12)
+    step *= np.minimum(1.0, _LONGEST_STEP / length)
+    return step, saddle

@@ -77,7 +77,7 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     if not len(points):
         return Saddles(np.zeros((0, 2)), np.zeros((0, 4)), np.zeros(0))
     noise = level.noise
-    rings = [_ring(sampled(level.smooth, points[:, None] + r * _DIRECTIONS), noise) for r in _RADII]
+    rings = [_ring(sampled(level.smooth, points + (r * _DIRECTIONS)[:, None]), noise) for r in _RADII]
     (ports, contrast, good), (ports_small, contrast_small, good_small) = rings
     # Where squares are small, rings reach into the next ones: trust a ring that agrees with a
     # smaller one, and curvature where none does.
@@ -114,6 +114,7 @@ def _differ(first: Array, second: Array) -> Array:
 
 _ANGLES = 2 * np.pi / _RAYS * np.arange(_RAYS)
 _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
+_NEXT = (np.arange(_RAYS) + 1) % _RAYS
 
 
 def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:
@@ -144,11 +145,12 @@ def _peaks(level: Level) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
         steepness = uv[band] * uv[band]
         steepness -= uu[band] * vv[band]
         largest = cv2.dilate(steepness, np.ones((2 * _AROUND + 1,) * 2, np.uint8))
-        inner = np.s_[_AROUND:-_AROUND, _BORDER:-_BORDER]
-        steepness, largest = steepness[inner], largest[inner]
-        peak = np.flatnonzero((steepness >= largest) & (steepness >= least))
-        v, u = np.divmod(peak, steepness.shape[1])
-        found.append((u + _BORDER, v + top, steepness[v, u]))
+        np.maximum(largest, least, out=largest)
+        peak = np.flatnonzero(steepness >= largest)
+        v, u = np.divmod(peak, width)
+        inner = (v >= _AROUND) & (v < _AROUND + bottom - top) & (u >= _BORDER) & (u < width - _BORDER)
+        v, u = v[inner], u[inner]
+        found.append((u, v + (top - _AROUND), steepness[v, u]))
     us, vs, values = zip(*found, strict=True)
     return np.concatenate(us), np.concatenate(vs), np.concatenate(values)
 
@@ -158,33 +160,34 @@ def _ring(profile: Array, noise: float) -> tuple[Array, Array, NDArray[np.bool_]
 
     Parameters
     ----------
-    profile : (N, _RAYS) array [DN]
+    profile : (_RAYS, N) array [DN]
     noise : float [DN]
     """
-    count = len(profile)
+    count = profile.shape[1]
     ports, contrast = np.zeros((count, 4)), np.zeros(count)
-    high, low = profile.max(axis=1), profile.min(axis=1)
-    level = profile - (0.5 * (high + low))[:, None]
-    after = np.roll(level, -1, axis=1)
-    change = (level > 0) != (after > 0)
-    good = (change.sum(axis=1) == 4) & (high - low > 4 * noise)
+    high, low = profile.max(axis=0), profile.min(axis=0)
+    level = profile - 0.5 * (high + low)
+    bright = level > 0
+    change = bright != bright[_NEXT]
+    good = (np.count_nonzero(change, axis=0) == 4) & (high - low > 4 * noise)
     if not good.any():
         return ports, contrast, good
     where = np.flatnonzero(good)
-    level, after, change = level[where], after[where], change[where]
-    row, ray = np.nonzero(change)
-    step = level[row, ray] / (level[row, ray] - after[row, ray])
-    angle = ((ray + step) * (2 * np.pi / _RAYS)).reshape(-1, 4)
+    level = level[:, where]
+    place, ray = np.nonzero(change.T[where])
+    here, after = level[ray, place], level[_NEXT[ray], place]
+    angle = ((ray + here / (here - after)) * (2 * np.pi / _RAYS)).reshape(-1, 4)
     # The first sector ends at the second crossing; number the ports so that it is dark.
-    dark = level.ravel()[(row * _RAYS + (ray + 1) % _RAYS).reshape(-1, 4)[:, 0]] < 0
+    dark = after[::4] < 0
     angle = np.where(dark[:, None], angle, np.concatenate([angle[:, 1:], angle[:, :1] + 2 * np.pi], axis=1))
-    bent = np.stack([angle[:, 2] - angle[:, 0] - np.pi, angle[:, 3] - angle[:, 1] - np.pi], axis=-1)
+    bent = np.abs(angle[:, 2:] - angle[:, :2] - np.pi)
     mean = 0.5 * (angle[:, :2] + angle[:, 2:] - np.pi)
     opening = mean[:, 1] - mean[:, 0]
-    sound = (np.abs(bent) < _MOST_BENT).all(axis=1)
+    sound = (bent[:, 0] < _MOST_BENT) & (bent[:, 1] < _MOST_BENT)
     sound &= (opening > _NARROWEST) & (opening < np.pi - _NARROWEST)
-    opposite = np.abs(level - np.roll(level, _RAYS // 2, axis=1)).mean(axis=1)
-    size = np.abs(level).mean(axis=1)
+    # Opposite rays, each pair once.
+    opposite = np.abs(level[: _RAYS // 2] - level[_RAYS // 2 :]).mean(axis=0)
+    size = np.abs(level).mean(axis=0)
     sound &= opposite < 0.7 * size
     ports[where] = np.concatenate([mean, mean + np.pi], axis=1)
     contrast[where] = 2 * size

@@ -7,6 +7,7 @@ port that a dark sector precedes: along a line of the board, even and odd ports 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,11 @@ class Links:
 
     to: Index
     port: Index
+
+    @cached_property
+    def lists(self) -> tuple[list[list[int]], list[list[int]]]:
+        """Both as lists, to follow one after the other."""
+        return self.to.tolist(), self.port.tolist()
 
 
 def find_links(level: Level, saddles: Saddles) -> Links:

@@ -48,6 +48,8 @@ def _offsets() -> Array:
 
 
 _OFFSETS = _offsets()
+_CONTRAST = np.array([0.5, -0.5, 0.5, -0.5] + [0.0] * 8)  # bright less dark squares
+_STEPS = np.concatenate([np.zeros((4, 4)), np.diag([1.0, -1, 1, -1]), np.diag([-1.0, 1, -1, 1])])  # at edges
 
 
 def look(level: Level, points: Array, at: Expected, dark: Array) -> Look:
@@ -62,15 +64,17 @@ def look(level: Level, points: Array, at: Expected, dark: Array) -> Look:
     dark : (N,) array of +-1
         +1 where the square towards growing c and r is dark.
     """
-    places = points[:, None] + _OFFSETS[:, :1] * at.c[:, None] + _OFFSETS[:, 1:] * at.r[:, None]
-    value = sampled(level.smooth, places) * -dark[:, None]
-    even, odd = value[:, 0:4:2], value[:, 1:4:2]
-    contrast = even.mean(axis=1) - odd.mean(axis=1)
+    places = at.around(_OFFSETS, points)
+    value = sampled(level.smooth, places)
+    value *= -dark[:, None]
+    contrast = value @ _CONTRAST
     scale = np.maximum(np.abs(contrast), 1e-9)
-    flat = (even.min(axis=1) - odd.max(axis=1)) / scale
-    edges = (value[:, 4:8] - value[:, 8:12]) * np.array([1.0, -1.0, 1.0, -1.0])
-    like = (contrast > 0) & (flat > _LEAST_EVEN) & (edges.min(axis=1) > _LEAST_EDGE * contrast)
-    height, width = level.image.shape
-    # The places beyond the border repeat it and tell nothing.
-    inside = ((places > -1) & (places < np.array([width, height]))).all(axis=(1, 2))
-    return Look(contrast, flat, like & inside)
+    flat = np.minimum(value[:, 0], value[:, 2]) - np.maximum(value[:, 1], value[:, 3])
+    flat /= scale
+    like = (contrast > 0) & (flat > _LEAST_EVEN)
+    like &= (value @ _STEPS).min(axis=1) > _LEAST_EDGE * contrast
+    size = np.array(level.image.shape[::-1])
+    if places.min() <= -1 or (places.max(axis=(0, 1)) >= size).any():
+        # The places beyond the border repeat it and tell nothing.
+        like &= ((places > -1) & (places < size)).all(axis=(1, 2))
+    return Look(contrast, flat, like)

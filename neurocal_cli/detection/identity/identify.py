@@ -28,6 +28,7 @@ from neurocal_cli.detection.identity.fit import fit_camera, is_flat, motion
 from neurocal_cli.detection.identity.placement import Placement, placements
 from neurocal_cli.detection.identity.trim import trimmed
 from neurocal_cli.detection.identity.words import LOOKS_THE_SAME, NoBoardError, another_size, several_ways
+from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
 
 __all__ = ["Identified", "Located", "NoBoardError", "identify"]
@@ -286,5 +287,5 @@ def _corners(plane: Plane) -> Array:
 
 def _square(grid: Grid) -> float:
     """Typical side of a square [px]."""
-    steps = [np.hypot(*np.moveaxis(np.diff(grid.pixels, axis=k), -1, 0)) for k in (0, 1)]
-    return float(min(np.nanmedian(step) for step in steps))
+    p = grid.pixels
+    return min(median(np.hypot(way[..., 0], way[..., 1])) for way in (p[1:] - p[:-1], p[:, 1:] - p[:, :-1]))

@@ -1,0 +1,106 @@
+"""The vertices of a board that are linked with one another: most of a grid, before it begins to grow.
+
+Layer by layer a grid grows as surely, only more slowly: what links have put together counts only where every
+vertex looks like one and is where its neighbours put it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from neurocal_cli.detection.finding.fold import folded, joined, restricted
+from neurocal_cli.detection.finding.grow import Lattice, cropped, judged, smoothing, squared
+from neurocal_cli.detection.finding.levels import Level
+from neurocal_cli.detection.finding.refine import settle
+from neurocal_cli.detection.finding.saddles import Saddles
+from neurocal_cli.detection.finding.seeds import Links
+
+__all__ = ["linked"]
+
+# (c, r) from a vertex to its neighbour at the port along c, and at the next ones.
+_STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+_NEAR = 1.0  # px; of a saddle from where it is with more smoothing
+_FEWEST = 12  # vertices
+_ROUNDS, _WRONG = 3, 0.1  # times that some are left out, and their share
+_WHOLE = 0.5  # share of an outer line; links lead astray beyond the board, and growing tells the better
+
+
+def linked(level: Level, saddles: Saddles, links: Links, middle: int) -> Lattice | None:
+    """Put together what is linked with a vertex.
+
+    Parameters
+    ----------
+    level : Level
+    saddles : Saddles
+    links : Links
+    middle : int
+        The vertex; its port 0 leads along c.
+
+    Returns
+    -------
+    lattice : Lattice or None
+        None where what the links lead to is not all as a board's.
+    """
+    places = _followed(links, middle)
+    if len(places) < _FEWEST:
+        return None
+    lattice = _laid(saddles, places)
+    row, col = np.nonzero(lattice.seen)
+    settled = settle(level.image, lattice.pixels[row, col], smoothing(lattice.width))
+    stays = np.abs(settled - lattice.pixels[row, col]).max(axis=1) < _NEAR
+    lattice.pixels[row, col] = np.where(stays[:, None], settled, np.nan)
+    for _ in range(_ROUNDS):
+        count = np.count_nonzero(lattice.seen)
+        if count < _FEWEST:
+            break
+        lattice, good = judged(level, lattice)
+        wrong = count - np.count_nonzero(good)
+        if wrong == 0:
+            # Over a fold vertices are linked as anywhere else, and only growing stops there.
+            return None if folded(lattice) else lattice
+        if wrong > _WRONG * count:
+            break
+        # What is left out has another chance when the grid grows.
+        parts = joined(restricted(lattice, squared(good)))
+        lattice = max(parts, key=lambda part: int(part.seen.sum()), default=lattice)
+    return None
+
+
+def _laid(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
+    """Saddles at their places (c, r), without those that close no square, and without ragged outer lines."""
+    place, index = np.array(list(places)), np.array(list(places.values()))
+    left, top = place.min(axis=0)
+    cols, rows = place.max(axis=0) - (left, top) + 1
+    member = np.full((rows, cols), -1, dtype=np.intp)
+    member[place[:, 1] - top, place[:, 0] - left] = index
+    seen = squared(member >= 0)
+    for line in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+        seen[line] &= seen[line].mean() > _WHOLE
+    row, col = np.nonzero(seen)
+    pixels, contrast = np.full((rows, cols, 2), np.nan), np.full((rows, cols), np.nan)
+    pixels[row, col], contrast[row, col] = (x[member[row, col]] for x in (saddles.points, saddles.contrast))
+    # The square that begins at the middle one, between its ports 0 and 1, is dark.
+    return cropped(Lattice(pixels, contrast, int(left + top) % 2))
+
+
+def _followed(links: Links, middle: int) -> dict[tuple[int, int], int]:
+    """Saddles by their places (c, r) from the middle one, each at the first place that leads to it."""
+    to, entry = links.lists
+    places, along = {(0, 0): middle}, {middle: 0}  # the latter: each one's port along c
+    waiting = deque(places)
+    while waiting:
+        c, r = waiting.popleft()
+        saddle = places[c, r]
+        for turn, (dc, dr) in enumerate(_STEPS):
+            port = (along[saddle] + turn) % 4
+            neighbour, there = to[saddle][port], (c + dc, r + dr)
+            if neighbour < 0:
+                continue
+            if there in places or neighbour in along:
+                continue
+            places[there] = neighbour
+            along[neighbour] = (entry[saddle][port] + 2 - turn) % 4
+            waiting.append(there)
+    return places
