@@ -149,11 +149,11 @@ def edge_data(
         shift = (start * lines.crossing[:, k]).sum(axis=1).astype(np.float32)
         t = (strips.u * crossing[:, :1] + strips.v * crossing[:, 1:] - shift[:, None]) * per_sigma
         used &= t > nearest.astype(np.float32)[:, None]
-        near = t < 4.5
-        fade, density = erf_and_density(t[near])
-        Q[near] *= fade
+        fade, density = erf_and_density(t)
+        Q *= fade
         rho = (lines.crossing[:, k] * lines.normal).sum(axis=1).astype(np.float32)
-        R[near] += np.broadcast_to(4 * rho[:, None], t.shape)[near] * density
+        density *= 4 * rho[:, None]
+        R += density
     slope_a, slope_b = (g.astype(np.float32) for g in slopes)
     value = strips.value - strips.u * slope_a[:, :1] - strips.v * slope_a[:, 1:]
     relative = slope_b / contrast.astype(np.float32)[:, None]

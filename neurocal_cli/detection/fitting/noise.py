@@ -99,13 +99,15 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     """
     # A share of the pixels is enough for a dozen numbers.
     step = max(1, int(data.count[good].sum()) // _ENOUGH)
-    edges = np.flatnonzero(good)[:, None]
+    edges, (_, width, length) = np.flatnonzero(good)[:, None], fit.linear.rows.shape
     # Each edge another share, or all of them would be from the same places across the edges.
-    some = (edges, np.arange(0, data.s.shape[1] - step + 1, step) + 7 * edges % step)
-    z, x, Q = fit.linear.z[some], fit.linear.x[some], data.Q[some]
+    some = np.arange(0, length - step + 1, step) + 7 * edges % step
+    place, first = edges * length + some, edges * (width * length) + some
+    z, x, Q, root, scale = (
+        y.reshape(-1).take(place) for y in (fit.linear.z, fit.linear.x, data.Q, data.root, data.gain)
+    )
     _, density = erf_and_density(z)
-    root = data.root[some]
-    scale = data.gain[some] * root
+    scale *= root
     scale *= fit.values[good, CONTRAST].astype(np.float32)[:, None]
     steep = scale * Q if not shape.bend.any() else response(x, shape.bend)[1] * Q * scale
     # Edge by edge: small products, for which no threads are started.
@@ -114,10 +116,10 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     tail_terms(z, density, out=tails)
     tails *= steep[:, None]
     response_terms(x, scale, out=bends)
-    others[:, 0], others[:, 1] = (fit.linear.rows[:, k][some] for k in (OFFSET, BLUR - 1))
+    for k, row in ((0, OFFSET), (1, width + BLUR - 1), (4, width - 1)):
+        others[:, k] = fit.linear.rows.reshape(-1).take(first + row * length)
     np.multiply(x, scale, out=others[:, 2])
     others[:, 3] = root
-    others[:, 4] = fit.linear.residual[some]
     products = (columns @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
     normal, right = products[:-1, :-1].copy(), products[:-1, -1].copy()
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE

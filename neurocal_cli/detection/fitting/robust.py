@@ -156,8 +156,7 @@ def settled_map(start: SmoothMap, rows: Rows, shift: Array, steps: int, worth: f
         normal = weighted @ jacobian.T
         normal.ravel()[:: len(values) + 1] += prior
         moved = values + _solved(normal, gradient, damping)
-        tried = replace(start, parameters=start.parameters.copy())
-        tried.parameters[free] = moved[:m]
+        tried = start.moved(free, moved[:m])
         ahead, slopes = seen.residual(tried, moved[m:], free)
         square_ahead = ahead * ahead
         before = weight @ square + prior @ (values * values)
@@ -243,17 +242,15 @@ def finished_map(settled: Settled, rows: Rows) -> MapFit:
     weight = _tukey(z / usual_scale(z[telling]))
     good = weight > 0
     normal = (jacobian * (good / rows.variance)) @ jacobian.T
-    normal[np.diag_indices_from(normal)] += np.concatenate(
-        [now.prior[free], np.full(len(shift), _SHIFT_PRIOR)]
-    )
-    size = 1 / np.sqrt(np.maximum(np.diag(normal), _TINY))
+    normal.ravel()[:: len(normal) + 1] += np.concatenate([now.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
+    size = 1 / np.sqrt(np.maximum(normal.diagonal(), _TINY))
     inverse = np.linalg.inv(normal * size[:, None] * size) * size[:, None] * size
     telling = good & telling
     left = int(telling.sum()) - len(free) - len(shift)
     excess = float((z[telling] ** 2).sum()) / max(left, 0.2 * len(z))
     shrunk = min(1.0, (excess * left + _BELIEF) / (left + _BELIEF)) if left > 0 else 1.0
     covariance = np.zeros((len(now.parameters),) * 2)
-    covariance[np.ix_(free, free)] = inverse[: len(free), : len(free)]
+    covariance[free[:, None], free] = inverse[: len(free), : len(free)]
     return MapFit(
         map=replace(now, covariance=covariance),
         shift=shift,

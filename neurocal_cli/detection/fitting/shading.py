@@ -14,7 +14,9 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Levels", "Shading", "fit_shading", "square_levels"]
 
-_LATTICE = np.linspace(0.25, 0.75, 8)  # of a square; its interior, away from the blurred edges
+_x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
+# Weights of a square's corners in places (64, 4) of its interior, away from the blurred edges.
+_INTERIOR = np.stack([(1 - _x) * (1 - _y), _x * (1 - _y), (1 - _x) * _y, _x * _y], axis=-1)
 _STEPS = 2  # after the last degree
 _TUKEY = 5.0  # standard deviations beyond which a level counts as an outlier
 _TINY = 1e-9  # DN^2
@@ -82,21 +84,18 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
     whole = seen[:-1, :-1] & seen[1:, :-1] & seen[:-1, 1:] & seen[1:, 1:]
     r, c = np.nonzero(whole)
     corner = np.stack([c, r], axis=-1).astype(float)
-    lattice = np.stack(np.meshgrid(_LATTICE, _LATTICE), axis=-1).reshape(-1, 2)
     corners = at.at(corner[:, None] + np.array([[0, 0], [1, 0], [0, 1], [1, 1]]))
-    x, y = lattice.T
-    weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=-1)
-    places = np.einsum("lk,eki->eli", weights, corners)
     height, width = image.shape
-    u, v = np.rint(places[..., 0]).astype(np.intp), np.rint(places[..., 1]).astype(np.intp)
-    values = image[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)].astype(float)
+    places = np.rint(_INTERIOR @ corners).astype(np.intp)
+    u, v = (np.minimum(np.maximum(places[..., k], 0), (width, height)[k] - 1) for k in (0, 1))
+    values = image[v, u].astype(float)
     half = values.shape[1] // 2
     level = np.sort(values, axis=1)[:, half]
     noise = (1.4826 * np.sort(np.abs(values - level[:, None]), axis=1)[:, half]) ** 2 + 1 / 12
     is_dark = (c + r + grid.dark) % 2 == 0
     middle = corners.mean(axis=1)
     dark, light = (
-        Levels(middle[kind], level[kind], 0.5 * np.pi * noise[kind] / len(lattice), noise[kind])
+        Levels(middle[kind], level[kind], 0.5 * np.pi * noise[kind] / len(_INTERIOR), noise[kind])
         for kind in (is_dark, ~is_dark)
     )
     return dark, light
@@ -121,7 +120,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
         used = min(used, most)
         # The median does not see the outliers that the weights have to find.
         scatter = median(residual**2) / 0.455 * n / max(n - used, 1)
-        weight = np.clip(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6, None) ** 2
+        weight = np.maximum(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6) ** 2
         root = np.sqrt(weight / (levels.variance + spread))
         weighted = terms[:, :used].T * root
         normal = weighted @ weighted.T

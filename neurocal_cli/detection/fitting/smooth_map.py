@@ -131,19 +131,26 @@ class SmoothMap:
         values[[k for k in range(_HOMOGRAPHY, _REST) if k not in _FREE_LENS[radial]]] = 0.0
         return replace(self, parameters=values, radial=radial, degree=degree, covariance=None)
 
+    def moved(self, which: NDArray[np.intp], values: Array) -> SmoothMap:
+        """The map with other values of some parameters."""
+        parameters = self.parameters.copy()
+        parameters[which] = values
+        return SmoothMap(self.frame, parameters, self.radial, self.degree)
+
     def at(self, grid: Array) -> Array:
         """Pixels of grid coordinates; (..., 2) -> (..., 2)."""
         frame, values = self.frame, self.parameters
-        scaled = (grid - frame.origin) / frame.half
-        q = _project(values, scaled[..., 0], scaled[..., 1])
+        ground = np.ones((3, grid.size // 2))
+        ground[:2] = ((grid - frame.origin) / frame.half).reshape(-1, 2).T
+        homogeneous = self._homography @ ground
+        q = homogeneous[:2] / homogeneous[2]
         if self.radial:
-            e = q - values[8:10]
-            rho = (e * (e @ self._metric)).sum(axis=-1)[..., None]
-            q = q + e * (rho * (values[10] + values[11] * rho))
+            e = q - values[8:10, None]
+            rho = (e * (self._metric @ e)).sum(axis=0)
+            q += e * (rho * (values[10] + values[11] * rho))
         if self.degree:
-            terms = _rest(self.degree, self.frame, scaled[..., 0], scaled[..., 1])
-            q = q + terms @ values[_REST:].reshape(2, -1).T
-        return np.asarray(frame.centre + frame.unit * q)
+            q += values[_REST:].reshape(2, -1) @ _rest(self.degree, self.frame, ground[0], ground[1]).T
+        return np.asarray(frame.centre + frame.unit * q.T).reshape(grid.shape)
 
     def places(self, grid: Array, direction: Array) -> Places:
         """Grid points (N, 2) and unit vectors (2, N), prepared for maps of this form."""
@@ -173,7 +180,7 @@ class SmoothMap:
         """
         values, way = self.parameters, places.way
         out = np.empty((len(values), way.shape[1]))
-        homogeneous = np.append(values[:_HOMOGRAPHY], 1.0).reshape(3, 3) @ places.ground
+        homogeneous = self._homography @ places.ground
         depth = 1 / homogeneous[2]
         q = homogeneous[:2] * depth
         value = (way * q).sum(axis=0)
@@ -218,6 +225,12 @@ class SmoothMap:
         return length * stretch, bent
 
     @property
+    def _homography(self) -> Array:
+        matrix = np.ones((3, 3))
+        matrix.ravel()[:_HOMOGRAPHY] = self.parameters[:_HOMOGRAPHY]
+        return matrix
+
+    @property
     def _metric(self) -> Array:
         m, n = self.parameters[12:14]
         return np.array([[1 + m, n], [n, 1 - m]])
@@ -239,13 +252,6 @@ def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
     values = np.zeros(_HOMOGRAPHY + _LENS)
     values[:8] = np.linalg.lstsq(np.concatenate([upper, lower]), np.concatenate([u, v]), rcond=None)[0]
     return SmoothMap(frame, values)
-
-
-def _project(values: Array, x: Array, y: Array) -> Array:
-    w = 1 + values[6] * x + values[7] * y
-    u = (values[0] * x + values[1] * y + values[2]) / w
-    v = (values[3] * x + values[4] * y + values[5]) / w
-    return np.stack([u, v], axis=-1)
 
 
 def _orders(degree: int, frame: Frame) -> tuple[tuple[int, int], ...]:

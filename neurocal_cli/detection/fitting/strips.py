@@ -57,6 +57,19 @@ class Lines:
         """(E,) from end to end [px]."""
         return self.ends[:, 1] - self.ends[:, 0]
 
+    def pixels(self, s: Single, d: Single) -> tuple[Single, Single]:
+        """Pixels u and v, relative to the middles, of tangential and normal coordinates (E, N)."""
+        across = s * s
+        across *= _column(0.5 * self.curvature)
+        across += d
+        # The frame is orthogonal, but longer than one where the line is bent.
+        square = (self.tangent**2).sum(axis=1, keepdims=True)
+        t, n = self.tangent / square, self.normal / square
+        u, v = s * _column(t[:, 0]), s * _column(t[:, 1])
+        u += across * _column(n[:, 0])
+        v += across * _column(n[:, 1])
+        return u, v
+
 
 def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light: Array) -> Lines:
     """Lines of a grid as a map sees them.
@@ -163,22 +176,23 @@ def gather(
     d -= _column(0.5 * lines.curvature) * s * s
     inside = np.abs(d) <= _column(half_width)
     inside &= (s >= _column(low)) & (s <= _column(high))
-    total = inside.sum(axis=1)
+    used = total = np.count_nonzero(inside, axis=1)
     framed = window.framed(steep, image.shape)
     if framed is not None:
         inside &= framed
-    used = inside.sum(axis=1)
+        used = np.count_nonzero(inside, axis=1)
     index, inside = packed(inside, used)
-    along_columns, down = window.relative(index)
-    return Strips(
-        s=s.reshape(-1)[index],
-        d=d.reshape(-1)[index],
-        value=image.reshape(-1).take(window.places(steep, image.shape[1], index), mode="clip").astype("f4"),
-        inside=inside,
-        u=np.where(steep[:, None], down, along_columns),
-        v=np.where(steep[:, None], along_columns, down),
-        beyond=1 - used / np.maximum(total, 1),
-    )
+    s, d = s.reshape(-1).take(index), d.reshape(-1).take(index)
+    u, v = lines.pixels(s, d)
+    return Strips(s, d, _values(image, lines, u, v), inside, u, v, 1 - used / np.maximum(total, 1))
+
+
+def _values(image: NDArray[np.generic], lines: Lines, u: Single, v: Single) -> Single:
+    """The image at whole pixels (E, N), relative to the lines' middles; padding may lie anywhere."""
+    column, row = (np.rint(x + _column(lines.middle[:, k])).astype(np.intp) for k, x in enumerate((u, v)))
+    row *= image.shape[1]
+    row += column
+    return image.reshape(-1).take(row, mode="clip").astype(np.float32)
 
 
 def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
@@ -243,16 +257,3 @@ class _Window:
         inside = (row >= 0) & (row < high[:, :, None])
         inside &= ((column >= 0) & (column < wide))[:, :, None]
         return inside.reshape(len(column), -1)
-
-    def places(self, steep: NDArray[np.bool_], width: int, index: NDArray[np.intp]) -> NDArray[np.intp]:
-        """Places of packed pixels in the flat image of a width; of those that stand for nothing, anywhere."""
-        right, down = (np.where(steep, a, b)[:, None] for a, b in ((width, 1), (1, width)))
-        first = (self.column * right + self.top * down).astype(np.intp)
-        return (first[:, :, None] + (down * np.arange(self.rows))[:, None]).reshape(-1)[index]
-
-    def relative(self, index: NDArray[np.intp]) -> tuple[Single, Single]:
-        """Coordinates of packed pixels relative to the line's middle, along the columns' way and down."""
-        a, b = self.a.astype(np.float32), self.b.astype(np.float32)
-        every = np.repeat(a.reshape(-1), self.rows)
-        down = np.asarray(b[:, :, None] + np.arange(self.rows, dtype=np.float32), dtype=np.float32)
-        return every[index], down.reshape(-1)[index]
