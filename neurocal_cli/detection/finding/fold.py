@@ -17,7 +17,7 @@ from neurocal_cli.detection.finding.grow import Lattice, cropped
 from neurocal_cli.detection.medians import median, quantile
 from neurocal_cli.geometry import Array
 
-__all__ = ["folded", "joined", "restricted", "unfolded"]
+__all__ = ["joined", "restricted", "unfolded"]
 
 # The least bend that is a fold [squares] and its ratio to the bends of the rows far from it: paper
 # is bent too, and the less the better the board is otherwise.
@@ -55,12 +55,6 @@ def unfolded(lattice: Lattice) -> list[Lattice]:
         part = restricted(lattice, np.isfinite(kept[..., 0]))
         parts += unfolded(part) if part.seen.any() else []
     return parts
-
-
-def folded(lattice: Lattice) -> bool:
-    """Whether a lattice runs over a fold."""
-    row, col = _folds(lattice)
-    return row[1] > 0 or col[1] > 0
 
 
 def restricted(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:

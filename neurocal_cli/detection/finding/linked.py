@@ -10,12 +10,13 @@ from collections import deque
 
 import numpy as np
 
-from neurocal_cli.detection.finding.fold import folded, joined, restricted
+from neurocal_cli.detection.finding.fold import joined, restricted, unfolded
 from neurocal_cli.detection.finding.grow import Lattice, cropped, judged, smoothing, squared
 from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.detection.finding.refine import settle
 from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.detection.finding.seeds import Links
+from neurocal_cli.geometry import Array
 
 __all__ = ["linked"]
 
@@ -51,21 +52,27 @@ def linked(level: Level, saddles: Saddles, links: Links, middle: int) -> Lattice
     settled = settle(level.image, lattice.pixels[row, col], smoothing(lattice.width))
     stays = np.abs(settled - lattice.pixels[row, col]).max(axis=1) < _NEAR
     lattice.pixels[row, col] = np.where(stays[:, None], settled, np.nan)
+    # Over a fold vertices are linked as anywhere else; growing stops there.
+    part = _with(unfolded(lattice), saddles.points[middle])
     for _ in range(_ROUNDS):
-        count = np.count_nonzero(lattice.seen)
-        if count < _FEWEST:
+        count = 0 if part is None else np.count_nonzero(part.seen)
+        if part is None or count < _FEWEST:
             break
-        lattice, good = judged(level, lattice)
+        part, good = judged(level, part)
         wrong = count - np.count_nonzero(good)
         if wrong == 0:
-            # Over a fold vertices are linked as anywhere else, and only growing stops there.
-            return None if folded(lattice) else lattice
+            return part
         if wrong > _WRONG * count:
             break
         # What is left out has another chance when the grid grows.
-        parts = joined(restricted(lattice, squared(good)))
-        lattice = max(parts, key=lambda part: int(part.seen.sum()), default=lattice)
+        part = _with(joined(restricted(part, squared(good))), saddles.points[middle])
     return None
+
+
+def _with(parts: list[Lattice], point: Array) -> Lattice | None:
+    """The lattice that a point [px] is a vertex of."""
+    near = (part for part in parts if (np.abs(part.pixels - point) < _NEAR).all(axis=-1).any())
+    return next(near, None)
 
 
 def _laid(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:

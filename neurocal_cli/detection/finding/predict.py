@@ -8,7 +8,7 @@ distortion, so that few neighbours give a plane map and many a curved one.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +89,13 @@ class Expected:
         return out
 
 
+@lru_cache(maxsize=64)
+def _window(width: int) -> NDArray[np.intp]:
+    """From a place's first neighbour to all of them, in flat arrays of a width."""
+    size = np.arange(2 * _REACH + 1)
+    return (size[:, None] * width + size).ravel()
+
+
 def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Expected:
     """Expect vertices where their neighbours put them, whether they are known or not.
 
@@ -104,9 +111,8 @@ def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Exp
     seen = ~np.isnan(pixels[..., 0])
     np.copyto(inner[:2], pixels.transpose(2, 0, 1), where=seen)
     inner[2] = seen
-    size, width = np.arange(2 * _REACH + 1), framed.shape[2]
-    window = (size[:, None] * width + size).ravel()
-    near = framed.reshape(3, -1).take((row * width + col)[:, None] + window, axis=1)
+    width = framed.shape[2]
+    near = framed.reshape(3, -1).take((row * width + col)[:, None] + _window(width), axis=1)
     known = near[2]
     sums = known @ _PRODUCTS
     normal = sums[:, :-1].reshape(-1, 6, 6) + _HELD_BACK

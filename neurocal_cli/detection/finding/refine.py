@@ -64,8 +64,7 @@ def settle(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
     low, high = half, np.array([[width - 1 - half], [height - 1 - half]])
     framed = (given >= low) & (given <= high)
     good = framed[0] & framed[1]
-    step = np.where(good, given, low)
-    centre = _within(step, low, high)
+    centre = np.rint(np.where(good, given, low))
     step, saddle = _newton(image, centre, sigma)
     # A step is the same from wherever a pixel is nearest: only those that lead to another one go on.
     for _ in range(rounds - 1):
@@ -97,6 +96,7 @@ def _newton(image: Image, centre: Array, sigma: float) -> tuple[Array, NDArray[n
     np.subtract(uv * v, vv * u, out=step[0])
     np.subtract(uv * u, uu * v, out=step[1])
     step /= np.where(saddle, determinant, -1.0)
-    length = np.maximum(np.hypot(step[0], step[1]), 1e-12)
-    step *= np.minimum(1.0, _LONGEST_STEP / length)
+    length = np.hypot(step[0], step[1])
+    if length.max(initial=0.0) > _LONGEST_STEP:
+        step *= np.minimum(1.0, _LONGEST_STEP / np.maximum(length, 1e-12))
     return step, saddle
