@@ -126,9 +126,11 @@ def _sprouted(
             continue
         free[seed] = False
         planted = linked(level, saddles, links, int(seed[1, 1])) if len(seed) == 3 else None
-        if planted is None:
-            planted = Lattice(saddles.points[seed], saddles.contrast[seed], int(parity))
-        grid = cleaned(level, grown(level, planted))
+        if planted is not None and planted.seen.all() and level.scale > 1:
+            grid = planted  # if there is more of it, finer levels show
+        else:
+            first = Lattice(saddles.points[seed], saddles.contrast[seed], int(parity))
+            grid = cleaned(level, grown(level, first if planted is None else planted))
         boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_seen(level, x)]
         if boards:
             found += boards
