@@ -10,7 +10,7 @@ import pytest
 from test_fit_models import some_map
 
 from neurocal_cli.detection.fitting.forms import choose_map
-from neurocal_cli.detection.fitting.newton import BLUR, Fit, Linear, Part, Prior, gauss_newton
+from neurocal_cli.detection.fitting.newton import BLUR, Fit, Linear, Part, Prior, gauss_newton, rows_for
 from neurocal_cli.detection.fitting.noise import BoardBlur
 from neurocal_cli.detection.fitting.robust import Rows, fit_map, median
 from neurocal_cli.detection.fitting.shading import Levels, fit_shading
@@ -70,7 +70,7 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
     information = np.tile(1e6 * np.eye(5), (60, 1, 1))
     prior = Prior(np.ones((60, 3)), np.zeros((60, 3, 3)))
     nothing = np.zeros((60, 1), dtype=np.float32)
-    linear = Linear(np.zeros((60, 6, 1), dtype=np.float32), nothing, nothing)
+    linear = Linear(rows_for(60, 5, 1, nothing.dtype), nothing, nothing)
     ones = np.ones(60)
     fit = Fit(values, information, prior, ones, ones.astype(np.int64), ones, linear)
     blur = BoardBlur.of(fit, normal, ones.astype(bool))
@@ -84,9 +84,9 @@ def test_fits_settle_where_their_steps_are_too_long() -> None:
         def model(values: Array) -> Linear:
             place = values[:, :1]
             rows = np.zeros((len(values), 5, 1), dtype=np.float32)
-            rows[:, 0] = 100 / (1 + place**2)
-            rows[:, -1] = -100 * np.arctan(place)
-            return Linear(rows, rows[:, -1], rows[:, -1])
+            rows[:, 0] = -100 * np.arctan(place)
+            rows[:, 1] = 100 / (1 + place**2)
+            return Linear(rows, rows[:, 0], rows[:, 0])
 
         return model
 

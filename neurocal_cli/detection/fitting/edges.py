@@ -28,6 +28,7 @@ from neurocal_cli.detection.fitting.newton import (
     Prior,
     Shape,
     gauss_newton,
+    rows_for,
 )
 from neurocal_cli.detection.fitting.profile import erf_and_density, response
 from neurocal_cli.detection.fitting.strips import Lines, Strips
@@ -218,8 +219,8 @@ def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Li
     slope *= data.Q
     slope -= density
     gain = data.gain * data.root
-    rows = np.empty((len(z), 6, z.shape[1]), dtype=x.dtype)
-    by_offset, by_tilt, by_mean, by_contrast, by_blur, residual = rows.swapaxes(0, 1)
+    rows = rows_for(len(z), 5, z.shape[1], x.dtype)
+    residual, by_offset, by_tilt, by_mean, by_contrast, by_blur = rows.swapaxes(0, 1)[:6]
     factor = gain * (-contrast / sigma)
     if shape.bend.any():
         F, steep = response(x, shape.bend)

@@ -22,6 +22,7 @@ __all__ = [
     "Prior",
     "Shape",
     "gauss_newton",
+    "rows_for",
 ]
 
 Single = NDArray[np.float32]
@@ -85,8 +86,9 @@ class Linear:
 
     Attributes
     ----------
-    rows : (E, P + 1, N) array
-        Derivatives of the model by the values, and the residual, in standard deviations of the pixels' noise.
+    rows : (E, R, N) array
+        The residual and the model's derivatives by the P values, in standard deviations of the pixels' noise;
+        see `rows_for`.
     z, x : (E, N) arrays
         Distance from the edge in sigma, and light between the levels.
     """
@@ -97,13 +99,12 @@ class Linear:
 
     @property
     def residual(self) -> Single:
-        """(E, N) values less the model, in standard deviations of the noise."""
-        return self.rows[:, -1]
+        """(E, N) pixels less the model, in standard deviations of the noise."""
+        return self.rows[:, 0]
 
-    @property
-    def products(self) -> Array:
-        """(E, P + 1, P + 1) sums over pixels: the information, the gradient beside it, chi2 in the corner."""
-        return (self.rows @ self.rows.swapaxes(1, 2)).astype(float)
+    def products(self, count: int) -> Array:
+        """(E, P + 1, P + 1) sums over pixels, for P values: chi2, the gradient beside it, the information."""
+        return (self.rows @ self.rows.swapaxes(1, 2))[:, : count + 1, : count + 1].astype(float)
 
     def part(self, which: NDArray[np.intp]) -> Linear:
         """That of some fits."""
@@ -112,6 +113,17 @@ class Linear:
     def put(self, which: NDArray[np.intp], part: Linear) -> None:
         """Replace that of some fits, in place."""
         self.rows[which], self.z[which], self.x[which] = part.rows, part.z, part.x
+
+
+def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) -> NDArray[np.floating]:
+    """Room (E, R, N) for the rows of a model: R a multiple of eight, beyond the values 0.
+
+    The linear algebra library takes twice as long for six rows as for eight.
+    """
+    used = 1 + values
+    rows = np.empty((count, -(-used // 8) * 8, pixels), dtype=kind)
+    rows[:, used:] = 0
+    return rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +205,7 @@ def gauss_newton(
         part = state.part(restless)
         part.settle(model_of(restless), prior.part(restless), more, 1.0)
         state.put(restless, part)
-    information, chi2 = state.products[:, :-1, :-1], state.products[:, -1, -1]
+    information, chi2 = state.products[:, 1:, 1:], state.products[:, 0, 0]
     return Fit(state.values, information, prior, chi2, count, state.size, state.linear)
 
 
@@ -211,7 +223,7 @@ class _State:
     @classmethod
     def of(cls, model: Callable[[Array], Linear], values: Array, prior: Prior) -> _State:
         linear = model(values)
-        products, none = linear.products, np.zeros(len(values))
+        products, none = linear.products(values.shape[1]), np.zeros(len(values))
         return cls(values, linear, products, _cost(products, values, prior), none, none)
 
     def part(self, which: NDArray[np.intp]) -> _State:
@@ -236,7 +248,7 @@ class _State:
         for _ in range(steps):
             tried = _moved(self.values, self._step(prior))
             ahead = model(tried)
-            products = ahead.products
+            products = ahead.products(tried.shape[1])
             cost = _cost(products, tried, prior)
             # Edges sharper than a pixel bend the model within a step: one that leads up is taken back.
             worse = ~(cost <= self.cost * (1 + _SINGLE) + _SINGLE)
@@ -255,7 +267,7 @@ class _State:
 
     def _step(self, prior: Prior) -> Array:
         """The next step; `size` becomes that of the undamped one."""
-        information, gradient = self.products[:, :-1, :-1].copy(), self.products[:, :-1, -1].copy()
+        information, gradient = self.products[:, 1:, 1:].copy(), self.products[:, 1:, 0].copy()
         pull = self.values[:, MEAN:] - prior.mean
         gradient[:, MEAN:] -= (prior.precision @ pull[:, :, None])[:, :, 0]
         information[:, MEAN:, MEAN:] += prior.precision
@@ -280,7 +292,7 @@ class _State:
 
 def _cost(products: Array, values: Array, prior: Prior) -> Array:
     pull = values[:, MEAN:] - prior.mean
-    return np.asarray(products[:, -1, -1] + np.einsum("ei,eij,ej->e", pull, prior.precision, pull))
+    return np.asarray(products[:, 0, 0] + np.einsum("ei,eij,ej->e", pull, prior.precision, pull))
 
 
 def _solved(information: Array, gradient: Array) -> Array:

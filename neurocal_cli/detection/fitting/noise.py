@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.edges import OFFSET, EdgeData
-from neurocal_cli.detection.fitting.newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape
+from neurocal_cli.detection.fitting.newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape, rows_for
 from neurocal_cli.detection.fitting.profile import (
     RESPONSE_TERMS,
     erf_and_density,
@@ -111,26 +111,27 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     scale *= fit.values[good, CONTRAST].astype(np.float32)[:, None]
     steep = scale * Q if not shape.bend.any() else response(x, shape.bend)[1] * Q * scale
     # Edge by edge: small products, for which no threads are started.
-    columns = np.empty((len(z), RESPONSE_TERMS + 7, z.shape[1]), dtype=np.float32)
-    tails, bends, others = np.split(columns, [2, 2 + RESPONSE_TERMS], axis=1)
+    columns = rows_for(len(z), RESPONSE_TERMS + 6, z.shape[1], z.dtype)
+    others, tails, bends = np.split(columns[:, : RESPONSE_TERMS + 7], [5, 7], axis=1)
     tail_terms(z, density, out=tails)
     tails *= steep[:, None]
     response_terms(x, scale, out=bends)
-    for k, row in ((0, OFFSET), (1, width + BLUR - 1), (4, width - 1)):
+    for k, row in enumerate((0, 1 + OFFSET, fit.values.shape[1])):
         others[:, k] = fit.linear.rows.reshape(-1).take(first + row * length)
-    np.multiply(x, scale, out=others[:, 2])
-    others[:, 3] = root
+    np.multiply(x, scale, out=others[:, 3])
+    others[:, 4] = root
     products = (columns @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
-    normal, right = products[:-1, :-1].copy(), products[:-1, -1].copy()
+    # The residual is the first row, what it depends on follow, what is asked for being the last.
+    rest = slice(1, RESPONSE_TERMS + 7)
+    normal, right = products[rest, rest], products[rest, 0]
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
     # Blur, contrast, tails and the odd terms of the response can nearly stand in for one another.
     believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _BENDS)]) ** -2
     known = np.concatenate([shape.tails.mean(axis=0), shape.bend])
-    right[: len(known)] -= believed * known
-    normal[range(len(known)), range(len(known))] += believed
-    change = np.linalg.solve(normal, right)
-    bend = shape.bend + change[2 : 2 + RESPONSE_TERMS]
-    return replace(shape, tails=shape.tails + change[:2], bend=bend)
+    right[4:] -= believed * known
+    np.einsum("ii->i", normal)[4:] += believed
+    change = np.linalg.solve(normal, right)[4:]
+    return replace(shape, tails=shape.tails + change[:2], bend=shape.bend + change[2:])
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.box import sharp_profile
-from neurocal_cli.detection.fitting.newton import Fit, Linear, Part, Prior, Shape, gauss_newton
+from neurocal_cli.detection.fitting.newton import (
+    Fit,
+    Linear,
+    Part,
+    Prior,
+    Shape,
+    gauss_newton,
+    rows_for,
+)
 from neurocal_cli.detection.fitting.profile import Real, erf_and_density, response
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, gather, grid_lines, packed
@@ -206,15 +214,16 @@ def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, s
     factor = -contrast / sigma * steep * gain
     by_z1 *= factor
     by_z2 *= factor
-    rows = np.empty((len(x), 8, x.shape[1]), dtype=data.value.dtype)
-    rows[:, FIRST], rows[:, FIRST + 1] = by_z1, by_z1 * levers[0]
-    rows[:, SECOND], rows[:, SECOND + 1] = by_z2, by_z2 * levers[1]
-    rows[:, 4] = data.root
-    rows[:, 5] = F * gain
-    rows[:, 6] = z1 * by_z1 + z2 * by_z2
+    rows = rows_for(len(x), 7, x.shape[1], data.value.dtype)
+    residual, by = rows[:, 0], rows[:, 1:].swapaxes(0, 1)
+    by[FIRST], by[FIRST + 1] = by_z1, by_z1 * levers[0]
+    by[SECOND], by[SECOND + 1] = by_z2, by_z2 * levers[1]
+    by[4] = data.root
+    by[5] = F * gain
+    by[6] = z1 * by_z1 + z2 * by_z2
     if spread1 is not None and spread2 is not None:
-        rows[:, 6] -= factor * (spread1 * E2 + E1 * spread2) * data.Q
-    rows[:, 7] = (data.value - mean) * data.root - contrast * rows[:, 5]
+        by[6] -= factor * (spread1 * E2 + E1 * spread2) * data.Q
+    residual[...] = (data.value - mean) * data.root - contrast * by[5]
     z = np.where(np.abs(z1) < np.abs(z2), z1, z2)
     return Linear(rows, z, x)
 
