@@ -24,7 +24,7 @@ __all__ = ["linked"]
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 _NEAR = 1.0  # px; of a saddle from where it is with more smoothing
 _FEWEST = 12  # vertices
-_ROUNDS, _WRONG = 3, 0.1  # times that some are left out, and their share
+_ROUNDS, _WRONG = 3, 0.35  # times that some are left out, and their share
 _WHOLE = 0.5  # share of an outer line; links lead astray beyond the board, and growing tells the better
 
 
