@@ -17,7 +17,7 @@ from neurocal_cli.detection.finding.grow import Lattice, cropped
 from neurocal_cli.detection.medians import median, quantile
 from neurocal_cli.geometry import Array
 
-__all__ = ["joined", "restricted", "unfolded"]
+__all__ = ["bend", "joined", "restricted", "unfolded"]
 
 # The least bend that is a fold [squares] and its ratio to the bends of the rows far from it: paper
 # is bent too, and the less the better the board is otherwise.
@@ -73,16 +73,27 @@ def joined(lattice: Lattice) -> list[Lattice]:
 
 def _folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
     """The sharpest folds along a row and along a column, see `_fold`."""
+    width = max(median(lattice.known[2].width), 1.0)
+    along_columns, along_rows = _second_differences(lattice)
+    return _fold(along_columns, width), _fold(along_rows, width)
+
+
+def bend(lattice: Lattice) -> float:
+    """How much the most bent row or column of a lattice is bent, folds included [squares]."""
+    return max(float(_size(second).max()) for second in _second_differences(lattice))
+
+
+def _second_differences(lattice: Lattice) -> tuple[Array, Array]:
+    """Those along the columns (rows, cols, 2) and along the rows (cols, rows, 2) [squares]; nan if unknown."""
     pixels = lattice.pixels
     row, col, at = lattice.known
-    width = max(median(at.width), 1.0)
-    folds = []
+    along = []
     for lines, index in ((pixels, (row, col)), (pixels.swapaxes(0, 1), (col, row))):
         second = np.full(lines.shape, np.nan)
         second[1:-1] = lines[2:] - 2 * lines[1:-1] + lines[:-2]
         second[index] = at.in_squares(second[index])
-        folds.append(_fold(second, width))
-    return folds[0], folds[1]
+        along.append(second)
+    return along[0], along[1]
 
 
 def _fold(second: Array, width: float) -> tuple[float, float]:

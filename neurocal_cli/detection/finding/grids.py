@@ -120,12 +120,12 @@ def _sprouted(
 ) -> list[Lattice]:
     """Grids that grow from seeds, until some of these have come to nothing."""
     found: list[Lattice] = []
-    free = np.ones(len(saddles), dtype=bool)
+    free, taken = np.ones(len(saddles), dtype=bool), np.zeros(len(saddles), dtype=bool)
     for seed, parity in zip(seeds, dark, strict=True):
         if not free[seed].all():
             continue
         free[seed] = False
-        planted = linked(level, saddles, links, int(seed[1, 1])) if len(seed) == 3 else None
+        planted = linked(level, saddles, links, int(seed[1, 1]), taken) if len(seed) == 3 else None
         if planted is not None and planted.seen.all() and level.scale > 1:
             grid = planted  # if there is more of it, finer levels show
         else:
@@ -134,7 +134,8 @@ def _sprouted(
         boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_seen(level, x)]
         if boards:
             found += boards
-            free &= _covered(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] == 0
+            taken |= _covered(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] > 0
+            free &= ~taken
         else:
             tries -= 1
         if tries <= 0:

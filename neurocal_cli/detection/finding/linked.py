@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
+from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.fold import joined, restricted, unfolded
+from neurocal_cli.detection.finding.fold import bend, joined, restricted, unfolded
 from neurocal_cli.detection.finding.grow import Lattice, cropped, judged, smoothing, squared
 from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.detection.finding.refine import settle
@@ -25,10 +26,13 @@ _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 _NEAR = 1.0  # px; of a saddle from where it is with more smoothing
 _FEWEST = 12  # vertices
 _ROUNDS, _WRONG = 3, 0.35  # times that some are left out, and their share
+_MOST_BENT = 0.16  # squares, of a row; more is seldom perspective, and may be a fold
 _WHOLE = 0.5  # share of an outer line; links lead astray beyond the board, and growing tells the better
 
 
-def linked(level: Level, saddles: Saddles, links: Links, middle: int) -> Lattice | None:
+def linked(
+    level: Level, saddles: Saddles, links: Links, middle: int, taken: NDArray[np.bool_]
+) -> Lattice | None:
     """Put together what is linked with a vertex.
 
     Parameters
@@ -38,13 +42,15 @@ def linked(level: Level, saddles: Saddles, links: Links, middle: int) -> Lattice
     links : Links
     middle : int
         The vertex; its port 0 leads along c.
+    taken : (N,) bool array
+        Saddles that belong to other grids.
 
     Returns
     -------
     lattice : Lattice or None
         None where what the links lead to is not all as a board's.
     """
-    places = _followed(links, middle)
+    places = _followed(links, middle, taken.tolist())
     if len(places) < _FEWEST:
         return None
     lattice = _laid(saddles, places)
@@ -61,7 +67,8 @@ def linked(level: Level, saddles: Saddles, links: Links, middle: int) -> Lattice
         part, good = judged(level, part)
         wrong = count - np.count_nonzero(good)
         if wrong == 0:
-            return part
+            # Holes may hide a fold.
+            return part if bend(part) < _MOST_BENT else None
         if wrong > _WRONG * count:
             break
         # What is left out has another chance when the grid grows.
@@ -92,7 +99,7 @@ def _laid(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
     return cropped(Lattice(pixels, contrast, int(left + top) % 2))
 
 
-def _followed(links: Links, middle: int) -> dict[tuple[int, int], int]:
+def _followed(links: Links, middle: int, taken: list[bool]) -> dict[tuple[int, int], int]:
     """Saddles by their places (c, r) from the middle one, each at the first place that leads to it."""
     to, entry = links.lists
     places, along = {(0, 0): middle}, {middle: 0}  # the latter: each one's port along c
@@ -103,9 +110,7 @@ def _followed(links: Links, middle: int) -> dict[tuple[int, int], int]:
         for turn, (dc, dr) in enumerate(_STEPS):
             port = (along[saddle] + turn) % 4
             neighbour, there = to[saddle][port], (c + dc, r + dr)
-            if neighbour < 0:
-                continue
-            if there in places or neighbour in along:
+            if neighbour < 0 or taken[neighbour] or there in places or neighbour in along:
                 continue
             places[there] = neighbour
             along[neighbour] = (entry[saddle][port] + 2 - turn) % 4
