@@ -9,7 +9,14 @@ from rendered import condition, picture
 
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.finding import levels as find_levels
+from neurocal_cli.detection.finding.fold import bend
 from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.finding.grow import Lattice
+from neurocal_cli.detection.finding.levels import Level, levels_of
+from neurocal_cli.detection.finding.linked import linked
+from neurocal_cli.detection.finding.refine import settle
+from neurocal_cli.detection.finding.saddles import find_saddles
+from neurocal_cli.detection.finding.seeds import find_links, find_seeds
 from neurocal_cli.geometry import Array
 from neurocal_cli.rendering import PlaneTruth, Rectangle, render, scene_bound
 
@@ -295,3 +302,54 @@ def test_noise_of_large_pictures_is_found_in_bands(monkeypatch: pytest.MonkeyPat
     whole = find_levels.Level(image, 1).noise
     monkeypatch.setattr(find_levels, "_LARGE", 0)
     assert find_levels.Level(image, 1).noise == pytest.approx(whole, rel=0.1)
+
+
+def linked_first(level: Level) -> Lattice | None:
+    """What is linked with the best seed of a level."""
+    saddles = find_saddles(level)
+    links = find_links(level, saddles)
+    seeds, _ = find_seeds(saddles, links)
+    return linked(level, saddles, links, int(seeds[0, 1, 1]), np.zeros(len(saddles), dtype=bool))
+
+
+@pytest.mark.parametrize("name", ["base", "noise 12", "k1 -0.3"])
+def test_links_put_a_plain_board_together(name: str) -> None:
+    shot = picture(name, FIRST)
+    lattice = linked_first(levels_of(shot.image)[-1])
+    assert lattice is not None
+    scale = levels_of(shot.image)[-1].scale
+    hit, wrong = matched(Grid(scale * lattice.pixels, lattice.dark), shot.truth.planes[0], within=2.0)
+    assert wrong == 0
+    assert hit.mean() > 0.9
+
+
+@pytest.mark.parametrize("seed", [FIRST, FIRST + 6])
+def test_links_do_not_lead_over_a_fold(seed: int) -> None:
+    """On the smallest level of the second one, holes hide the fold from what looks for it."""
+    shot = picture("three planes across", seed)
+    level = levels_of(shot.image)[-1]
+    saddles = find_saddles(level)
+    links = find_links(level, saddles)
+    seeds, _ = find_seeds(saddles, links)
+    none = np.zeros(len(saddles), dtype=bool)
+    together = [linked(level, saddles, links, int(s), none) for s in np.unique(seeds[:, 1, 1])]
+    assert any(together)
+    for lattice in filter(None, together):
+        assert bend(lattice) < 0.16
+        hits = [
+            matched(Grid(level.scale * lattice.pixels, lattice.dark), plane, within=3.0)[0].sum()
+            for plane in shot.truth.planes
+        ]
+        # A plane's outer squares run on behind the fold, one row of vertices at most.
+        assert max(hits) >= 0.6 * lattice.seen.sum()
+
+
+def test_saddles_settle_where_they_are() -> None:
+    shot = picture("base", FIRST)
+    image, vertices = levels_of(shot.image)[0].image, shot.truth.planes[0].vertices.reshape(-1, 2)
+    start = vertices + np.random.default_rng(1).uniform(-1, 1, vertices.shape)
+    settled = settle(image, start, 1.5)
+    assert np.abs(settled - vertices).max() < 0.1
+    np.testing.assert_allclose(settle(image, settled, 1.5), settled, atol=1e-9)
+    np.testing.assert_allclose(settle(image, settled, 1.5, rounds=1), settled, atol=1e-9)
+    assert np.isnan(settle(image, np.array([[-5.0, 20.0], [np.nan, 3.0]]), 1.5)).all()

@@ -84,7 +84,7 @@ def bend(lattice: Lattice) -> float:
 
 
 def _second_differences(lattice: Lattice) -> tuple[Array, Array]:
-    """Those along the columns (rows, cols, 2) and along the rows (cols, rows, 2) [squares]; nan if unknown."""
+    """Those along columns (rows, cols, 2) and along rows (cols, rows, 2) [squares]; nan where unknown."""
     pixels = lattice.pixels
     row, col, at = lattice.known
     along = []
