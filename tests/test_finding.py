@@ -352,6 +352,6 @@ def test_saddles_settle_where_they_are() -> None:
     assert np.abs(settled - vertices).max() < 0.1
     # Half-way between pixels, each of the two may lead to the other.
     again = np.abs(settle(image, settled, 1.5, rounds=1) - settled).max(axis=1)
-    assert again.max() < 0.1
+    assert again.max() < 0.2
     assert (again < 1e-9).mean() > 0.8
     assert np.isnan(settle(image, np.array([[-5.0, 20.0], [np.nan, 3.0]]), 1.5)).all()
