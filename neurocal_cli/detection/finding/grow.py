@@ -162,7 +162,9 @@ def frontier(lattice: Lattice) -> tuple[Index, Index]:
 
 
 _BESIDE = 16  # what a neighbour along an edge counts more than one at a corner
-_COUNTS = np.array([[1, _BESIDE + 1, 1], [_BESIDE + 1, 1, _BESIDE + 1], [1, _BESIDE + 1, 1]], dtype=np.float32)
+_COUNTS = np.array(
+    [[1, _BESIDE + 1, 1], [_BESIDE + 1, 1, _BESIDE + 1], [1, _BESIDE + 1, 1]], dtype=np.float32
+)
 
 
 def _frontier(seen: NDArray[np.bool_], reach: int) -> tuple[Index, Index, NDArray[np.generic]]:
