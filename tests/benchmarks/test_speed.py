@@ -12,7 +12,8 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from scenes import Scene, random_flat_set, table_1
+from bent import through
+from scenes import random_flat_set, table_1
 
 from neurocal_cli import Correspondences, calibrate, read_points
 from neurocal_cli.camera import project
@@ -20,32 +21,48 @@ from neurocal_cli.camera import project
 VIEWS = [13, 100, 1000]
 
 
-def flat_scene(n_views: int) -> Scene:
-    rng = np.random.default_rng(5)
-    return random_flat_set(rng, n_views, False, cols=9, rows=6, f=1500)
+PLUMB_BOB = [-0.2, 0.05, 0.001, -0.001, 0.02]
+
+
+def flat_points(n_views: int, model: str) -> Correspondences:
+    scene = random_flat_set(np.random.default_rng(5), n_views, False, cols=9, rows=6, f=1500)
+    if model != "none":
+        scene = through(scene, model, PLUMB_BOB)
+    return scene.points(0.3, np.random.default_rng(1))
 
 
 @pytest.mark.benchmark(group="flat views of 54 points")
-@pytest.mark.parametrize("n_views", [*VIEWS, 3000])
-def test_neurocal_on_flat_views(benchmark: BenchmarkFixture, n_views: int) -> None:
-    points = flat_scene(n_views).points(0.3, np.random.default_rng(1))
-    calibration = benchmark(lambda: calibrate(points, skew=False))
+@pytest.mark.parametrize(
+    ("n_views", "model"), [*((n, "none") for n in (*VIEWS, 3000)), *((n, "plumb_bob") for n in VIEWS)]
+)
+def test_neurocal_on_flat_views(benchmark: BenchmarkFixture, n_views: int, model: str) -> None:
+    points = flat_points(n_views, model)
+    calibration = benchmark(lambda: calibrate(points, skew=False, distortion=model, outliers="keep"))
     assert calibration.converged
 
 
 @pytest.mark.benchmark(group="flat views of 54 points")
-@pytest.mark.parametrize("n_views", VIEWS)
-def test_opencv_on_the_same_views(benchmark: BenchmarkFixture, n_views: int) -> None:
+@pytest.mark.parametrize(("n_views", "model"), [(n, "plumb_bob") for n in VIEWS[:2]])
+def test_neurocal_with_all_its_defaults(benchmark: BenchmarkFixture, n_views: int, model: str) -> None:
+    points = flat_points(n_views, model)
+    assert benchmark(lambda: calibrate(points, skew=False)).converged
+
+
+@pytest.mark.benchmark(group="flat views of 54 points")
+@pytest.mark.parametrize(("n_views", "model"), [(n, model) for model in ("none", "plumb_bob") for n in VIEWS])
+def test_opencv_on_the_same_views(benchmark: BenchmarkFixture, n_views: int, model: str) -> None:
     cv2 = pytest.importorskip("cv2")
     cv2.setNumThreads(1)
-    points = flat_scene(n_views).points(0.3, np.random.default_rng(1))
+    points = flat_points(n_views, model)
     views = range(points.n_views)
     world = [points.world[points.view_index == k].astype(np.float32) for k in views]
     pixels = [points.pixels[points.view_index == k].astype(np.float32) for k in views]
-    # The pinhole camera without skew: the same unknowns.
-    flags = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    # Without skew and, for a pinhole, without distortion: the same unknowns.
+    pinhole = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    flags = pinhole if model == "none" else 0
     result = benchmark(lambda: cv2.calibrateCamera(world, pixels, points.image_size, None, None, flags=flags))
-    assert result[0] == pytest.approx(calibrate(points, skew=False).rmse_px, rel=1e-4)
+    same = calibrate(points, skew=False, distortion=model, outliers="keep")
+    assert result[0] == pytest.approx(same.rmse_px, rel=1e-3)
 
 
 @pytest.mark.benchmark(group="one view")
