@@ -81,6 +81,15 @@ class NewViews:
         return float(np.sqrt(found.cost.sum() / len(views.index))) * views.pixel_scale
 
 
+def within_reach(new: NewViews, scene: Scene, points: Correspondences) -> NewViews:
+    """New views without what lies farther from the axis than any of some points."""
+    far, reach = (np.hypot(*without_camera(scene.intrinsics.A, p.pixels)) for p in (new.points, points))
+    some = new.points.select(far <= reach.max())
+    some = some.select((np.bincount(some.view_index) >= 12)[some.view_index])
+    poses = dict(zip(new.points.view_names, new.poses, strict=True))
+    return NewViews(some, [poses[name] for name in some.view_names])
+
+
 def new_views(scene: Scene, model: str, k: list[float], seed: int, n_views: int = 20) -> NewViews:
     """Other boards anywhere in the image of the same camera, with noise."""
     rng = np.random.default_rng([seed, 2])

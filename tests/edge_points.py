@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scenes import board_midpoints, random_flat_set
 
@@ -10,32 +12,45 @@ from neurocal_cli.camera import Intrinsics, project
 from neurocal_cli.geometry import Array
 
 
+def edges(square: float = 25.0) -> tuple[Array, Array]:
+    """Mid-points of a board of 9 x 6 vertices, and points farther along their edges; (93, 3) each."""
+    middle = board_midpoints(9, 6)
+    world = square * np.column_stack([middle, np.zeros(len(middle))])
+    return world, world + np.where((middle[:, :1] % 1) > 0, [[1.0, 0, 0]], [[0, 1.0, 0]])
+
+
 def edge_set(seed: int, n_views: int = 8, sigma: float = 0.01) -> tuple[Intrinsics, Correspondences]:
-    """A camera and what it saw of a board of 9 x 6 vertices in some views."""
+    """A camera and what it saw of a board in some views."""
     rng = np.random.default_rng(seed)
     scene = random_flat_set(rng, n_views, False, cols=9, rows=6, width=640, f=600.0)
-    middle = board_midpoints(9, 6)
-    world = 25.0 * np.column_stack([middle, np.zeros(len(middle))])
-    ends = world + np.where((middle[:, :1] % 1) > 0, [[1.0, 0, 0]], [[0, 1.0, 0]])
+    world, ends = edges()
+    true, farther = (
+        np.concatenate([project(scene.intrinsics.A, pose, some)[0] for pose in scene.poses.values()])
+        for some in (world, ends)
+    )
+    exact = Correspondences(
+        np.tile(world, (n_views, 1)), true, np.repeat(list(scene.poses), len(world)), scene.image_size
+    )
+    return scene.intrinsics, as_measured(exact, farther, sigma, rng)
+
+
+def as_measured(
+    exact: Correspondences, farther: Array, sigma: float, rng: np.random.Generator
+) -> Correspondences:
+    """Exact points with the errors of a detector, given pixels (N, 2) farther along each edge."""
     pixels, across, covariance = [], [], []
-    for pose in scene.poses.values():
-        true, _ = project(scene.intrinsics.A, pose, world)
-        along = project(scene.intrinsics.A, pose, ends)[0] - true
+    for view in range(exact.n_views):
+        rows = exact.view_index == view
+        along = farther[rows] - exact.pixels[rows]
         along /= np.linalg.norm(along, axis=1)[:, None]
         normal = along[:, ::-1] * [-1.0, 1.0]
-        noise, C = measured(true, along, normal, sigma * rng.uniform(0.5, 2.0, len(true)), rng)
-        pixels.append(true + noise)
+        spread = sigma * rng.uniform(0.5, 2.0, len(along))
+        noise, C = measured(exact.pixels[rows], along, normal, spread, rng)
+        pixels.append(exact.pixels[rows] + noise)
         across.append(normal)
         covariance.append(C)
-    points = Correspondences(
-        np.tile(world, (n_views, 1)),
-        np.concatenate(pixels),
-        np.repeat(list(scene.poses), len(world)),
-        scene.image_size,
-        covariance=np.concatenate(covariance),
-        across=np.concatenate(across),
-    )
-    return scene.intrinsics, points
+    joined = (np.concatenate(parts) for parts in (pixels, across, covariance))
+    return replace(exact, **dict(zip(("pixels", "across", "covariance"), joined, strict=True)))
 
 
 def measured(

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_points import edge_set
+from edge_points import as_measured, edge_set, edges
 from hypothesis import given
 from hypothesis import strategies as st
+from rigs import random_rig
 from scenes import pinhole
 
 from neurocal_cli import Correspondences, calibrate
@@ -22,6 +23,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.judging.judgement import judge
 from neurocal_cli.lenses.plumb_lines import find_lines
+from neurocal_cli.stereo.methods import calibrate_stereo
 
 NAMES = ("alpha_u", "alpha_v", "u0", "v0")
 
@@ -47,6 +49,23 @@ def test_standard_deviations_of_midpoints_hold() -> None:
     assert 0.85 < rms(one_way) < 1.15
     assert rms(both_ways) > 2.0
     assert np.mean(disagreement) == pytest.approx(1.0, abs=0.25)
+
+
+def test_standard_deviations_of_a_rig_hold() -> None:
+    one_way, both_ways = [], []
+    world, ends = edges()
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        scene = replace(random_rig(rng, "verging", 8), world=world)
+        sides = [
+            as_measured(scene.points(side), replace(scene, world=ends).points(side).pixels, 0.01, rng)
+            for side in (0, 1)
+        ]
+        for kept, points in ((one_way, sides), (both_ways, [replace(p, across=None) for p in sides])):
+            rig = calibrate_stereo(*points, skew=False, distortion="none", outliers="keep")
+            kept.append([(rig.t[k] - scene.rig.t[k]) / rig.std[f"t_{axis}"] for k, axis in enumerate("xyz")])
+    assert 0.8 < rms(one_way) < 1.2
+    assert rms(both_ways) > 2.0
 
 
 def test_the_level_of_the_noise_is_that_of_the_measurement() -> None:

@@ -1,0 +1,112 @@
+"""From light to the camera: sets of rendered images, detected and calibrated, beside the truth."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from bent import coefficients
+
+from neurocal_cli import Calibration, Correspondences, calibrate, detect_points
+from neurocal_cli.board import Board, Plane
+from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.detection.detect import Points, gather
+from neurocal_cli.lens import MODELS, Lens
+from neurocal_cli.lenses.unfolding import folds_back
+from neurocal_cli.rendering import Background, Camera, Scene, Sensor, Target, render
+
+SIZE = (400, 300)
+TRUTH = Intrinsics(505.0, 503.0, 201.0, 148.0)
+PLANE = Plane("", 9, 6, 25.0)
+VIEWS = 8
+NAMES = ("alpha_u", "alpha_v", "u0", "v0")
+
+
+def camera(model: str, rng: np.random.Generator) -> Camera:
+    """One that bends, but folds nothing back that it sees."""
+    anywhere = Correspondences(np.zeros((1, 3)), np.array([[200.0, 150.0]]), image_size=SIZE)
+    while True:
+        lens = tuple(coefficients(model, 0.5, rng))
+        if folds_back(Lens(model, lens), TRUTH.A, anywhere) is None:
+            return Camera(TRUTH, SIZE, lens)
+
+
+def look(rng: np.random.Generator, view: int) -> Pose:
+    """A tilted board whose centre is anywhere in the middle half of the image."""
+    side = 2 * np.pi * view / VIEWS
+    turn = Pose.from_euler(0, 0, side, np.zeros(3)).R
+    tilt = Pose.from_euler(np.radians(rng.uniform(20, 40)), 0, 0, np.zeros(3)).R
+    R = turn @ tilt @ turn.T @ Pose.from_euler(0, 0, rng.uniform(-0.4, 0.4), np.zeros(3)).R
+    depth = rng.uniform(430, 620)
+    t = np.array([*(rng.uniform(-0.125, 0.125, 2) * SIZE * depth / 500), depth])
+    return Pose(R, t - R @ PLANE.at([4.0, 2.5]))
+
+
+def rendered(model: str, seed: int, *kinds: Points) -> list[Correspondences]:
+    """What is detected in eight images, for each kind of points."""
+    rng = np.random.default_rng([seed, len(MODELS[model])])
+    through, board = camera(model, rng), Board.single(9, 6, 25.0)
+    found: dict[Points, dict] = {kind: {} for kind in kinds}
+    while len(found[kinds[0]]) < VIEWS:
+        name = f"view{len(found[kinds[0]])}"
+        scene = Scene(
+            through,
+            look(rng, len(found[kinds[0]])),
+            (Target(PLANE),),
+            Background(0.45),
+            psf=0.7,
+            sensor=Sensor(read_noise=2.0),
+        )
+        picture = render(scene, rng)
+        if picture.truth.planes[0].vertices_visible.all():
+            for kind in kinds:
+                found[kind][name] = detect_points(picture.image, board, kind)
+    return [gather(found[kind]) for kind in kinds]
+
+
+def sigmas(found: Calibration) -> list[float]:
+    return [(getattr(found.intrinsics, name) - getattr(TRUTH, name)) / found.std[name] for name in NAMES]
+
+
+def rms(values: list[list[float]]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def test_a_set_of_images_gives_the_camera_within_its_standard_deviations() -> None:
+    (points,) = rendered("none", 7, "midpoints")
+    found = calibrate(points, skew=False)
+    assert found.distortion_model == "none"
+    assert not len(found.rejected)
+    assert np.abs(sigmas(found)).max() < 3
+    assert found.std["alpha_u"] < 0.1
+
+
+@pytest.mark.slow
+def test_standard_deviations_hold_from_images_on() -> None:
+    one_way, vertices, both_ways = [], [], []
+    for seed in range(40):
+        midpoints, corners = rendered("none", seed, "midpoints", "vertices")
+        one_way.append(sigmas(calibrate(midpoints, skew=False, distortion="none")))
+        vertices.append(sigmas(calibrate(corners, skew=False, distortion="none")))
+        naive = Correspondences(
+            midpoints.world, midpoints.pixels, midpoints.view, SIZE, covariance=midpoints.covariance
+        )
+        both_ways.append(sigmas(calibrate(naive, skew=False, distortion="none", outliers="keep")))
+    assert 0.8 < rms(one_way) < 1.2
+    assert 0.8 < rms(vertices) < 1.2
+    assert rms(both_ways) > 2.5  # what it would be without knowing in which direction points are measured
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["none", "k1", "k1k2", "k1k2p1p2", "plumb_bob"])
+def test_the_lens_of_rendered_images_is_found(model: str) -> None:
+    chosen: Counter[str] = Counter()
+    errors = []
+    for seed in range(40):
+        found = calibrate(*rendered(model, seed, "midpoints"), skew=False)
+        chosen[found.distortion_model] += 1
+        errors.append(sigmas(found))
+    assert all(len(MODELS[name]) <= len(MODELS[model]) + 2 for name in chosen)
+    assert chosen[model] >= 38, chosen
+    assert 0.8 < rms(errors) < 1.2
