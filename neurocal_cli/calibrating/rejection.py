@@ -224,19 +224,35 @@ def _errors(fit: Fit, points: Correspondences) -> _Errors:
     view = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
     predicted, in_front = seen.predict(points.world, np.maximum(view, 0))
     residuals = predicted - points.pixels
-    length = _lengths(residuals, points, fit.share)
+    stated = None
+    if points.covariance is not None:
+        stated = with_common_share(points.covariance, fit.share, points.across)
+        residuals = _eased(residuals, stated, points.across)
+    length = _lengths(residuals, stated, points.across)
     length = np.where(in_front & (view >= 0) & np.isfinite(length), length, np.inf)
     return _Errors(length, _parts(length, residuals, points.across))
 
 
-def _lengths(residuals: Array, points: Correspondences, share: float) -> Array:
+def _eased(residuals: Array, stated: Array, across: Array | None) -> Array:
+    """Errors along edges smaller by as much as the points are less certain there, at a board's ends."""
+    if across is None:
+        return residuals
+    n = unit(across)
+    s = n[:, ::-1] * [-1.0, 1.0]
+    certain, less = variance_across(stated, n), variance_across(stated, s)
+    ease = np.sqrt(np.minimum(certain / less, 1.0))[:, None]
+    with np.errstate(invalid="ignore"):
+        along = (residuals * s).sum(axis=1, keepdims=True) * s
+    return np.where(single(across)[:, None], residuals - along + ease * along, residuals)
+
+
+def _lengths(residuals: Array, stated: Array | None, across: Array | None) -> Array:
     """Lengths of residuals (N, 2) [px], whitened where the points have covariances, on average unchanged.
 
     Along an edge the camera may miss a mid-point by as much as across it: what is wrong shows in both.
     """
-    if points.covariance is None:
+    if stated is None:
         return np.hypot(residuals[:, 0], residuals[:, 1])
-    stated, across = with_common_share(points.covariance, share, points.across), points.across
     if across is not None:
         variance = variance_across(stated, across)[:, None]
         stated = np.where(single(across)[:, None], variance * np.array([1.0, 0.0, 1.0]), stated)
