@@ -182,6 +182,33 @@ def test_grids_are_oriented_as_promised() -> None:
     assert (dark == ((rows + cols + grid.dark) % 2 == 0)).all()
 
 
+def before_its_own_small_picture(reduced: int) -> tuple[np.ndarray, tuple[int, int]]:
+    """A board with a picture of itself, so many times smaller, in a corner of the image; and its shape."""
+    image = np.array(picture("base", FIRST).image)
+    (grid,) = find_grids(image)
+    low = np.floor(np.nanmin(grid.pixels, axis=(0, 1)) - 45).astype(int)
+    size = (np.ceil(np.nanmax(grid.pixels, axis=(0, 1)) + 45).astype(int) - low) // reduced
+    part = image[low[1] : low[1] + size[1] * reduced, low[0] : low[0] + size[0] * reduced]
+    small = part.reshape(size[1], reduced, size[0], reduced).mean(axis=(1, 3))
+    image[: size[1], : size[0]] = np.rint(small)
+    return image, grid.shape
+
+
+def test_far_behind_the_board_that_is_wanted_nothing_is_looked_for() -> None:
+    image, shape = before_its_own_small_picture(4)
+    near, far = find_grids(image)
+    (alone,) = find_grids(image, [shape])
+    assert near.shape == far.shape == shape
+    assert (alone.pixels == near.pixels).all()
+    assert len(find_grids(image, [(shape[0] + 1, shape[1])])) == 2
+    assert len(find_grids(image, [shape[::-1]])) == 1
+
+
+def test_what_is_nearly_as_near_is_looked_for_all_the_same() -> None:
+    image, shape = before_its_own_small_picture(2)
+    assert len(find_grids(image, [shape])) == 2
+
+
 @pytest.mark.parametrize("name", ["occluded", "board cut", "two boards"])
 @pytest.mark.parametrize("count", [2, pytest.param(16, marks=pytest.mark.slow)])
 def test_visible_vertices_of_partly_hidden_boards_are_found(name: str, count: int) -> None:

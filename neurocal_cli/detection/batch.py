@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 
 from neurocal_cli.board import Board
-from neurocal_cli.detection.detect import Detection, Points, detect_points
+from neurocal_cli.detection.detect import Detection, Points, detect_points, wanted_sizes
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
@@ -125,7 +125,7 @@ def examine(path: str, task: Task) -> Outcome:
 
 
 def _detected(path: str, image: Image, task: Task) -> Outcome:
-    grids = find_grids(image.grey)
+    grids = find_grids(image.grey, wanted_sizes(task.board))
     overlay: bytes | None = None
     try:
         found = detect_points(image.grey, task.board, task.points, task.gamma, grids)

@@ -19,7 +19,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Detection", "Labels", "Points", "detect_points", "gather", "label"]
+__all__ = ["Detection", "Labels", "Points", "detect_points", "gather", "label", "wanted_sizes"]
 
 Points = Literal["midpoints", "vertices"]
 
@@ -130,7 +130,7 @@ def detect_points(
     NoBoardError
         The image does not show the board, or not enough of it; with the reason.
     """
-    found = find_grids(image) if grids is None else grids
+    found = find_grids(image, wanted_sizes(board)) if grids is None else grids
     identified = identify(board, found, image)
     located = identified.located
     measured = tuple(_sound(measure(image, one.grid, points, gamma)) for one in located)
@@ -152,6 +152,11 @@ def detect_points(
         measured,
         identified.warnings,
     )
+
+
+def wanted_sizes(board: Board) -> list[tuple[int, int]]:
+    """What `find_grids` need not look behind: a board of one plane."""
+    return [(plane.cols, plane.rows) for plane in board.planes] if len(board.planes) == 1 else []
 
 
 def _check_enough(measured: Iterable[Measured]) -> None:

@@ -6,6 +6,7 @@ on a reduced picture, and are completed and made precise on finer and finer ones
 
 from __future__ import annotations
 
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 import cv2
@@ -35,15 +36,21 @@ _SEARCHED = 1.4e6
 # at this size would have to be a speck in a picture that fills the memory.
 _MOST_SEARCHED = 30_000_000
 _TRIES, _SLIM_TRIES = 8, 4  # seeds per level that come to nothing
+_BEHIND = 3.0  # times larger are the squares of a board before what need not be looked at
+
+Size = tuple[int, int]
 
 
-def find_grids(image: NDArray[np.generic]) -> list[Grid]:
+def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list[Grid]:
     """Find every chessboard in a picture.
 
     Parameters
     ----------
     image : (height, width) array
         Grey, of 8 or 16 bits or real numbers of any range.
+    sizes : collection of (int, int), optional
+        Columns and rows, either way round, of a board that alone is wanted: once it is seen whole, others
+        whose squares are a third of its and smaller, far behind it, are let be.
 
     Returns
     -------
@@ -54,6 +61,7 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
     """
     lattices: list[Lattice] = []
     saddles: Saddles
+    wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
     levels = levels_of(image)
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
@@ -62,7 +70,7 @@ def find_grids(image: NDArray[np.generic]) -> list[Grid]:
             if level is small[0]:
                 lattices = [y for x in lattices for y in _boards(cleaned(level, grown(level, x)))]
             saddles = find_saddles(level, _covered(level, lattices) if lattices else None)
-            lattices += _new(level, saddles, not lattices)
+            lattices += _new(level, saddles, lattices, wanted)
             if level not in small[1:]:
                 lattices = _separated(level, lattices)
     if not lattices and levels and levels[0] in small:
@@ -98,15 +106,31 @@ def _area(pixels: Array) -> float:
     return float(np.nansum(np.abs(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])) / 2)
 
 
-def _new(level: Level, saddles: Saddles, first: bool) -> list[Lattice]:
-    """Grids of a level's saddles; with more effort for the first in an image."""
+def _whole(lattices: Iterable[Lattice], wanted: frozenset[Size]) -> float:
+    """Width of the squares [px] of the nearest grid of a wanted size that is seen whole; 0 if none is."""
+    widths = (x.width for x in lattices if x.contrast.shape in wanted and x.seen.all())
+    return max(widths, default=0.0)
+
+
+def _sides(points: Array) -> Array:
+    """(S,) longest sides of the squares between blocks of points (S, R, C, 2) [px]."""
+    along, down = points[:, :, 1:] - points[:, :, :-1], points[:, 1:] - points[:, :-1]
+    return np.maximum(*(np.hypot(x[..., 0], x[..., 1]).max(axis=(1, 2)) for x in (along, down)))
+
+
+def _new(
+    level: Level, saddles: Saddles, known: list[Lattice], wanted: frozenset[Size] = frozenset()
+) -> list[Lattice]:
+    """Grids of a level's saddles beside the known ones; with more effort for the first in an image."""
     if len(saddles) < 9:
         return []
     links = find_links(level, saddles)
     seeds, _ = find_seeds(saddles, links)
-    found = _sprouted(level, saddles, links, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES)
-    if not found and first and level.scale == 1:
-        found = _sprouted(level, saddles, links, *find_slim_seeds(saddles, links), _SLIM_TRIES)
+    found = _sprouted(
+        level, saddles, links, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES, known, wanted
+    )
+    if not found and not known and level.scale == 1:
+        found = _sprouted(level, saddles, links, *find_slim_seeds(saddles, links), _SLIM_TRIES, known, wanted)
     return found
 
 
@@ -117,12 +141,16 @@ def _sprouted(
     seeds: NDArray[np.intp],
     dark: NDArray[np.intp],
     tries: int,
+    known: list[Lattice],
+    wanted: frozenset[Size],
 ) -> list[Lattice]:
     """Grids that grow from seeds, until some of these have come to nothing."""
     found: list[Lattice] = []
     free, taken = np.ones(len(saddles), dtype=bool), np.zeros(len(saddles), dtype=bool)
-    for seed, parity in zip(seeds, dark, strict=True):
-        if not free[seed].all():
+    nearest = _whole(known, wanted)
+    sides = _sides(saddles.points[seeds]) if wanted and len(seeds) else np.full(len(seeds), np.inf)
+    for seed, parity, side in zip(seeds, dark, sides.tolist(), strict=True):
+        if side * _BEHIND < nearest or not free[seed].all():
             continue
         free[seed] = False
         planted = linked(level, saddles, links, int(seed[1, 1]), taken) if len(seed) == 3 else None
@@ -134,6 +162,7 @@ def _sprouted(
         boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_seen(level, x)]
         if boards:
             found += boards
+            nearest = max(nearest, _whole(boards, wanted))
             taken |= _covered(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] > 0
             free &= ~taken
         else:
@@ -149,7 +178,7 @@ def _slivers(level: Level, saddles: Saddles) -> list[Lattice]:
     if part is None:
         return []
     found = []
-    for lattice in _new(part.level, find_saddles(part.level), True):
+    for lattice in _new(part.level, find_saddles(part.level), []):
         there = part.back(lattice.pixels[lattice.seen])
         pixels = np.full_like(lattice.pixels, np.nan)
         settled = settle(level.image, there, smoothing(0.0))
