@@ -5,11 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from bent import without_camera
 from scenes import board_midpoints, random_flat_set
 
 from neurocal_cli import Correspondences
 from neurocal_cli.camera import Intrinsics, project
 from neurocal_cli.geometry import Array
+from neurocal_cli.lens import distort
 
 
 def edges(square: float = 25.0) -> tuple[Array, Array]:
@@ -19,19 +21,33 @@ def edges(square: float = 25.0) -> tuple[Array, Array]:
     return world, world + np.where((middle[:, :1] % 1) > 0, [[1.0, 0, 0]], [[0, 1.0, 0]])
 
 
-def edge_set(seed: int, n_views: int = 8, sigma: float = 0.01) -> tuple[Intrinsics, Correspondences]:
-    """A camera and what it saw of a board in some views."""
+def edge_set(
+    seed: int, n_views: int = 8, sigma: float = 0.01, lens: tuple[float, ...] = ()
+) -> tuple[Intrinsics, Correspondences]:
+    """A camera, with or without k1, k2 and so on, and what it saw of a board in some views."""
     rng = np.random.default_rng(seed)
     scene = random_flat_set(rng, n_views, False, cols=9, rows=6, width=640, f=600.0)
     world, ends = edges()
     true, farther = (
-        np.concatenate([project(scene.intrinsics.A, pose, some)[0] for pose in scene.poses.values()])
+        bent(
+            scene.intrinsics.A,
+            np.concatenate([project(scene.intrinsics.A, pose, some)[0] for pose in scene.poses.values()]),
+            lens,
+        )
         for some in (world, ends)
     )
     exact = Correspondences(
         np.tile(world, (n_views, 1)), true, np.repeat(list(scene.poses), len(world)), scene.image_size
     )
     return scene.intrinsics, as_measured(exact, farther, sigma, rng)
+
+
+def bent(A: Array, pixels: Array, lens: tuple[float, ...]) -> Array:
+    if not lens:
+        return pixels
+    x, y = without_camera(A, pixels)
+    x, y = distort("plumb_bob", [*lens, *[0.0] * (5 - len(lens))], x, y)
+    return np.column_stack([A[0, 0] * x + A[0, 1] * y + A[0, 2], A[1, 1] * y + A[1, 2]])
 
 
 def as_measured(

@@ -51,6 +51,17 @@ def test_standard_deviations_of_midpoints_hold() -> None:
     assert np.mean(disagreement) == pytest.approx(1.0, abs=0.25)
 
 
+@pytest.mark.parametrize("distortion", ["k1k2", pytest.param("plumb-line", marks=pytest.mark.slow)])
+def test_standard_deviations_of_a_lens_hold(distortion: str) -> None:
+    errors = []
+    for seed in range(50):
+        camera, points = edge_set(seed, 12, 0.05, (-0.2, 0.05))
+        found = calibrate(points, skew=False, distortion=distortion, outliers="keep")
+        k1, k2 = found.distortion[:2]
+        errors.append([*sigmas(found, camera), (k1 + 0.2) / found.std["k1"], (k2 - 0.05) / found.std["k2"]])
+    assert 0.85 < rms(errors) < 1.2
+
+
 def test_standard_deviations_of_a_rig_hold() -> None:
     one_way, both_ways = [], []
     world, ends = edges()

@@ -38,8 +38,9 @@ def with_lens_asked_for(
         Other states to begin with.
     """
     views, state = job.views, solution.refined.state
-    settled = solution.refined.converged and correlation(views, of_points(views, state)) < _ALIKE
-    if settled or not job.known.free_lens:
+    if not job.known.free_lens:
+        return solution
+    if solution.refined.converged and correlation(views, of_points(views, state)) < _ALIKE:
         return solution
     best, cost = solution, float(solution.refined.cost.sum())
     for start in (state, *more_starts()):
