@@ -40,6 +40,19 @@ def test_the_share_is_found_whatever_the_level(share: float, level: float) -> No
     assert share - 1e-9 <= found <= share + 0.08  # the largest that is not contradicted
 
 
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 1.0])
+@pytest.mark.parametrize("some", [1.0, 0.5])
+def test_the_share_is_found_from_what_was_measured(share: float, some: float) -> None:
+    """Errors in the other direction, whatever they are, tell nothing."""
+    rng = np.random.default_rng(4)
+    C, angle = stated(6000, rng), rng.uniform(0, 2 * np.pi, 6000)
+    across = np.column_stack([np.cos(angle), np.sin(angle)]) * (rng.random((6000, 1)) < some)
+    residuals = drawn(with_common_share(C, share, across), rng)
+    residuals += 30 * rng.normal(size=(6000, 1)) * across[:, ::-1] * [-1.0, 1.0]
+    found = common_share(C, residuals, across)
+    assert share - 0.02 <= found <= share + 0.12
+
+
 def test_mixing_keeps_the_mean_variance() -> None:
     C = stated(100, np.random.default_rng(2))
     for share in (0.0, 0.3, 1.0):

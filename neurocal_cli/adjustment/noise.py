@@ -150,8 +150,8 @@ def _unlikelihood(covariance: Array, residuals: Array, across: Array | None, sha
     chi = ((svv * u - 2 * suv * v) * u + suu * v * v) / det
     if across is None:
         return float(np.log(chi.mean()) + 0.5 * np.log(det).mean())
-    count = equations(across, len(C))
-    variance = variance_across(C, across)
-    chi = np.where(count == 1, (u * u + v * v) / variance, chi)
-    det = np.where(count == 1, variance, det)
-    return float(0.5 * count.mean() * np.log(chi.mean()) + 0.5 * np.log(det).mean())
+    one_way, variance = single(across), variance_across(C, across)
+    chi = np.where(one_way, (u * u + v * v) / variance, chi)
+    det = np.where(one_way, variance, det)
+    count = np.where(one_way, 1.0, 2.0).mean()
+    return float(0.5 * count * np.log(chi.mean()) + 0.5 * np.log(det).mean())
