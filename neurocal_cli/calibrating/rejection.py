@@ -227,19 +227,23 @@ def _errors(fit: Fit, points: Correspondences) -> _Errors:
     stated = None
     if points.covariance is not None:
         stated = with_common_share(points.covariance, fit.share, points.across)
-        residuals = _eased(residuals, stated, points.across)
+        residuals = _eased(residuals, points.covariance, stated, points.across)
     length = _lengths(residuals, stated, points.across)
     length = np.where(in_front & (view >= 0) & np.isfinite(length), length, np.inf)
     return _Errors(length, _parts(length, residuals, points.across))
 
 
-def _eased(residuals: Array, stated: Array, across: Array | None) -> Array:
-    """Errors along edges smaller by as much as the points are less certain there, at a board's ends."""
+def _eased(residuals: Array, covariance: Array, believed: Array, across: Array | None) -> Array:
+    """Errors along edges smaller by as much as the points are less certain there, at a board's ends.
+
+    What is alike for all points of the believed covariance is across the edges; along them the stated one
+    says how stiff the board's map is.
+    """
     if across is None:
         return residuals
     n = unit(across)
     s = n[:, ::-1] * [-1.0, 1.0]
-    certain, less = variance_across(stated, n), variance_across(stated, s)
+    certain, less = variance_across(believed, n), variance_across(covariance, s)
     ease = np.sqrt(np.minimum(certain / less, 1.0))[:, None]
     with np.errstate(invalid="ignore"):
         along = (residuals * s).sum(axis=1, keepdims=True) * s

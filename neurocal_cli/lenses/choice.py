@@ -37,6 +37,7 @@ _CHANCE = 4.6  # standard errors, of five folds, that chance exceeds in one case
 _MORE = 2  # coefficients
 _DECISIVE = 10.0  # of the criterion: odds of 150
 _ALIKE = 0.3  # correlation of neighbours' residuals
+_MUCH_BETTER = 0.8  # times the squared error
 _FAR_BELOW = 2.0  # times the squared error of the pinhole
 
 
@@ -84,11 +85,10 @@ def choose_lens(
     """
     views, by_views = job.views, _views_can_spare_any(job, solution)
     fitted = fit_candidates(job, solution.refined.state, points, by_views)
-    if not fitted or _lost_its_way(views, fitted):
+    limit = _limit(views, fitted)
+    if limit > 0:
         for start in more_starts():
-            for model, candidate in fit_candidates(job, start, points, by_views).items():
-                if model not in fitted or candidate.cost < fitted[model].cost:
-                    fitted[model] = candidate
+            _join(fitted, fit_candidates(job, start, points, by_views), limit)
     if not fitted:  # not even the pinhole settled: as it is
         return LensChoice(job, solution, {})
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
@@ -103,11 +103,26 @@ def choose_lens(
     return LensChoice(job, refined, table, _refusal(fitted, chosen))
 
 
-def _lost_its_way(views: Views, fitted: dict[str, Candidate]) -> bool:
-    """Whether the closest model leaves what a camera with another lens might not."""
-    closest = min(fitted.values(), key=lambda c: c.cost).refined.state
-    alike = correlation(views, of_points(views, closest)) > _ALIKE
-    return alike or falls_short(views, fitted.values())
+def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
+    """Squared error below which what another start leads to is of interest; 0: no start is.
+
+    Where every view by itself fits far better, any is; where neighbours err alike, as they do on a board that
+    is not flat too, one that explains much more.
+    """
+    if not fitted or falls_short(views, fitted.values()):
+        return np.inf
+    closest = min(fitted.values(), key=lambda c: c.cost)
+    alike = correlation(views, of_points(views, closest.refined.state)) > _ALIKE
+    return _MUCH_BETTER * closest.cost if alike else 0.0
+
+
+def _join(fitted: dict[str, Candidate], others: dict[str, Candidate], limit: float) -> None:
+    """Take over what fits better, if any of the others is below the limit."""
+    if min((c.cost for c in others.values()), default=np.inf) >= limit:
+        return
+    for model, candidate in others.items():
+        if model not in fitted or candidate.cost < fitted[model].cost:
+            fitted[model] = candidate
 
 
 def _views_can_spare_any(job: Job, solution: Solution) -> bool:
