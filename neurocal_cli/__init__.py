@@ -3,16 +3,18 @@
 Data flow from the top to the bottom of this list, and nothing imports from further down:
 
 ====================================  ==================================================================
-errors, geometry, camera, lens        the language: conventions, projection, distortion
+errors, geometry, camera              the language: conventions, projection, distortion
 points, board, calibration            what goes in and what comes out
+least_squares                         steps, Schur complements and covariances of nonlinear least squares
 network, training                     the calibrating network and its trainers
-adjustment                            the pixel error of all views, its minimum, its covariance
-search                                from random weights to a camera
-lenses                                which lens the data support, and straightening with it
-calibrating, methods                  `calibrate`: the fit, without the points that lie, as a result
-judging, evaluation, report           what a result is worth
-stereo, active_lens, plots            two cameras; a camera whose zoom and focus move; pictures
-io, rendering, detection              files; exact synthetic images; points from images
+bundle_adjustment                     the reprojection error of all views, its minimum, its covariance
+initialisation                        from random weights to a camera
+distortion                            which distortion model the data support; undistortion
+calibrating, methods                  `calibrate`: the fit, without outliers, as a result
+verdict, evaluation, report           what a result is worth
+stereo, zoom_lens, plots              two cameras; a camera whose zoom and focus move; pictures
+simulation                            synthetic images and zoom lenses with their exact truth
+io, detection                         files; points from images
 commands                              the command line
 ====================================  ==================================================================
 
@@ -25,15 +27,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurocal_cli.active_lens.camera_at import camera_at
-    from neurocal_cli.active_lens.evaluation import evaluate_lens
-    from neurocal_cli.active_lens.fit import fit_lens
-    from neurocal_cli.active_lens.fit_known import fit_lens_cameras
-    from neurocal_cli.active_lens.lens_model import ActiveLens
     from neurocal_cli.board import Board
     from neurocal_cli.calibration import Calibration
-    from neurocal_cli.camera import Intrinsics, Pose
+    from neurocal_cli.camera.pinhole import Intrinsics, Pose
     from neurocal_cli.detection.detect import detect_points
+    from neurocal_cli.distortion.remapping import undistort_image
+    from neurocal_cli.distortion.undistortion import undistort_points
     from neurocal_cli.errors import NeurocalError
     from neurocal_cli.evaluation import evaluate_camera
     from neurocal_cli.io.board_yaml import read_board
@@ -43,38 +42,41 @@ if TYPE_CHECKING:
     from neurocal_cli.io.lens_yaml import read_lens, write_lens
     from neurocal_cli.io.points_csv import read_points, write_points
     from neurocal_cli.io.rig_yaml import read_rig, write_rig
-    from neurocal_cli.lenses.remapping import undistort_image
-    from neurocal_cli.lenses.undistortion import undistort_points
     from neurocal_cli.methods import calibrate
     from neurocal_cli.points import Correspondences
+    from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
     from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
-    from neurocal_cli.stereo.fitting import fit_rig
-    from neurocal_cli.stereo.methods import calibrate_stereo
+    from neurocal_cli.stereo.fit_rig import fit_rig
     from neurocal_cli.stereo.rig import Rig
     from neurocal_cli.stereo.triangulation import triangulate
+    from neurocal_cli.zoom_lens.camera_at import camera_at
+    from neurocal_cli.zoom_lens.evaluation import evaluate_lens
+    from neurocal_cli.zoom_lens.fit_cameras import fit_lens_cameras
+    from neurocal_cli.zoom_lens.fit_points import fit_lens
+    from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "ActiveLens": "active_lens.lens_model",
+    "ZoomLens": "zoom_lens.zoom_lens",
     "Board": "board",
     "Calibration": "calibration",
     "Correspondences": "points",
-    "Intrinsics": "camera",
+    "Intrinsics": "camera.pinhole",
     "NeurocalError": "errors",
-    "Pose": "camera",
+    "Pose": "camera.pinhole",
     "Rig": "stereo.rig",
     "calibrate": "methods",
-    "calibrate_stereo": "stereo.methods",
-    "camera_at": "active_lens.camera_at",
+    "calibrate_stereo": "stereo.calibrate_stereo",
+    "camera_at": "zoom_lens.camera_at",
     "detect_points": "detection.detect",
     "evaluate_camera": "evaluation",
-    "evaluate_lens": "active_lens.evaluation",
+    "evaluate_lens": "zoom_lens.evaluation",
     "evaluate_rig": "stereo.evaluation",
     "evaluate_stereo": "stereo.evaluation",
-    "fit_lens": "active_lens.fit",
-    "fit_lens_cameras": "active_lens.fit_known",
-    "fit_rig": "stereo.fitting",
+    "fit_lens": "zoom_lens.fit_points",
+    "fit_lens_cameras": "zoom_lens.fit_cameras",
+    "fit_rig": "stereo.fit_rig",
     "read_board": "io.board_yaml",
     "read_calibration": "io.calibration_yaml",
     "read_image": "io.images",
@@ -84,8 +86,8 @@ _HOMES = {
     "read_points": "io.points_csv",
     "read_rig": "io.rig_yaml",
     "triangulate": "stereo.triangulation",
-    "undistort_image": "lenses.remapping",
-    "undistort_points": "lenses.undistortion",
+    "undistort_image": "distortion.remapping",
+    "undistort_points": "distortion.undistortion",
     "write_calibration": "io.calibration_yaml",
     "write_lens": "io.lens_yaml",
     "write_points": "io.points_csv",
@@ -93,7 +95,6 @@ _HOMES = {
 }
 
 __all__ = [
-    "ActiveLens",
     "Board",
     "Calibration",
     "Correspondences",
@@ -101,6 +102,7 @@ __all__ = [
     "NeurocalError",
     "Pose",
     "Rig",
+    "ZoomLens",
     "calibrate",
     "calibrate_stereo",
     "camera_at",

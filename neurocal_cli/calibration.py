@@ -8,7 +8,7 @@ from enum import Enum
 
 import numpy as np
 
-from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.problems import KnownCamera
-from neurocal_cli.adjustment.user_units import see
+from neurocal_cli.bundle_adjustment.problem import KnownCamera
+from neurocal_cli.bundle_adjustment.units import see
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import Lens
 from neurocal_cli.points import Correspondences
 
 __all__ = ["CameraEvaluation", "ViewEvaluation", "evaluate_camera"]

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.adjustment.job import Strategy
-from neurocal_cli.adjustment.problems import Known, KnownCamera, known_for
+from neurocal_cli.bundle_adjustment.job import Strategy
+from neurocal_cli.bundle_adjustment.problem import Known, KnownCamera, known_for
 from neurocal_cli.calibrating.assembly import assemble
 from neurocal_cli.calibrating.fitting import Fitter
-from neurocal_cli.calibrating.rejection import fit_robustly
+from neurocal_cli.calibrating.outlier_rejection import fit_robustly
 from neurocal_cli.calibration import Calibration, Rejected
-from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.camera.distortion_models import MODELS, Lens, coefficient_names
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import MODELS, Lens, coefficient_names
 from neurocal_cli.points import Correspondences
 from neurocal_cli.training import Task, Trained
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm

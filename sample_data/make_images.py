@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from neurocal_cli.board import Plane
-from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.io.files import write_whole
 from neurocal_cli.io.images import encode_png
-from neurocal_cli.rendering import Background, Camera, Scene, Sensor, Target, render
+from neurocal_cli.simulation.rendering import Background, Camera, Scene, Sensor, Target, render
 
 HERE = Path(__file__).resolve().parent
 CAMERA = Camera(Intrinsics(510.0, 508.0, 202.5, 147.0), (400, 300))

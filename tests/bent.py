@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scenes import Scene, random_flat_set
 
-from neurocal_cli.adjustment.refine import refine
-from neurocal_cli.adjustment.user_units import Seen, normalised
-from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.units import Seen, normalised
+from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import Pose, project
+from neurocal_cli.camera.distortion_models import Lens, distort
+from neurocal_cli.camera.monotonic import first_fold, is_seen
+from neurocal_cli.camera.pinhole import Pose, project
+from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import Lens, distort
-from neurocal_cli.lens_domain import first_fold, is_seen
-from neurocal_cli.lenses.unfolding import folds_back
 from neurocal_cli.points import Correspondences
 
 BENT = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "fisheye")
@@ -38,7 +38,7 @@ def bent_set(model: str, seed: int) -> tuple[Scene, list[float]]:
         if not enough or (model != "none" and first_fold(Lens(model, k)) < 1.6 * reach):
             continue
         bent = through(scene, model, k)
-        if sees(scene, model, k).all() and folds_back(Lens(model, k), A, bent.points()) is None:
+        if sees(scene, model, k).all() and where_not_monotonic(Lens(model, k), A, bent.points()) is None:
             return bent, k
 
 
@@ -77,7 +77,7 @@ class NewViews:
         views, R = arrange(self.points), np.stack([pose.R for pose in self.poses])
         lens = Lens(camera.distortion_model, camera.distortion)
         start = normalised(Seen(camera.K, lens, R, np.stack([pose.t for pose in self.poses])), views)
-        found = refine(views.tiles, start, np.zeros(5 + len(start.k), dtype=bool))
+        found = adjust(views.batches, start, np.zeros(5 + len(start.k), dtype=bool))
         return float(np.sqrt(found.cost.sum() / len(views.index))) * views.pixel_scale
 
 

@@ -9,9 +9,9 @@ from bent import without_camera
 from scenes import board_midpoints, random_flat_set
 
 from neurocal_cli import Correspondences
-from neurocal_cli.camera import Intrinsics, project
+from neurocal_cli.camera.distortion_models import distort
+from neurocal_cli.camera.pinhole import Intrinsics, project
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import distort
 
 
 def edges(square: float = 25.0) -> tuple[Array, Array]:

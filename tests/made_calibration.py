@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 

@@ -12,7 +12,7 @@ from rendered import condition
 from neurocal_cli.detection import EDGE_H, VERTEX, Grid, Measured
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.geometry import Array
-from neurocal_cli.rendering import PlaneTruth, Rendered, Scene, render, scene_bound
+from neurocal_cli.simulation.rendering import PlaneTruth, Rendered, Scene, render, scene_bound
 
 Points = Literal["midpoints", "vertices"]
 

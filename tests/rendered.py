@@ -15,9 +15,9 @@ from typing import Literal
 import numpy as np
 
 from neurocal_cli.board import Plane
-from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array
-from neurocal_cli.rendering import (
+from neurocal_cli.simulation.rendering import (
     Background,
     Camera,
     Disc,
@@ -31,8 +31,8 @@ from neurocal_cli.rendering import (
     ground_truth,
     render,
 )
-from neurocal_cli.rendering.rays import Lens
-from neurocal_cli.rendering.scene import CLUTTER_KINDS
+from neurocal_cli.simulation.rendering.rays import Lens
+from neurocal_cli.simulation.rendering.scene import CLUTTER_KINDS
 
 IMAGES = 8  # per condition, by default
 SQUARE = 28.0  # mm

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from neurocal_cli import Correspondences, Intrinsics, Pose
+from neurocal_cli.camera.distortion_models import Lens, distort
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_files import CameraFile
-from neurocal_cli.lens import Lens, distort
 
 KINDS = ("parallel", "verging", "wide", "narrow", "unequal")
 

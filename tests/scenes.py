@@ -8,12 +8,12 @@ from functools import partial
 import numpy as np
 
 from neurocal_cli import calibrate
-from neurocal_cli.adjustment.pixel_error import ENTRIES, CameraState, normal_blocks
-from neurocal_cli.adjustment.problems import Known, known_for
-from neurocal_cli.adjustment.refine import refine
-from neurocal_cli.adjustment.uncertainty import covariance
-from neurocal_cli.adjustment.views import Views, arrange
-from neurocal_cli.camera import Intrinsics, Pose, project
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.problem import Known, known_for
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.bundle_adjustment.views import Views, arrange
+from neurocal_cli.camera.pinhole import Intrinsics, Pose, project
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -77,8 +77,8 @@ def reference(scene: Scene, points: Correspondences, type: int, skew: bool, sigm
     views = arrange(points)
     known = scene.known(points, type, skew)
     start = scene.true_state(views)
-    fit = refine(views.tiles, start, known.free, known.free_poses, 300)
-    normal, _ = normal_blocks(views.tiles, start)
+    fit = adjust(views.batches, start, known.free, known.free_poses, 300)
+    normal, _ = normal_blocks(views.batches, start)
     unknowns = int(known.free.sum()) + (6 * views.n_views if known.free_poses else 0)
     normal[:, -1, -1] = 0.0
     normal[0, -1, -1] = (sigma / views.pixel_scale) ** 2 * max(2 * len(points) - unknowns, 1)

@@ -8,7 +8,7 @@ import numpy as np
 from scenes import Scene, pinhole, random_flat_set, random_solid
 
 from neurocal_cli import Calibration, Correspondences
-from neurocal_cli.camera import project
+from neurocal_cli.camera.pinhole import project
 from neurocal_cli.errors import NeurocalError
 
 SIGMA = 0.3

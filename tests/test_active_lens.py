@@ -11,12 +11,17 @@ import pytest
 from scipy.interpolate import RBFInterpolator, RectBivariateSpline, RegularGridInterpolator
 from zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, seen, truth
 
-from neurocal_cli.active_lens.camera_at import camera_at
-from neurocal_cli.active_lens.committee import Budget, fit_committee
-from neurocal_cli.active_lens.evaluation import _rival_error, _rms, _squares, evaluate_lens
-from neurocal_cli.active_lens.fit import fit_lens
-from neurocal_cli.active_lens.fit_known import LensCameras, fit_lens_cameras
-from neurocal_cli.active_lens.interpolation import (
+from neurocal_cli.errors import InputError, NeurocalError, UsageError
+from neurocal_cli.evaluation import evaluate_camera
+from neurocal_cli.points import Correspondences
+from neurocal_cli.simulation.zoom_lens import SimulatedZoom
+from neurocal_cli.zoom_lens.baseline_models import rivals_of
+from neurocal_cli.zoom_lens.camera_at import camera_at
+from neurocal_cli.zoom_lens.committee import Budget, fit_committee
+from neurocal_cli.zoom_lens.evaluation import _rival_error, _rms, _squares, evaluate_lens
+from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
+from neurocal_cli.zoom_lens.fit_points import fit_lens
+from neurocal_cli.zoom_lens.interpolation import (
     grid_axes,
     lookup_matrix,
     monomials,
@@ -24,20 +29,15 @@ from neurocal_cli.active_lens.interpolation import (
     spline_matrix,
     thin_plate_matrix,
 )
-from neurocal_cli.active_lens.lens_model import ActiveLens
-from neurocal_cli.active_lens.rivals import rivals_of
-from neurocal_cli.active_lens.settings import LensPoints
-from neurocal_cli.active_lens.simulated import SimulatedZoom
-from neurocal_cli.errors import InputError, NeurocalError, UsageError
-from neurocal_cli.evaluation import evaluate_camera
-from neurocal_cli.points import Correspondences
+from neurocal_cli.zoom_lens.settings import LensPoints
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 FEW = ((0, 1), (0, 2))  # topologies that a smooth lens needs no more than
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data" / "zoom_sony24-70"
 
 
 @cache
-def smooth() -> ActiveLens:
+def smooth() -> ZoomLens:
     return fit_lens(seen("c", grid(5, 3), seed=1), distortion="none", topologies=FEW)
 
 
@@ -376,7 +376,7 @@ class Held:
         self.rivals[law] = own | mean
 
 
-def one_at_a_time(lens: ActiveLens, x: np.ndarray) -> np.ndarray:
+def one_at_a_time(lens: ZoomLens, x: np.ndarray) -> np.ndarray:
     """What networks say that learn one parameter at a time, from the static calibrations alone."""
     table, rng = lens.static, np.random.default_rng(0)
     settings = lens.scaled(lens.settings)

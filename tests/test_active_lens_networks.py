@@ -10,12 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from zoom_laws import grid, seen
 
-from neurocal_cli.active_lens.alternating import train_alternating
-from neurocal_cli.active_lens.blocks import Constants, PixelData
-from neurocal_cli.active_lens.committee import Budget, fit_committee
-from neurocal_cli.active_lens.joint import JointLearner, loosened, train_joint
-from neurocal_cli.active_lens.mlfn import Topology, respond, respond_with_jacobian
-from neurocal_cli.active_lens.nets import (
+from neurocal_cli.geometry import Array, rotation_step
+from neurocal_cli.points import Correspondences
+from neurocal_cli.zoom_lens.alternating_training import train_alternating
+from neurocal_cli.zoom_lens.committee import Budget, fit_committee
+from neurocal_cli.zoom_lens.joint_training import JointLearner, loosened, train_joint
+from neurocal_cli.zoom_lens.mlfn import Topology, respond, respond_with_jacobian
+from neurocal_cli.zoom_lens.network_training import Schedule, train
+from neurocal_cli.zoom_lens.parameter_networks import (
     SCALES,
     LensNets,
     ParameterNet,
@@ -24,11 +26,14 @@ from neurocal_cli.active_lens.nets import (
     outputs_to_local,
     to_scale,
 )
-from neurocal_cli.active_lens.settings import LensPoints, scaled_controls
-from neurocal_cli.active_lens.static import calibrate_each, common_tables, first_constants, local_covariance
-from neurocal_cli.active_lens.training import Schedule, train
-from neurocal_cli.geometry import Array, rotation_step
-from neurocal_cli.points import Correspondences
+from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData
+from neurocal_cli.zoom_lens.settings import LensPoints, scaled_controls
+from neurocal_cli.zoom_lens.static_calibration import (
+    calibrate_each,
+    common_tables,
+    first_constants,
+    local_covariance,
+)
 
 STEP = 1e-6
 

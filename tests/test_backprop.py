@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
-from neurocal_cli.camera import Intrinsics, Pose, decompose, project
+from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose, project
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, euler_to_rotation, similarity
 from neurocal_cli.network import (
@@ -27,7 +27,8 @@ from neurocal_cli.network import (
     random_weights,
     residual_jacobian,
 )
-from neurocal_cli.training import blocks, compile  # noqa: A004
+from neurocal_cli.training import compile  # noqa: A004
+from neurocal_cli.training import rule_in_blocks as blocks
 from neurocal_cli.training.backprop import BackpropOptions, train_backprop
 from neurocal_cli.training.task import Task
 
@@ -501,14 +502,14 @@ def run(code: str) -> str:
 
 
 def test_numba_is_imported_only_by_the_compiled_kernel() -> None:
-    code = "import sys; from neurocal_cli.training import backprop, blocks; print('numba' in sys.modules)"
+    code = "import sys; from neurocal_cli.training import backprop, rule_in_blocks; print('numba' in sys.modules)"
     assert run(code) == "False\n"
 
 
 def test_without_numba_training_goes_in_blocks() -> None:
     code = (
         "import sys; sys.modules['numba'] = None\n"
-        "from neurocal_cli.training import backprop, blocks, rule\n"
+        "from neurocal_cli.training import backprop, rule, rule_in_blocks as blocks\n"
         "print(rule.COMPILING, backprop._presenter('auto')[0] is blocks.present,"
         " backprop._presenter('patterns')[0] is rule.present)"
     )

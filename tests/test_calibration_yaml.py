@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from made_calibration import made_calibration
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, ViewResult
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
 from neurocal_cli.io.yaml_text import number, quoted, text

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from neurocal_cli.adjustment.pixel_error import ENTRIES
-from neurocal_cli.camera import Intrinsics, Pose, decompose, project, projection_jacobian
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
+from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose, project, projection_jacobian
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation, rotation_step
 

@@ -51,7 +51,7 @@ def test_the_command_gives_what_the_library_gives(points: Path) -> None:
     from dataclasses import replace
 
     from neurocal_cli import calibrate
-    from neurocal_cli.judging.judgement import judged
+    from neurocal_cli.verdict.assessment import judged
 
     found = calibrate(read_points(str(points)))
     assert run("calibrate", points).stdout == format_calibration(replace(found, verdict=judged(found)))

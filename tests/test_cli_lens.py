@@ -13,12 +13,12 @@ import pytest
 from command_line import run
 from zoom_laws import FLOOR, between, grid, seen
 
-from neurocal_cli.active_lens.camera_at import camera_at
-from neurocal_cli.active_lens.fit import fit_lens
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration
 from neurocal_cli.io.lens_points import read_lens_data, read_lens_points, write_lens_points
 from neurocal_cli.io.lens_yaml import format_lens, read_lens, write_lens
+from neurocal_cli.zoom_lens.camera_at import camera_at
+from neurocal_cli.zoom_lens.fit_points import fit_lens
 
 CAMERAS = "zoom,alpha_u,alpha_v,u0,v0\n" + "".join(
     f"{z},{100 * z + 3 * (z % 7)},{100 * z},640,{480 + 0.1 * (z % 3)}\n" for z in range(20, 70, 5)
@@ -339,8 +339,8 @@ def test_the_options_are_those_of_the_library() -> None:
 
     import click
 
-    from neurocal_cli.active_lens.fit import CAMERAS, DISTORTIONS, OUTLIERS, TRAININGS
     from neurocal_cli.commands.lens import fit
+    from neurocal_cli.zoom_lens.fit_points import CAMERAS, DISTORTIONS, OUTLIERS, TRAININGS
 
     library = inspect.signature(fit_lens).parameters
     options = {option.name: option for option in fit.params}

@@ -16,7 +16,7 @@ from rigs import RigScene, random_rig
 from neurocal_cli import Board, Correspondences, calibrate, read_rig, write_calibration, write_points
 from neurocal_cli.board import Plane
 from neurocal_cli.io.board_yaml import write_board
-from neurocal_cli.stereo.methods import calibrate_stereo
+from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

@@ -18,7 +18,7 @@ from neurocal_cli.detection.identity.identify import Identified, Located
 from neurocal_cli.detection.identity.placement import Placement
 from neurocal_cli.detection.identity.words import NoBoardError
 from neurocal_cli.errors import InputError
-from neurocal_cli.rendering import Rendered, render
+from neurocal_cli.simulation.rendering import Rendered, render
 
 BOARD = Board.single(9, 6, 28.0)
 

@@ -13,17 +13,24 @@ from rigs import random_rig
 from scenes import pinhole
 
 from neurocal_cli import Correspondences, calibrate
-from neurocal_cli.adjustment.directions import LEAST, equations, loosened, measured_part, rounded, unit
-from neurocal_cli.adjustment.noise import Noise, noise_of
-from neurocal_cli.adjustment.views import arrange, noise_model
-from neurocal_cli.adjustment.whiteness import correlation
+from neurocal_cli.bundle_adjustment.common_noise import Noise, noise_of
+from neurocal_cli.bundle_adjustment.measured_directions import (
+    LEAST,
+    equations,
+    loosened,
+    measured_part,
+    rounded,
+    unit,
+)
+from neurocal_cli.bundle_adjustment.residual_correlation import correlation
+from neurocal_cli.bundle_adjustment.views import arrange, noise_model
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import Intrinsics
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.distortion.collinear_points import find_lines
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.judging.judgement import judge
-from neurocal_cli.lenses.plumb_lines import find_lines
-from neurocal_cli.stereo.methods import calibrate_stereo
+from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
+from neurocal_cli.verdict.assessment import judge
 
 NAMES = ("alpha_u", "alpha_v", "u0", "v0")
 

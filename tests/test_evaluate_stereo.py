@@ -12,7 +12,7 @@ from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.evaluation import evaluate_stereo
-from neurocal_cli.stereo.fitting import fit_rig
+from neurocal_cli.stereo.fit_rig import fit_rig
 from neurocal_cli.stereo.triangulation import METHODS
 
 

@@ -9,7 +9,7 @@ import pytest
 from made_calibration import CAMERA, made_calibration, made_points, pose_of, two_planes
 
 from neurocal_cli import Correspondences, NeurocalError, evaluate_camera
-from neurocal_cli.camera import project
+from neurocal_cli.camera.pinhole import project
 
 
 def test_error_is_that_of_projecting_each_point_alone() -> None:

@@ -18,7 +18,7 @@ from neurocal_cli.detection.finding.refine import settle
 from neurocal_cli.detection.finding.saddles import find_saddles
 from neurocal_cli.detection.finding.seeds import find_links, find_seeds
 from neurocal_cli.geometry import Array
-from neurocal_cli.rendering import PlaneTruth, Rectangle, render, scene_bound
+from neurocal_cli.simulation.rendering import PlaneTruth, Rectangle, render, scene_bound
 
 cv2 = pytest.importorskip("cv2")
 

@@ -22,7 +22,7 @@ from neurocal_cli.detection.identity.placement import Placement, placements
 from neurocal_cli.detection.identity.trim import trimmed
 from neurocal_cli.detection.identity.words import LOOKS_THE_SAME, NoBoardError
 from neurocal_cli.geometry import Array
-from neurocal_cli.rendering import Rectangle, Rendered, Scene, Sides, Target, ground_truth, render
+from neurocal_cli.simulation.rendering import Rectangle, Rendered, Scene, Sides, Target, ground_truth, render
 
 picture = cache(rendered_picture)
 

@@ -12,11 +12,11 @@ from scenes import Scene, pinhole, random_flat_set, table_1
 from wrong_inputs import flat
 
 from neurocal_cli import Calibration, calibrate
-from neurocal_cli.adjustment.user_units import see
+from neurocal_cli.bundle_adjustment.units import see
+from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
-from neurocal_cli.judging.judgement import judge, judged
-from neurocal_cli.lens import Lens
-from neurocal_cli.lens_domain import undistort
+from neurocal_cli.verdict.assessment import judge, judged
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 

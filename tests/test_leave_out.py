@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scenes import Scene, pinhole, random_flat_set, random_solid
 
-from neurocal_cli.adjustment.leave_out import (
+from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
+from neurocal_cli.bundle_adjustment.cross_validation import (
     disagreement,
     held_out,
     held_out_points,
@@ -15,17 +16,16 @@ from neurocal_cli.adjustment.leave_out import (
     reduced,
     without_each,
 )
-from neurocal_cli.adjustment.refine import Refined, refine
-from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.points import Correspondences
 
 FREE = np.array([True, False, True, True, True])
 
 
-def solved(scene: Scene, points: Correspondences) -> tuple[Views, Refined]:
+def solved(scene: Scene, points: Correspondences) -> tuple[Views, Adjusted]:
     views = arrange(points)
-    return views, refine(views.tiles, scene.true_state(views), FREE)
+    return views, adjust(views.batches, scene.true_state(views), FREE)
 
 
 def flat(seed: int, n_views: int) -> tuple[Scene, Correspondences]:
@@ -37,8 +37,8 @@ def flat(seed: int, n_views: int) -> tuple[Scene, Correspondences]:
 @pytest.mark.parametrize("seed", range(4))
 def test_the_error_on_views_left_out_is_that_of_calibrating_without_them(seed: int) -> None:
     scene, points = flat(seed, 10)
-    views, refined = solved(scene, points)
-    lost = held_out(views, refined.state, refined.normal, FREE, True)
+    views, adjusted = solved(scene, points)
+    lost = held_out(views, adjusted.state, adjusted.normal, FREE, True)
     fold = np.arange(10) % 5
     squared = 0.0
     for k in range(5):
@@ -51,16 +51,16 @@ def test_the_error_on_views_left_out_is_that_of_calibrating_without_them(seed: i
 
 def test_views_left_out_one_by_one() -> None:
     scene, points = flat(7, 6)
-    views, refined = solved(scene, points)
-    q = reduced(refined.normal, FREE, True)
+    views, adjusted = solved(scene, points)
+    q = reduced(adjusted.normal, FREE, True)
     moves = moves_without_each(q)
     for k in range(6):
         rest = views.subset(np.delete(np.arange(6), k))
-        start = refined.state
+        start = adjusted.state
         keep = np.delete(np.arange(6), k)
-        again = refine(rest.tiles, type(start)(start.entries, start.R[keep], start.t[keep]), FREE, True)
+        again = adjust(rest.batches, type(start)(start.entries, start.R[keep], start.t[keep]), FREE, True)
         assert without_each(q)[k] == pytest.approx(again.cost.sum(), rel=0.01)
-        std = np.sqrt(np.diagonal(inverse(q.S.sum(axis=0))) * refined.cost.sum() / (2 * len(points)))
+        std = np.sqrt(np.diagonal(inverse(q.S.sum(axis=0))) * adjusted.cost.sum() / (2 * len(points)))
         moved = (again.state.entries - start.entries)[0, FREE]
         assert np.abs(moves[k] - moved).max() < 0.2 * max(np.abs(moved).max(), std.max())
 
@@ -70,9 +70,9 @@ def test_points_left_out_of_a_single_view_cost_more_than_those_kept() -> None:
     scene = random_solid(rng, 1, False)
     while len(scene.world) < 100:
         scene = random_solid(rng, 1, False)
-    views, refined = solved(scene, scene.points(0.3, rng))
-    lost = held_out_points(views, refined.state, FREE, True)
-    assert refined.cost.sum() < lost.sum() < 2 * refined.cost.sum()
+    views, adjusted = solved(scene, scene.points(0.3, rng))
+    lost = held_out_points(views, adjusted.state, FREE, True)
+    assert adjusted.cost.sum() < lost.sum() < 2 * adjusted.cost.sum()
 
 
 def test_halves_disagree_by_what_their_noise_explains() -> None:
@@ -81,8 +81,8 @@ def test_halves_disagree_by_what_their_noise_explains() -> None:
     values = []
     for trial in range(150):
         points = scene.points(0.3, np.random.default_rng(trial))
-        views, refined = solved(scene, points)
-        difference, covariance = disagreement(views, refined.state, refined.normal, FREE, True)
-        variance = refined.cost.sum() / (2 * len(points) - 4 - 48)
+        views, adjusted = solved(scene, points)
+        difference, covariance = disagreement(views, adjusted.state, adjusted.normal, FREE, True)
+        variance = adjusted.cost.sum() / (2 * len(points) - 4 - 48)
         values.append(difference @ np.linalg.inv(covariance) @ difference / variance)
     assert np.mean(values) == pytest.approx(4.0, abs=4 * np.sqrt(8 / 150))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from neurocal_cli.camera.distortion_models import MODELS, bend, coefficient_names, distort
+from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.errors import InputError
-from neurocal_cli.lens import MODELS, bend, coefficient_names, distort
-from neurocal_cli.lens_domain import undistort
 
 # Coefficients of real lenses' sizes.
 LENSES = {

@@ -9,13 +9,13 @@ from scenes import Scene, board_midpoints, random_flat_set, table_1
 from test_real_data import zhang
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
-from neurocal_cli.adjustment.pixel_error import CameraState, normal_blocks, residuals
-from neurocal_cli.adjustment.tiles import tile
-from neurocal_cli.camera import INTRINSIC_NAMES, project
+from neurocal_cli.bundle_adjustment.point_batches import batches_of
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks, residuals
+from neurocal_cli.camera.distortion_models import Lens, distort
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, project
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import write_calibration
-from neurocal_cli.lens import Lens, distort
 
 LENSES = {
     "k1": [-0.25],
@@ -47,12 +47,12 @@ def flat_points(model: str, sigma: float = 0.0, seed: int = 0) -> tuple[Scene, C
 def test_columns_of_the_lens_are_those_of_differences(model: str) -> None:
     rng = np.random.default_rng(2)
     local, pixels = rng.uniform(-1, 1, (40, 3)), rng.uniform(-1, 1, (40, 2))
-    tiles = tile(local, pixels, None, np.repeat([0, 1], 20), 2)
+    batches = batches_of(local, pixels, None, np.repeat([0, 1], 20), 2)
     R = np.tile(np.eye(3), (2, 1, 1))
     t = np.array([[0.1, 0.2, 3.0], [-0.2, 0.1, 4.0]])
     state = CameraState(np.array([[2.0, 0.1, 1.9, 0.05, -0.1]]), R, t, model, np.array(LENSES[model]))
-    normal, _ = normal_blocks(tiles, state)
-    r0 = residuals(tiles, state)
+    normal, _ = normal_blocks(batches, state)
+    r0 = residuals(batches, state)
     n = 5 + len(state.k)
 
     def moved(column: int, step: float) -> Array:
@@ -63,7 +63,7 @@ def test_columns_of_the_lens_are_those_of_differences(model: str) -> None:
             by_pose[:, column - 5] = step
         else:
             by_camera[0, column - 6] = step
-        return residuals(tiles, state.moved(by_camera, by_pose))
+        return residuals(batches, state.moved(by_camera, by_pose))
 
     for column in range(11 + len(state.k)):
         slope = (moved(column, 1e-6) - moved(column, -1e-6)) / 2e-6

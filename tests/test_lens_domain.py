@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_lens import LENSES
 
+from neurocal_cli.camera.distortion_models import Lens, bend, distort
+from neurocal_cli.camera.monotonic import first_fold, is_seen, straightened, undistort
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import Lens, bend, distort
-from neurocal_cli.lens_domain import first_fold, is_seen, straightened, undistort
 
 SPREAD = {
     "k1": [0.4],

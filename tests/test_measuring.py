@@ -11,7 +11,7 @@ from measured import errors, found, places, take
 
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Grid
 from neurocal_cli.detection.measuring import measure
-from neurocal_cli.rendering import edge_bound
+from neurocal_cli.simulation.rendering import edge_bound
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 PHOTOS = DATA / "opencv_stereo"

@@ -13,10 +13,10 @@ from scipy.spatial.transform import Rotation
 from test_uncertainty import noisy, whitener
 
 from neurocal_cli import Correspondences, Intrinsics, Pose
-from neurocal_cli.adjustment.pixel_error import ENTRIES
-from neurocal_cli.adjustment.problems import intrinsic_matrix
+from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import INTRINSIC_NAMES, project
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, project
 from neurocal_cli.geometry import Array
 
 CAMERA = Intrinsics(800.0, 820.0, 330.0, 250.0)

@@ -5,10 +5,10 @@ import pytest
 from scenes import Scene, pinhole, table_1
 
 from neurocal_cli import Calibration
-from neurocal_cli.adjustment.pixel_error import normal_blocks
-from neurocal_cli.adjustment.uncertainty import covariance
-from neurocal_cli.adjustment.views import arrange
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
+from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.reprojection import normal_blocks
+from neurocal_cli.bundle_adjustment.views import arrange
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array
 
 UNKNOWNS = {1: 11, 2: 9, 3: 6, 4: 5}
@@ -78,7 +78,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     points = scene.points()
     views = arrange(points)
     known = scene.known(points, 1)
-    normal, _ = normal_blocks(views.tiles, scene.true_state(views))
+    normal, _ = normal_blocks(views.batches, scene.true_state(views))
     unknowns, n = UNKNOWNS[1], 2 * len(points)
     normal[0, -1, -1] = (1.0 / views.pixel_scale) ** 2 * (n - unknowns)
     entries = covariance(normal, known.free, True, n).entries

@@ -9,7 +9,7 @@ import pytest
 from scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences
-from neurocal_cli.adjustment.noise import common_share, with_common_share
+from neurocal_cli.bundle_adjustment.common_noise import common_share, with_common_share
 from neurocal_cli.geometry import Array
 
 

@@ -17,17 +17,17 @@ from test_lens_calibration import bent
 from test_real_data import zhang
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
-from neurocal_cli.adjustment.views import noise_model
 from neurocal_cli.board import Board
-from neurocal_cli.camera import Intrinsics
+from neurocal_cli.bundle_adjustment.views import noise_model
+from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, LinesSeen, find_lines
+from neurocal_cli.distortion.plumb_line import PlumbLine, fit_plumb_line, lines_in_pixels
+from neurocal_cli.distortion.straightness import bent_lines
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import write_calibration
 from neurocal_cli.io.points_csv import write_points
-from neurocal_cli.lens import Lens
-from neurocal_cli.lenses.plumb_line import PlumbLine, fit_plumb_line, lines_in_pixels
-from neurocal_cli.lenses.plumb_lines import FEWEST_ON_LINE, LinesSeen, find_lines
-from neurocal_cli.lenses.straightness import bent_lines
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SIZE = (1000, 800)

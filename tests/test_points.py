@@ -70,7 +70,10 @@ def test_lists_are_taken_and_arrays_are_copied_and_read_only() -> None:
         ({"image_center": (np.nan, 1.0)}, "finite"),
         ({"covariance": np.ones((N, 2))}, r"shape \(N, 3\)"),
         ({"covariance": np.tile([1.0, 1.0, 1.0], (N, 1))}, "row 1: .* positive definite"),
-        ({"covariance": with_value(np.tile([1.0, 0.0, 1.0], (N, 1)), 2.0)}, "row 4: .* positive definite"),
+        (
+            {"covariance": with_value(np.tile([1.0, 0.0, 1.0], (N, 1)), 2.0)},
+            "row 4: .* positive definite",
+        ),
         ({"covariance": np.tile([np.nan, 0.0, 1.0], (N, 1))}, "positive definite"),
         ({"covariance": np.tile([1e-200, 0.0, 1e-200], (N, 1))}, "positive definite"),
         ({"covariance": np.tile([1e200, 0.0, 1e200], (N, 1))}, "positive definite"),

@@ -9,9 +9,9 @@ import pytest
 from scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
-from neurocal_cli.adjustment.pixel_error import ENTRIES
-from neurocal_cli.adjustment.problems import known_for
-from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.bundle_adjustment.problem import known_for
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
+from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 
 SCENE = table_1()

@@ -14,7 +14,7 @@ from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.rig_yaml import format_ros_pair
 from neurocal_cli.io.yaml_tree import parse_yaml
-from neurocal_cli.stereo.methods import calibrate_stereo
+from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 from neurocal_cli.stereo.rectification import rectify
 
 POSES = {

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from neurocal_cli.adjustment.pixel_error import CameraState, normal_blocks
-from neurocal_cli.adjustment.problems import intrinsic_matrix
-from neurocal_cli.adjustment.refine import refine
-from neurocal_cli.adjustment.tiles import Tiles, tile
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
+from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.geometry import Array
 
 FREE = {
@@ -56,7 +56,7 @@ class Problem:
             )
         self.pixels = np.zeros((n, 2))
         self.pixels = -self.plain(self.true).reshape(n, 2) + 2e-3 * rng.normal(size=(n, 2))
-        self.tiles: Tiles = tile(self.local, self.pixels, self.whitening, self.view, V)
+        self.batches: PointBatches = batches_of(self.local, self.pixels, self.whitening, self.view, V)
 
     def plain(self, state: CameraState, whiten: bool = False) -> Array:
         """Residuals (2 N,) point by point."""
@@ -114,7 +114,7 @@ def test_normal_blocks_by_central_differences(counts: tuple[int, ...], skew: flo
     problem = Problem(counts, skew, whitened)
     state = problem.moved(problem.true, np.full(5 + 6 * len(counts), 0.01), np.ones(5))
     state.entries[0, 1] = skew  # exactly 0 takes a shorter way
-    exact, in_front = normal_blocks(problem.tiles, state)
+    exact, in_front = normal_blocks(problem.batches, state)
     numeric = blocks_by_differences(problem, state)
     assert in_front.all()
     # Each entry against the sizes of the two columns that make it.
@@ -127,7 +127,7 @@ def test_normal_blocks_with_a_camera_for_each_view(whitened: bool) -> None:
     problem = Problem(EVEN, whitened=whitened)
     entries = problem.true.entries * np.array([[1.0], [1.02], [0.97]])
     state = CameraState(entries, problem.true.R, problem.true.t)
-    exact, _ = normal_blocks(problem.tiles, state)
+    exact, _ = normal_blocks(problem.batches, state)
     numeric = blocks_by_differences(problem, state)
     size = np.sqrt(np.einsum("kii->ki", numeric))
     assert (np.abs(exact - numeric) <= 1e-6 * size[:, :, None] * size[:, None, :]).all()
@@ -143,7 +143,7 @@ def test_gradient_of_the_pixel_error_by_what_each_problem_type_leaves_free(
     f, V = np.flatnonzero(mask), 2
     offset = np.random.default_rng(1).normal(size=len(f) + 6 * V) * 0.02
     state = problem.moved(problem.true, offset, mask)
-    N, _ = normal_blocks(problem.tiles, state)
+    N, _ = normal_blocks(problem.batches, state)
     exact = -2 * np.concatenate([N[:, f, 11].sum(axis=0), N[:, 5:11, 11].reshape(-1)])
 
     def cost(p: Array) -> float:
@@ -158,7 +158,7 @@ def test_a_point_behind_the_camera_is_noticed_in_its_view_only() -> None:
     problem = Problem(RAGGED)
     t = problem.true.t.copy()
     t[2, 2] = 0.2
-    _, in_front = normal_blocks(problem.tiles, CameraState(problem.true.entries, problem.true.R, t))
+    _, in_front = normal_blocks(problem.batches, CameraState(problem.true.entries, problem.true.R, t))
     assert in_front.tolist() == [True, True, False, True]
 
 
@@ -183,16 +183,16 @@ def assert_same_minimum(problem: Problem, mask: Array, poses: bool = True) -> No
     offset = 0.05 * np.random.default_rng(3).normal(size=int(mask.sum()) + 6 * len(problem.true.R))
     if not poses:
         offset[int(mask.sum()) :] = 0.0
-    refined = refine(problem.tiles, problem.moved(problem.true, offset, mask), mask, poses)
+    adjusted = adjust(problem.batches, problem.moved(problem.true, offset, mask), mask, poses)
     expected, cost = scipy_minimum(problem, mask, poses)
-    assert refined.converged
-    assert refined.cost.sum() == pytest.approx(cost, rel=1e-9)
+    assert adjusted.converged
+    assert adjusted.cost.sum() == pytest.approx(cost, rel=1e-9)
     # 1e-6 is a thousandth of what the noise of 2e-3 leaves open.
-    np.testing.assert_allclose(refined.state.entries, expected.entries, atol=1e-6)
-    np.testing.assert_allclose(refined.state.R, expected.R, atol=1e-6)
-    np.testing.assert_allclose(refined.state.t, expected.t, atol=1e-5)
+    np.testing.assert_allclose(adjusted.state.entries, expected.entries, atol=1e-6)
+    np.testing.assert_allclose(adjusted.state.R, expected.R, atol=1e-6)
+    np.testing.assert_allclose(adjusted.state.t, expected.t, atol=1e-5)
     np.testing.assert_allclose(
-        refined.state.R @ np.swapaxes(refined.state.R, 1, 2) - np.eye(3), 0, atol=1e-15
+        adjusted.state.R @ np.swapaxes(adjusted.state.R, 1, 2) - np.eye(3), 0, atol=1e-15
     )
 
 
@@ -222,11 +222,11 @@ def far_start(problem: Problem, seed: int) -> CameraState:
 def test_views_of_a_given_camera_are_refined_as_if_each_were_alone(seed: int) -> None:
     problem = Problem((25,) * 6, seed=seed)
     start, none = far_start(problem, seed), np.zeros(5, dtype=bool)
-    together = refine(problem.tiles, start, none)
+    together = adjust(problem.batches, start, none)
     for k in range(6):
         rows = problem.view == k
-        alone = tile(problem.local[rows], problem.pixels[rows], None, np.zeros(25, dtype=int), 1)
-        one = refine(alone, CameraState(start.entries, start.R[k : k + 1], start.t[k : k + 1]), none)
+        alone = batches_of(problem.local[rows], problem.pixels[rows], None, np.zeros(25, dtype=int), 1)
+        one = adjust(alone, CameraState(start.entries, start.R[k : k + 1], start.t[k : k + 1]), none)
         np.testing.assert_allclose(together.state.R[k], one.state.R[0], atol=1e-12)
         np.testing.assert_allclose(together.state.t[k], one.state.t[0], atol=1e-12)
 
@@ -236,14 +236,14 @@ def test_cameras_side_by_side_do_not_hold_each_other_up() -> None:
     free, view = np.ones(5, dtype=bool), np.zeros(25, dtype=int)
     # From where they start, half of them see a mirrored image: their steps go to negative focal lengths.
     problem.pixels[problem.view % 2 == 0] *= -1
-    tiles = tile(problem.local, problem.pixels, None, problem.view, 8)
+    batches = batches_of(problem.local, problem.pixels, None, problem.view, 8)
     entries = np.tile(problem.true.entries, (8, 1))
     start = far_start(problem, 0)
-    together = refine(tiles, CameraState(entries, start.R, start.t), free)
+    together = adjust(batches, CameraState(entries, start.R, start.t), free)
     for k in range(8):
         rows = problem.view == k
-        alone = tile(problem.local[rows], problem.pixels[rows], None, view, 1)
-        one = refine(alone, CameraState(entries[k : k + 1], start.R[k : k + 1], start.t[k : k + 1]), free)
+        alone = batches_of(problem.local[rows], problem.pixels[rows], None, view, 1)
+        one = adjust(alone, CameraState(entries[k : k + 1], start.R[k : k + 1], start.t[k : k + 1]), free)
         assert together.cost[k] == pytest.approx(one.cost[0], rel=1e-9)
         assert together.each_settled[k] == one.each_settled[0]
 
@@ -253,23 +253,23 @@ def test_cameras_side_by_side_do_not_hold_each_other_up() -> None:
 def test_no_step_raises_the_error_or_takes_a_point_behind_the_camera(seed: int) -> None:
     problem = Problem((12, 30), seed=seed)
     start = far_start(problem, seed)
-    before, front = normal_blocks(problem.tiles, start)
+    before, front = normal_blocks(problem.batches, start)
     if not front.all():
         return
 
     def cost(steps: int) -> float:
-        return float(refine(problem.tiles, start, np.ones(5, dtype=bool), max_iterations=steps).cost.sum())
+        return float(adjust(problem.batches, start, np.ones(5, dtype=bool), max_iterations=steps).cost.sum())
 
     costs = [float(before[:, 11, 11].sum()), *(cost(n) for n in range(1, 12))]
     assert (np.diff(costs) <= 0).all()
-    final = refine(problem.tiles, start, np.ones(5, dtype=bool))
-    assert normal_blocks(problem.tiles, final.state)[1].all()
+    final = adjust(problem.batches, start, np.ones(5, dtype=bool))
+    assert normal_blocks(problem.batches, final.state)[1].all()
     assert final.state.entries[0, 0] > 0
     assert final.state.entries[0, 2] > 0
 
 
 def test_a_refinement_that_is_cut_short_says_so() -> None:
     problem = Problem(EVEN)
-    cut = refine(problem.tiles, far_start(problem, 0), np.ones(5, dtype=bool), max_iterations=2)
+    cut = adjust(problem.batches, far_start(problem, 0), np.ones(5, dtype=bool), max_iterations=2)
     assert cut.iterations == 2
     assert not cut.converged

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import project
+from neurocal_cli.camera.pinhole import project
 from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation
 

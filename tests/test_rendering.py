@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from rendered import CONDITIONS, IMAGES, RECIPES, condition, picture
 
 from neurocal_cli.board import Board, Plane
-from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, InputError
-from neurocal_cli.rendering import (
+from neurocal_cli.simulation.rendering import (
     Background,
     Camera,
     Disc,
@@ -35,11 +35,11 @@ from neurocal_cli.rendering import (
     scene_bound,
     vertex_bound,
 )
-from neurocal_cli.rendering.blur import Blur
-from neurocal_cli.rendering.coverage import half_plane
-from neurocal_cli.rendering.light import image_light
-from neurocal_cli.rendering.rays import Lens
-from neurocal_cli.rendering.sensor import digitised
+from neurocal_cli.simulation.rendering.blur import Blur
+from neurocal_cli.simulation.rendering.coverage import half_plane
+from neurocal_cli.simulation.rendering.light import image_light
+from neurocal_cli.simulation.rendering.rays import Lens
+from neurocal_cli.simulation.rendering.sensor import digitised
 
 SMALL = Camera(Intrinsics(250.0, 252.0, 81.0, 58.0), (160, 120))
 PLANE = Plane("", 5, 4, 10.0)
@@ -454,5 +454,7 @@ def test_a_scene_that_cannot_be_is_refused(make: Any, message: str) -> None:
 
 
 def test_rendering_needs_neither_opencv_nor_scipy() -> None:
-    code = "import sys, neurocal_cli.rendering; sys.exit(bool({'cv2', 'scipy'} & set(sys.modules)))"
+    code = (
+        "import sys, neurocal_cli.simulation.rendering; sys.exit(bool({'cv2', 'scipy'} & set(sys.modules)))"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

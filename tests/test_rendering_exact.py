@@ -12,9 +12,9 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
 
 from neurocal_cli.board import Plane
-from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array
-from neurocal_cli.rendering import (
+from neurocal_cli.simulation.rendering import (
     Background,
     Camera,
     Illumination,
@@ -25,7 +25,7 @@ from neurocal_cli.rendering import (
     ground_truth,
     noise_free,
 )
-from neurocal_cli.rendering.light import image_light
+from neurocal_cli.simulation.rendering.light import image_light
 
 PLANE = Plane("", 5, 4, 10.0)
 EXACT = Sensor(read_noise=0.0, bits=16)

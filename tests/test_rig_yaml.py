@@ -14,7 +14,7 @@ from rigs import random_rig
 from neurocal_cli import calibrate
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.rig_yaml import format_rig, read_rig, write_rig
-from neurocal_cli.stereo.fitting import fit_rig
+from neurocal_cli.stereo.fit_rig import fit_rig
 from neurocal_cli.stereo.rig import Rig
 
 

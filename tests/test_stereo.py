@@ -12,13 +12,13 @@ from rigs import KINDS, RigScene, corner, random_rig
 from scenes import random_rotation
 
 from neurocal_cli import Correspondences, Rig, calibrate
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.methods import calibrate_stereo
+from neurocal_cli.stereo.adjust import adjust_rig
+from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.problem import rig_problem
-from neurocal_cli.stereo.refine import refine_rig
 
 
 def sides(scene: RigScene, sigma: float, seed: int = 1) -> tuple[Correspondences, Correspondences]:
@@ -69,7 +69,7 @@ def test_the_views_poses_go_through_the_rig() -> None:
 
 
 def test_the_common_fit_is_no_worse_than_any_rig_between_two_single_cameras() -> None:
-    from neurocal_cli.stereo.fitting import fit_rig
+    from neurocal_cli.stereo.fit_rig import fit_rig
 
     points = sides(flat(), 0.3)
     apart = fit_rig(*(calibrate(p, skew=False) for p in points))
@@ -209,7 +209,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     """At the truth, from the residuals' own finite differences."""
     from test_stereo_pixel_error import all_residuals
 
-    from neurocal_cli.stereo.pixel_error import Columns
+    from neurocal_cli.stereo.reprojection import Columns
 
     scene = flat("wide", 4, 7)
     points = sides(scene, 1e-5)
@@ -219,7 +219,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     columns = Columns.of(state)
     free = np.ones(columns.n_shared, dtype=bool)
     free[[1, 6]] = False
-    state = refine_rig(problem.frames, problem.sightings, state, free).state
+    state = adjust_rig(problem.frames, problem.sightings, state, free).state
     V, step = len(problem.frames.scale), 1e-7
     rows = []
     for n in np.flatnonzero(np.concatenate([free, np.ones(6 * V, dtype=bool)])):

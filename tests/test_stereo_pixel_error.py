@@ -5,13 +5,13 @@ import pytest
 from rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate
-from neurocal_cli.adjustment.pixel_error import residuals
+from neurocal_cli.bundle_adjustment.reprojection import residuals
 from neurocal_cli.geometry import Array
+from neurocal_cli.stereo.adjust import adjust_rig
 from neurocal_cli.stereo.consensus import find_consensus
 from neurocal_cli.stereo.pairing import pair_views
-from neurocal_cli.stereo.pixel_error import Columns, RigState, rig_normal_blocks
 from neurocal_cli.stereo.problem import RigProblem, rig_problem
-from neurocal_cli.stereo.refine import refine_rig
+from neurocal_cli.stereo.reprojection import Columns, RigState, rig_normal_blocks
 
 
 def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigProblem, RigState]:
@@ -32,9 +32,9 @@ def all_residuals(problem: RigProblem, state: RigState) -> Array:
     out = []
     for side, seen in enumerate(problem.sightings):
         camera = state.seen_by(side, problem.frames, seen)
-        error = residuals(seen.tiles, camera)
-        if seen.tiles.whitening is not None:
-            error = error * (seen.tiles.whitening[:, :1] > 0)
+        error = residuals(seen.batches, camera)
+        if seen.batches.whitening is not None:
+            error = error * (seen.batches.whitening[:, :1] > 0)
         out.append(np.sqrt(seen.weight) * error.ravel())
     return np.concatenate(out)
 
@@ -90,8 +90,8 @@ def test_the_minimum_is_that_of_an_independent_optimiser(lens: str) -> None:
     columns = Columns.of(state)
     free = np.ones(columns.n_shared, dtype=bool)
     free[[1, columns.right[1]]] = False  # no skew
-    refined = refine_rig(problem.frames, problem.sightings, state, free)
-    assert refined.converged
+    adjusted = adjust_rig(problem.frames, problem.sightings, state, free)
+    assert adjusted.converged
     V, places = len(problem.frames.scale), np.flatnonzero(free)
 
     def errors(x: Array) -> Array:
@@ -100,13 +100,13 @@ def test_the_minimum_is_that_of_an_independent_optimiser(lens: str) -> None:
         return all_residuals(problem, state.moved(columns, shared, x[len(places) :].reshape(V, 6)))
 
     fit = least_squares(errors, np.zeros(len(places) + 6 * V), x_scale="jac", xtol=1e-12, ftol=1e-14)
-    assert refined.cost == pytest.approx(2 * fit.cost, rel=1e-9)
+    assert adjusted.cost == pytest.approx(2 * fit.cost, rel=1e-9)
 
 
 def test_without_noise_the_truth_is_found_exactly() -> None:
     scene, problem, state = made_problem(sigma=0.0)
     free = np.ones(Columns.of(state).n_shared, dtype=bool)
     free[[1, 6]] = False
-    found = refine_rig(problem.frames, problem.sightings, state, free).state
+    found = adjust_rig(problem.frames, problem.sightings, state, free).state
     assert pytest.approx(scene.rig.R, abs=1e-10) == found.R
     assert found.t * problem.frames.unit == pytest.approx(scene.rig.t, abs=1e-7)

@@ -1,4 +1,4 @@
-"""Tiles hold every point once, of one view each, whatever the sizes of the views."""
+"""PointBatches hold every point once, of one view each, whatever the sizes of the views."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.tiles import Tiles, tile
+from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
 from neurocal_cli.geometry import Array
 
 counts_of = st.lists(
@@ -18,14 +18,14 @@ counts_of = st.lists(
 
 def laid(
     counts: list[int], whitened: bool, seed: int = 0
-) -> tuple[Tiles, Array, Array | None, NDArray[np.intp]]:
-    """Tiles of points whose first coordinate is their number."""
+) -> tuple[PointBatches, Array, Array | None, NDArray[np.intp]]:
+    """PointBatches of points whose first coordinate is their number."""
     rng = np.random.default_rng(seed)
     n = sum(counts)
     view = rng.permutation(np.repeat(np.arange(len(counts)), counts))
     local = np.column_stack([np.arange(n), rng.normal(size=(n, 2))])
     whitening = rng.uniform(0.5, 2, (n, 3)) if whitened else None
-    return tile(local, local[:, :2], whitening, view, len(counts)), local, whitening, view
+    return batches_of(local, local[:, :2], whitening, view, len(counts)), local, whitening, view
 
 
 @settings(max_examples=80, deadline=None)
@@ -33,54 +33,54 @@ def laid(
 def test_every_point_lies_in_one_tile_of_its_view_and_padding_weighs_nothing(
     counts: list[int], whitened: bool
 ) -> None:
-    tiles, local, whitening, view = laid(counts, whitened)
-    n = tiles.local.shape[2]
-    assert tiles.counts.tolist() == counts
-    assert tiles.view[tiles.first].tolist() == list(range(len(counts)))
-    factors = tiles.whitening
+    batches, local, whitening, view = laid(counts, whitened)
+    n = batches.local.shape[2]
+    assert batches.counts.tolist() == counts
+    assert batches.view[batches.first].tolist() == list(range(len(counts)))
+    factors = batches.whitening
     if factors is None:
         assert not whitened
-        assert len(tiles.view) * n == len(local)
-        factors = np.ones((len(tiles.view), 3, n))
+        assert len(batches.view) * n == len(local)
+        factors = np.ones((len(batches.view), 3, n))
     real = factors[:, 0] > 0
     assert real.sum() == len(local)
-    numbers = tiles.local[:, 0].astype(int)
+    numbers = batches.local[:, 0].astype(int)
     assert sorted(numbers[real]) == list(range(len(local)))
-    assert (view[numbers] == tiles.view[:, None]).all()  # padding as well: a point of the same view
-    np.testing.assert_array_equal(np.swapaxes(tiles.local, 1, 2), local[numbers])
-    np.testing.assert_array_equal(np.swapaxes(tiles.pixels, 1, 2), local[numbers][..., :2])
+    assert (view[numbers] == batches.view[:, None]).all()  # padding as well: a point of the same view
+    np.testing.assert_array_equal(np.swapaxes(batches.local, 1, 2), local[numbers])
+    np.testing.assert_array_equal(np.swapaxes(batches.pixels, 1, 2), local[numbers][..., :2])
     assert (np.swapaxes(factors, 1, 2)[~real] == 0).all()
     expected = np.array([1.0, 0.0, 1.0]) if whitening is None else whitening[numbers[real]]
-    if tiles.whitening is not None:
+    if batches.whitening is not None:
         np.testing.assert_array_equal(np.swapaxes(factors, 1, 2)[real], expected + np.zeros((len(local), 3)))
 
 
 @settings(max_examples=40, deadline=None)
 @given(counts_of)
 def test_sums_over_tiles_are_sums_over_views(counts: list[int]) -> None:
-    tiles, *_ = laid(counts, True)
-    ones = np.ones((len(tiles.view), 2, 2))
-    expected = np.bincount(tiles.view)[:, None, None] * np.ones((2, 2))
-    np.testing.assert_array_equal(tiles.sum_by_view(ones), expected)
+    batches, *_ = laid(counts, True)
+    ones = np.ones((len(batches.view), 2, 2))
+    expected = np.bincount(batches.view)[:, None, None] * np.ones((2, 2))
+    np.testing.assert_array_equal(batches.sum_by_view(ones), expected)
 
 
 @settings(max_examples=40, deadline=None)
 @given(counts_of)
 def test_chunks_cover_all_tiles_once(counts: list[int]) -> None:
-    tiles, *_ = laid(counts, False)
-    covered = np.concatenate([np.arange(len(tiles.view))[chunk] for chunk in tiles.chunks()])
-    assert covered.tolist() == list(range(len(tiles.view)))
+    batches, *_ = laid(counts, False)
+    covered = np.concatenate([np.arange(len(batches.view))[chunk] for chunk in batches.chunks()])
+    assert covered.tolist() == list(range(len(batches.view)))
 
 
 def test_views_of_one_size_need_no_padding_and_keep_the_order() -> None:
-    tiles, local, _, view = laid([54] * 5, False)
-    assert tiles.whitening is None
-    assert tiles.local.shape == (5, 3, 54)
+    batches, local, _, view = laid([54] * 5, False)
+    assert batches.whitening is None
+    assert batches.local.shape == (5, 3, 54)
     for k in range(5):
-        assert tiles.local[k, 0].tolist() == local[view == k, 0].tolist()
+        assert batches.local[k, 0].tolist() == local[view == k, 0].tolist()
 
 
 @pytest.mark.parametrize("counts", [[20_000, 4, 5, 6, 7, 8], [7] * 200 + [5000]])
 def test_ragged_views_cost_little_padding(counts: list[int]) -> None:
-    tiles, *_ = laid(counts, False)
-    assert len(tiles.view) * tiles.local.shape[2] < 2 * sum(counts) + 1000
+    batches, *_ = laid(counts, False)
+    assert len(batches.view) * batches.local.shape[2] < 2 * sum(counts) + 1000

@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 from rigs import KINDS, RigScene, random_rig
 
 from neurocal_cli import Pose
+from neurocal_cli.camera.distortion_models import Lens
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import Lens
 from neurocal_cli.stereo.triangulation import METHODS, Triangulated, epipolar_limit, triangulate
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

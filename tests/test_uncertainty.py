@@ -9,11 +9,11 @@ import pytest
 from scenes import Scene, pinhole, random_flat_set, random_solid
 
 from neurocal_cli import Correspondences
-from neurocal_cli.adjustment.pixel_error import CameraState, normal_blocks
-from neurocal_cli.adjustment.uncertainty import covariance
-from neurocal_cli.adjustment.views import arrange
+from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
 from neurocal_cli.geometry import Array
 
 
@@ -141,7 +141,7 @@ def test_elimination_view_by_view_is_the_inverse_of_the_whole(free: list[int], p
         return
     scene = random_flat_set(np.random.default_rng(1), 5, False, cols=6, rows=5)
     views = arrange(scene.points(0.5, np.random.default_rng(2)))
-    normal, _ = normal_blocks(views.tiles, scene.true_state(views))
+    normal, _ = normal_blocks(views.batches, scene.true_state(views))
     whole = np.zeros((len(f) + 30 * poses,) * 2)
     whole[: len(f), : len(f)] = normal[:, f[:, None], f].sum(axis=0)
     for k in range(5 * poses):
@@ -165,13 +165,13 @@ def test_elimination_view_by_view_is_the_inverse_of_the_whole(free: list[int], p
 def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
     scene = random_flat_set(np.random.default_rng(1), 3, False, cols=6, rows=5)
     views = arrange(scene.points())
-    normal, _ = normal_blocks(views.tiles, scene.true_state(views))
+    normal, _ = normal_blocks(views.batches, scene.true_state(views))
     normal[1, 5:11] = normal[1, :, 5:11] = 0.0  # a pose that nothing depends on
     assert covariance(normal, np.ones(5, dtype=bool), True, 180).smallest == 0
     # Without the third view's tilt the focal length and the distance are one unknown.
     state = scene.true_state(views)
     flat = CameraState(state.entries, np.tile(np.eye(3), (3, 1, 1)), np.tile([0.0, 0.0, 5.0], (3, 1)))
-    normal, _ = normal_blocks(views.tiles, flat)
+    normal, _ = normal_blocks(views.batches, flat)
     assert covariance(normal, np.ones(5, dtype=bool), True, 180).smallest < 1e-13
 
 

@@ -15,11 +15,11 @@ from test_lens import LENSES
 from test_lens_calibration import bent
 
 from neurocal_cli import Correspondences, calibrate, undistort_image, undistort_points
-from neurocal_cli.camera import Intrinsics
+from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.distortion.undistortion import new_camera, undistortion
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import Lens
-from neurocal_cli.lenses.undistortion import new_camera, undistortion
 
 SIZE = (640, 480)
 BENDING = [model for model in LENSES if model != "none"]
@@ -283,7 +283,7 @@ def test_nothing_is_mirrored_beyond_the_fold() -> None:
     assert np.isnan(su[radius > fold + 0.01]).all()
     naive = cv2.undistort(white, cam.K, np.array([-0.25, 0, 0, 0]), newCameraMatrix=zoomed_out.K)
     assert naive[radius > 1.5].any()  # what others show there
-    from neurocal_cli.lenses.remapping import Remapping
+    from neurocal_cli.distortion.remapping import Remapping
 
     done = Remapping(step, SIZE)(white)
     assert done[radius < fold - 0.05].min() == 255

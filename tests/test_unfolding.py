@@ -9,13 +9,13 @@ import pytest
 from bent import SIGMA, bent_set, new_views, through
 
 from neurocal_cli import Calibration, Correspondences, calibrate
-from neurocal_cli.adjustment.pixel_error import CameraState
-from neurocal_cli.camera import Pose, project
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.camera.distortion_models import Lens, bend
+from neurocal_cli.camera.monotonic import radial_slope
+from neurocal_cli.camera.pinhole import Pose, project
+from neurocal_cli.distortion.monotonic_fit import MonotonicFit, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.lens import Lens, bend
-from neurocal_cli.lens_domain import radial_slope
-from neurocal_cli.lenses.unfolding import Unfolded, folds_back
-from neurocal_cli.stereo.fitting import fit_rig
+from neurocal_cli.stereo.fit_rig import fit_rig
 
 LENSES = {
     "k1": [-0.2],
@@ -54,7 +54,7 @@ def test_the_slope_and_its_derivatives_are_those_of_differences(model: str) -> N
 
 
 def test_a_lens_with_all_the_slope_that_is_asked_for_is_free() -> None:
-    restraint = Unfolded(np.linspace(0.1, 0.5, 5), 100.0, 0.1)
+    restraint = MonotonicFit(np.linspace(0.1, 0.5, 5), 100.0, 0.1)
     state = CameraState(np.ones((1, 5)), np.eye(3)[None], np.zeros((1, 3)), "k1", np.array([-0.2]))
     by_camera, missing = restraint(state)
     assert not by_camera.any()
@@ -73,8 +73,8 @@ def test_a_fold_where_no_point_is_goes_and_new_views_are_predicted_better(
     found = calibrate(points, distortion="auto" if asked == "auto" else model, skew=False)
     free = free_fit(points, model)
     assert found.distortion_model == model
-    assert folds_back(Lens(model, free.distortion), free.K, points) == "image"
-    assert folds_back(Lens(model, found.distortion), found.K, points) is None
+    assert where_not_monotonic(Lens(model, free.distortion), free.K, points) == "image"
+    assert where_not_monotonic(Lens(model, found.distortion), found.K, points) is None
     assert found.converged
     assert free.rmse_px < found.rmse_px < 1.01 * free.rmse_px
     scene, k = bent_set(model, seed)
@@ -106,8 +106,8 @@ def test_a_fisheye_need_not_see_the_corners() -> None:
         Lens("fisheye", [0.02, 0.0, 0.0, 0.0]),
     )
     points = Correspondences(np.zeros((1, 3)), np.array([[330.0, 250.0]]), image_size=(640, 480))
-    assert folds_back(lens, A, points) is None
-    assert folds_back(Lens("fisheye", [-0.2, 0.0, 0.0, 0.0]), A, points) == "image"
+    assert where_not_monotonic(lens, A, points) is None
+    assert where_not_monotonic(Lens("fisheye", [-0.2, 0.0, 0.0, 0.0]), A, points) == "image"
 
 
 def test_standard_deviations_are_not_too_small() -> None:

@@ -9,7 +9,7 @@ import pytest
 from wrong_inputs import FLAT, FOLDED, flat, folded, outcome
 
 from neurocal_cli import calibrate
-from neurocal_cli.judging.judgement import judged
+from neurocal_cli.verdict.assessment import judged
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| ([^|]+?) \| (refused|poor|usable) \|", README, flags=re.MULTILINE))

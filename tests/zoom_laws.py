@@ -6,11 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from neurocal_cli.active_lens.lens_model import ActiveLens
-from neurocal_cli.active_lens.settings import LensPoints
-from neurocal_cli.active_lens.simulated import see
-from neurocal_cli.camera import Pose
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.geometry import Array
+from neurocal_cli.simulation.zoom_lens import see
+from neurocal_cli.zoom_lens.settings import LensPoints
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 LOW, HIGH = np.array([100.0, 0.0]), np.array([2100.0, 900.0])  # of the encoders
 POSE = Pose.from_euler(0.15, -0.22, 0.05, np.array([12.0, -8.0, 0.0]))
@@ -107,7 +107,7 @@ def seen(
     return see(parameters, settings, POSE, THETA, SIZE, side, sigma, np.random.default_rng(seed))
 
 
-def covered(lens: ActiveLens, law: str, settings: Array) -> float:
+def covered(lens: ZoomLens, law: str, settings: Array) -> float:
     """Share of the parameters' true values within two standard deviations."""
     prediction = lens.predict(settings)
     true = np.column_stack([truth(law, settings)[name] for name in NAMES])

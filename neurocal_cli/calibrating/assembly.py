@@ -6,20 +6,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.job import Job, Solution
-from neurocal_cli.adjustment.observability import refuse_undetermined
-from neurocal_cli.adjustment.odd_views import seen_from_behind
-from neurocal_cli.adjustment.parameters import parameter_covariance, parameter_warnings, pose_std
-from neurocal_cli.adjustment.problems import Known, intrinsic_matrix
-from neurocal_cli.adjustment.uncertainty import Covariance, covariance
-from neurocal_cli.adjustment.user_units import translations
-from neurocal_cli.adjustment.views import Views
-from neurocal_cli.adjustment.whiteness import of_points
+from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
+from neurocal_cli.bundle_adjustment.job import Job, Solution
+from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
+from neurocal_cli.bundle_adjustment.outlier_views import seen_from_behind
+from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
+    parameter_covariance,
+    parameter_warnings,
+    pose_std,
+)
+from neurocal_cli.bundle_adjustment.problem import Known, intrinsic_matrix
+from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
+from neurocal_cli.bundle_adjustment.units import translations
+from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibrating.fitting import Fit
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
-from neurocal_cli.camera import POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import Lens
 from neurocal_cli.points import Correspondences
 
 __all__ = ["assemble"]
@@ -47,7 +51,7 @@ def assemble(fit: Fit, rejected: Rejected, *, method: str, trainer: str, seed: i
         warnings=(
             *found.warnings,
             *_corner_warning(job),
-            *_mirrored_warning(seen_from_behind(job.views, fit.solution.refined.state)),
+            *_mirrored_warning(seen_from_behind(job.views, fit.solution.adjusted.state)),
             *_rejection_warnings(rejected, len(fit.points)),
         ),
     )
@@ -107,12 +111,12 @@ class _Assembly:
 
     def calibration(self, method: str, trainer: str, seed: int, name: str) -> Calibration:
         views, known, solution = self.views, self.known, self.solution
-        refined = solution.refined
+        adjusted = solution.adjusted
         cov = covariance(
-            refined.normal, known.free_camera, known.free_poses, views.n_equations, solution.shared
+            adjusted.normal, known.free_camera, known.free_poses, views.n_equations, solution.shared
         )
-        refuse_undetermined(views, known, refined.state, cov)
-        A = known.matrix(refined.state.entries[0], views)
+        refuse_undetermined(views, known, adjusted.state, cov)
+        A = known.matrix(adjusted.state.entries[0], views)
         intrinsics = known.intrinsics or Intrinsics.from_matrix(A)
         if known.type != 3 and not known.free[1]:
             intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
@@ -120,7 +124,7 @@ class _Assembly:
         results, rmse, largest = self._views(cov)
         free = [n for n, name in enumerate(std) if name not in known.fixed]
         reason = StopReason.CONVERGED
-        if not refined.converged:
+        if not adjusted.converged:
             reason = StopReason.MAX_ITERATIONS
         elif not solution.tally.certain:
             reason = StopReason.NO_AGREEMENT
@@ -141,11 +145,11 @@ class _Assembly:
             covariance=block[np.ix_(free, free)],
             covariance_names=tuple(np.array(list(std))[free].tolist()),
             distortion_model=known.lens.model,
-            distortion=refined.state.k,
+            distortion=adjusted.state.k,
             network=self._network(rmse),
             camera_name=name,
             warnings=parameter_warnings(
-                intrinsics, Lens(known.lens.model, refined.state.k), std, self.lens_chosen
+                intrinsics, Lens(known.lens.model, adjusted.state.k), std, self.lens_chosen
             ),
         )
 
@@ -162,9 +166,9 @@ class _Assembly:
     def _views(self, cov: Covariance) -> tuple[dict[str, ViewResult], float, float]:
         """Poses in world units with their std, and the pixel error (3), unweighted."""
         views, known = self.views, self.known
-        R = self.solution.refined.state.R
+        R = self.solution.adjusted.state.R
         centre = (R @ views.centre[..., None])[..., 0]
-        t_world = translations(views, self.solution.refined.state)
+        t_world = translations(views, self.solution.adjusted.state)
         if known.poses is not None:
             R = np.stack([known.poses[name].R for name in views.names])
             t_world = np.stack([known.poses[name].t for name in views.names])
@@ -190,12 +194,12 @@ class _Assembly:
 
     def _squared_errors(self) -> Array:
         """Squared pixel error of each point, sorted by view; (N,)."""
-        errors = of_points(self.views, self.solution.refined.state)
+        errors = point_residuals(self.views, self.solution.adjusted.state)
         return np.asarray((errors**2).sum(axis=1) * self.views.pixel_scale**2)
 
     def _network(self, rmse: float) -> NetworkRecord:
         views, tally = self.views, self.solution.tally
-        state = self.solution.refined.state
+        state = self.solution.adjusted.state
         px, n = views.pixel_scale, len(views.index)
         return NetworkRecord(
             W=intrinsic_matrix(state.entries[0]),

@@ -8,22 +8,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli.adjustment.job import Job, Solution, Strategy, Tally
-from neurocal_cli.adjustment.observability import check_points
-from neurocal_cli.adjustment.pixel_error import CameraState
-from neurocal_cli.adjustment.problems import Known
-from neurocal_cli.adjustment.reweighting import reweighted
-from neurocal_cli.adjustment.user_units import Seen, normalised
-from neurocal_cli.adjustment.views import Views, arrange
+from neurocal_cli.bundle_adjustment.job import Job, Solution, Strategy, Tally
+from neurocal_cli.bundle_adjustment.observability import check_points
+from neurocal_cli.bundle_adjustment.problem import Known
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.reweighting import reweighted
+from neurocal_cli.bundle_adjustment.units import Seen, normalised
+from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import StraightLines
+from neurocal_cli.distortion.candidate_models import supported
+from neurocal_cli.distortion.given_distortion import check_lens, straighten
+from neurocal_cli.distortion.model_selection import LensChoice, choose_lens
+from neurocal_cli.distortion.multi_start import with_more_starts
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.lenses.asked_for import with_lens_asked_for
-from neurocal_cli.lenses.candidates import supported
-from neurocal_cli.lenses.choice import LensChoice, choose_lens
-from neurocal_cli.lenses.given_lens import check_lens, straighten
+from neurocal_cli.initialisation.local_minima import try_mirrored
+from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.points import Correspondences
-from neurocal_cli.search.neuro import solve
-from neurocal_cli.search.rivals import try_mirrored
 
 __all__ = ["Fit", "Fitter"]
 
@@ -62,7 +62,7 @@ class Fit:
     @property
     def seen(self) -> Seen:
         """The camera and the poses in pixels and world units, poses in the order of the job's views."""
-        return Seen.of(self.job.views, self.job.known, self.solution.refined.state)
+        return Seen.of(self.job.views, self.job.known, self.solution.adjusted.state)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class Fitter:
         job = self._job(views, self.known)
         if not self.lens:
             found = solve(job)
-            found = with_lens_asked_for(job, found, points, lambda: self._bent_starts(views, points))
+            found = with_more_starts(job, found, points, lambda: self._bent_starts(views, points))
             return self._finished(job, _turned(job, found), points)
         try:
             solution = solve(job)
@@ -119,7 +119,7 @@ class Fitter:
         state = normalised(replace(seen, R=seen.R[place], t=seen.t[place]), views)
         own = Tally(**{**vars(tally), "agreed": tally.agreed[place]})
         job = replace(fit.job, views=views, tally=own, restraint=None)
-        return self._finished(job, Solution(job.refine(state), own), points)
+        return self._finished(job, Solution(job.adjust(state), own), points)
 
     def _job(self, views: Views, known: Known) -> Job:
         check_points(views, known)
@@ -154,7 +154,7 @@ class Fitter:
         if job is None:
             return
         with suppress(DegenerateGeometryError):
-            yield _turned(job, solve(job)).refined.state
+            yield _turned(job, solve(job)).adjusted.state
         if points.image_size is None or not job.known.free[3:].all():
             return
         known = job.known
@@ -162,14 +162,14 @@ class Fitter:
         entries[3:], free[3:] = (np.array(points.image_size) - 1) / 2, False
         held = replace(known, entries=entries, free=free, fixed=known.fixed | {"u0", "v0"})
         with suppress(DegenerateGeometryError):
-            state = solve(self._job(views, held)).refined.state
-            yield _turned(job, Solution(job.refine(state), job.tally)).refined.state
+            state = solve(self._job(views, held)).adjusted.state
+            yield _turned(job, Solution(job.adjust(state), job.tally)).adjusted.state
 
     def _lines_first(self, points: Correspondences) -> Fit:
         """The lens from straight lines, then the pinhole camera, then both together."""
         # A hundredth of a second that other lenses are spared.
-        from neurocal_cli.lenses.plumb_camera import lens_and_camera
-        from neurocal_cli.lenses.plumb_line import fit_plumb_line
+        from neurocal_cli.distortion.plumb_line import fit_plumb_line
+        from neurocal_cli.distortion.plumb_line_camera import lens_and_camera
 
         plumb = fit_plumb_line(points, self.known.given_centre)
         job = self._job(arrange(plumb.corrected(points)), self.known)
@@ -184,9 +184,9 @@ def _turned(job: Job, solution: Solution) -> Solution:
 
     Before the lens was known, the wrong one may have looked better.
     """
-    refined = solution.refined
-    error = refined.cost / job.views.counts
-    if refined.state.lens == "none" or error.max() <= _FAR_WORSE * np.median(error):
+    adjusted = solution.adjusted
+    error = adjusted.cost / job.views.counts
+    if adjusted.state.lens == "none" or error.max() <= _FAR_WORSE * np.median(error):
         return solution
-    turned = try_mirrored(job, refined)
-    return solution if turned is refined else Solution(turned, job.tally, solution.shared)
+    turned = try_mirrored(job, adjusted)
+    return solution if turned is adjusted else Solution(turned, job.tally, solution.shared)

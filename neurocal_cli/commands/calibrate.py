@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.estimation import Estimation, estimation_options
+from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.options import Command, check_plot, output_option, plot_option, points_argument
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
@@ -90,8 +90,8 @@ def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) 
     note(notes)
     points, arguments = estimation.prepare(points)
 
-    from neurocal_cli.judging.judgement import judged
     from neurocal_cli.methods import calibrate as learn
+    from neurocal_cli.verdict.assessment import judged
 
     with ProgressBar() as progress:
         calibration = learn(points, **arguments, camera_name=camera_name, progress=progress)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.estimation import given_camera
+from neurocal_cli.commands.calibration_options import given_camera
 from neurocal_cli.commands.evaluate_stereo import stereo
 from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
@@ -99,7 +99,7 @@ def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluati
     """Evaluate a calibration or, given points, any camera file: then all poses are fitted."""
     from neurocal_cli.evaluation import evaluate_camera
     from neurocal_cli.io.calibration_yaml import read_calibration
-    from neurocal_cli.judging.judgement import judged
+    from neurocal_cli.verdict.assessment import judged
 
     try:
         calibration = read_calibration(name)
@@ -124,8 +124,8 @@ def _tell(evaluation: CameraEvaluation) -> None:
 
 
 def _show(evaluation: CameraEvaluation, verdict: Verdict | None, as_json: bool) -> None:
-    from neurocal_cli.judging.verdict_report import verdict_lines
     from neurocal_cli.report import evaluation_json, evaluation_report, evaluation_tables
+    from neurocal_cli.verdict.report import verdict_lines
 
     if as_json:
         click.echo(json.dumps(evaluation_json(evaluation, verdict), indent=2, allow_nan=False))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.estimation import given_camera
+from neurocal_cli.commands.calibration_options import given_camera
 from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
 from neurocal_cli.commands.tables import show

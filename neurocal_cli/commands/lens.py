@@ -23,7 +23,7 @@ from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
-    from neurocal_cli.active_lens.lens_model import ActiveLens
+    from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 __all__ = ["lens"]
 
@@ -160,7 +160,7 @@ def fit(
     _check_plot(plot, output)
     learnt = _learn(points, distortion, training, camera, hidden, outliers, no_skew, seed)
     _write(learnt, output, plot)
-    from neurocal_cli.active_lens.report import lens_report
+    from neurocal_cli.zoom_lens.report import lens_report
 
     say(lens_report(learnt))
     warn(learnt.warnings)
@@ -177,10 +177,10 @@ def _learn(
     outliers: str,
     no_skew: bool,
     seed: int,
-) -> ActiveLens:
-    from neurocal_cli.active_lens.fit import fit_lens
-    from neurocal_cli.active_lens.fit_known import LensCameras, fit_lens_cameras
+) -> ZoomLens:
     from neurocal_cli.io.lens_points import read_lens_data
+    from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
+    from neurocal_cli.zoom_lens.fit_points import fit_lens
 
     notes: list[str] = []
     data = read_lens_data(points, notes=notes)
@@ -214,13 +214,13 @@ def _check_plot(plot: str | None, output: str | None) -> None:
     check_available()
 
 
-def _write(learnt: ActiveLens, output: str, plot: str | None) -> None:
+def _write(learnt: ZoomLens, output: str, plot: str | None) -> None:
     """Write both files, the picture drawn before either is touched."""
     from neurocal_cli.io.lens_yaml import write_lens
 
     if plot is not None:
-        from neurocal_cli.active_lens.plots import draw_lens
         from neurocal_cli.io.files import write_whole
+        from neurocal_cli.zoom_lens.plots import draw_lens
 
         write_whole(plot, draw_lens(learnt, os.path.splitext(plot)[1][1:].lower()))
     write_lens(learnt, output)
@@ -256,16 +256,16 @@ def camera(
     compute_in_one_thread()
     if not camera_name.strip() or not camera_name.isprintable():
         raise UsageError("--camera-name must be a name of printable characters")
-    from neurocal_cli.active_lens.camera_at import camera_at
     from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.lens_yaml import read_lens
+    from neurocal_cli.zoom_lens.camera_at import camera_at
 
     learnt = read_lens(lens_file)
     setting, warnings = learnt.setting_of({"zoom": zoom, "focus": focus}, extrapolate)
     calibration = camera_at(learnt, setting, camera_name, tuple(warnings))
     write_calibration(calibration, output)
     if output != "-":
-        from neurocal_cli.active_lens.report import camera_report
+        from neurocal_cli.zoom_lens.report import camera_report
 
         say(camera_report(calibration))
     warn(warnings)
@@ -298,10 +298,10 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     compute_in_one_thread()
     check_one_stdin(lens_file, points)
     _check_plot(plot, None)
-    from neurocal_cli.active_lens.evaluation import evaluate_lens
-    from neurocal_cli.active_lens.report import evaluation_json, evaluation_report
     from neurocal_cli.io.lens_points import read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens
+    from neurocal_cli.zoom_lens.evaluation import evaluate_lens
+    from neurocal_cli.zoom_lens.report import evaluation_json, evaluation_report
 
     learnt = read_lens(lens_file)
     notes: list[str] = []
@@ -309,8 +309,8 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     note(notes)
     evaluation = evaluate_lens(learnt, data)
     if plot is not None:
-        from neurocal_cli.active_lens.plots import draw_evaluation
         from neurocal_cli.io.files import write_whole
+        from neurocal_cli.zoom_lens.plots import draw_evaluation
 
         write_whole(plot, draw_evaluation(evaluation, learnt.controls, os.path.splitext(plot)[1][1:].lower()))
     if as_json:

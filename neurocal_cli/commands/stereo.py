@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.estimation import Estimation, estimation_options_without_files
+from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
 from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option, plot_option
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
@@ -154,7 +154,7 @@ def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], esti
         points.append(one)
         arguments.append(given)
 
-    from neurocal_cli.stereo.methods import calibrate_stereo
+    from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 
     with ProgressBar() as progress:
         return calibrate_stereo(

@@ -101,7 +101,7 @@ def _rig(names: tuple[str, ...]) -> Rig:
 
         return read_rig(names[0])
     from neurocal_cli.io.calibration_yaml import read_calibration
-    from neurocal_cli.stereo.fitting import fit_rig
+    from neurocal_cli.stereo.fit_rig import fit_rig
 
     left, right = (read_calibration(name) for name in names)
     rig = fit_rig(left, right)

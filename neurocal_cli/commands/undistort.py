@@ -16,8 +16,8 @@ from neurocal_cli.commands.streams import check_one_stdin, is_terminal, note, on
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
+    from neurocal_cli.distortion.remapping import Remapping
     from neurocal_cli.io.camera_files import CameraFile
-    from neurocal_cli.lenses.remapping import Remapping
 
 __all__ = ["undistort"]
 
@@ -211,9 +211,9 @@ class _Work:
         write_whole(output, content)
 
     def _image(self, path: str, output: str) -> bytes:
+        from neurocal_cli.distortion.remapping import Remapping
+        from neurocal_cli.distortion.undistortion import undistortion
         from neurocal_cli.io.images import encode_image, read_picture
-        from neurocal_cli.lenses.remapping import Remapping
-        from neurocal_cli.lenses.undistortion import undistortion
 
         picture = read_picture(path)
         if self.remapping is None:
@@ -229,8 +229,8 @@ class _Work:
         return content
 
     def _points(self, path: str) -> str:
+        from neurocal_cli.distortion.undistortion import undistort_points
         from neurocal_cli.io.points_csv import format_points, read_points
-        from neurocal_cli.lenses.undistortion import undistort_points
 
         notes: list[str] = []
         points = read_points(path, notes=notes)
@@ -250,9 +250,9 @@ class _Work:
 
     def write_camera(self, path: str) -> None:
         """Write the camera of what was corrected."""
+        from neurocal_cli.distortion.undistortion import undistortion
         from neurocal_cli.io.camera_info import format_camera_info
         from neurocal_cli.io.files import write_whole
-        from neurocal_cli.lenses.undistortion import undistortion
 
         step = undistortion(self.camera, self.alpha, self.size)
         write_whole(path, format_camera_info(self.camera.camera_name, self.size, step.new.A))

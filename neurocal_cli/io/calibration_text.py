@@ -12,13 +12,13 @@ import numpy as np
 
 from neurocal_cli import __version__
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES
+from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
 from neurocal_cli.io.camera_info import camera_info_lines
 from neurocal_cli.io.rejected_yaml import rejected_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
-from neurocal_cli.lens import coefficient_names
 from neurocal_cli.points import Correspondences
 
 __all__ = ["FORMAT", "calibration_lines"]

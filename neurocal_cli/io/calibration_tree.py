@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, ViewResult
-from neurocal_cli.camera import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_text import FORMAT

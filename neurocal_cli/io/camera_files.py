@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_tree import distortion_from_field, intrinsics_from_field, poses_from_field

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from neurocal_cli.camera.distortion_models import coefficient_names
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import coefficient_names
 
 __all__ = ["from_ros", "own_length", "to_ros"]
 

@@ -18,7 +18,7 @@ __all__ = ["Header", "read_header"]
 
 _EXIF_MARK = b"Exif\0\0"
 _ORIENTATION, _WIDTH, _HEIGHT = 274, 256, 257
-_STRIPS = ((273, 279), (324, 325))  # offsets and lengths of strips, of tiles
+_STRIPS = ((273, 279), (324, 325))  # offsets and lengths of strips, of batches
 _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from neurocal_cli.active_lens.fit_known import LensCameras
-from neurocal_cli.active_lens.settings import CONTROLS
+from neurocal_cli.camera.distortion_models import MODELS
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_files import read_intrinsics
 from neurocal_cli.io.table import Schema, Table, parse_table
-from neurocal_cli.lens import MODELS
+from neurocal_cli.zoom_lens.fit_cameras import LensCameras
+from neurocal_cli.zoom_lens.settings import CONTROLS
 
 __all__ = ["names_cameras", "note_unknown", "read_cameras", "require_setting"]
 

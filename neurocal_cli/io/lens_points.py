@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.active_lens.fit_known import LensCameras
-from neurocal_cli.active_lens.settings import LensPoints, describe
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import read_bytes, write_whole
@@ -19,6 +17,8 @@ from neurocal_cli.io.lens_cameras import names_cameras, read_cameras, require_se
 from neurocal_cli.io.points_csv import POINTS, format_points
 from neurocal_cli.io.points_join import correspondences
 from neurocal_cli.io.table import Table, parse_table
+from neurocal_cli.zoom_lens.fit_cameras import LensCameras
+from neurocal_cli.zoom_lens.settings import LensPoints, describe
 
 __all__ = ["read_lens_data", "read_lens_points", "write_lens_points"]
 

@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli import __version__
-from neurocal_cli.active_lens.blocks import Constants, Normal
-from neurocal_cli.active_lens.lens_model import ActiveLens, Member, Rejected, TableRecord
-from neurocal_cli.active_lens.mlfn import Topology
-from neurocal_cli.active_lens.nets import SCALES, LensNets, ParameterNet
-from neurocal_cli.active_lens.settings import CONTROLS
+from neurocal_cli.camera.distortion_models import coefficient_names
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import write_whole
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import read_yaml
-from neurocal_cli.lens import coefficient_names
+from neurocal_cli.zoom_lens.mlfn import Topology
+from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, ParameterNet
+from neurocal_cli.zoom_lens.setting_normals import Constants, Normal
+from neurocal_cli.zoom_lens.settings import CONTROLS
+from neurocal_cli.zoom_lens.zoom_lens import Member, Rejected, TableRecord, ZoomLens
 
 __all__ = ["format_lens", "read_lens", "write_lens"]
 
@@ -30,7 +30,7 @@ _CAMERA = ("alpha_u", "alpha_v", "u0", "v0")
 _MOST_UNITS = 1000
 
 
-def format_lens(lens: ActiveLens) -> str:
+def format_lens(lens: ZoomLens) -> str:
     """Text of a lens file.
 
     Raises
@@ -44,12 +44,12 @@ def format_lens(lens: ActiveLens) -> str:
     return "\n".join([*lines, ""])
 
 
-def write_lens(lens: ActiveLens, path: str | Path) -> None:
+def write_lens(lens: ZoomLens, path: str | Path) -> None:
     """Write a lens file, whole or not at all; ``-`` is stdout."""
     write_whole(path, format_lens(lens))
 
 
-def read_lens(path: str | Path) -> ActiveLens:
+def read_lens(path: str | Path) -> ZoomLens:
     """Read a lens file; ``-`` is stdin.
 
     Raises
@@ -76,7 +76,7 @@ def _words(names: tuple[str, ...]) -> str:
     return f"[{', '.join(map(text, names))}]"
 
 
-def _record_lines(lens: ActiveLens) -> Iterator[str]:
+def _record_lines(lens: ZoomLens) -> Iterator[str]:
     width, height = lens.image_size or (0, 0)
     yield f"format: {_FORMAT}"
     yield f"version: {text(__version__)}"
@@ -106,7 +106,7 @@ def _record_lines(lens: ActiveLens) -> Iterator[str]:
         yield f"  - {quoted(warning)}"
 
 
-def _setting_lines(lens: ActiveLens) -> Iterator[str]:
+def _setting_lines(lens: ZoomLens) -> Iterator[str]:
     yield "settings:"
     yield f"  columns: [{', '.join([*lens.controls, 'n_points', 'rmse_px'])}]"
     yield "  rows:"
@@ -114,7 +114,7 @@ def _setting_lines(lens: ActiveLens) -> Iterator[str]:
         yield f"    - [{', '.join(map(number, setting.tolist()))}, {count}, {number(rmse)}]"
 
 
-def _member_lines(lens: ActiveLens) -> Iterator[str]:
+def _member_lines(lens: ZoomLens) -> Iterator[str]:
     yield "members:"
     for member in lens.members:
         yield f"  - scale: {member.nets.scale}"
@@ -133,7 +133,7 @@ def _constants(constants: Constants) -> str:
     return mapping(theta=number(constants.theta), R=flow(constants.R), t=flow(constants.t))
 
 
-def _tables_lines(lens: ActiveLens) -> Iterator[str]:
+def _tables_lines(lens: ZoomLens) -> Iterator[str]:
     for name, table in (("tables", lens.tables), ("static", lens.static)):
         yield f"{name}:"
         yield f"  constants: {_constants(table.constants)}"
@@ -147,7 +147,7 @@ def _tables_lines(lens: ActiveLens) -> Iterator[str]:
             yield f"  {key}: {flow(values)}"
 
 
-def _lens(block: Field) -> ActiveLens:
+def _lens(block: Field) -> ZoomLens:
     if block["format"].integer() != _FORMAT:
         raise FormatError(
             f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again",
@@ -168,7 +168,7 @@ def _lens(block: Field) -> ActiveLens:
     width, height = block["image_width"].integer(), block["image_height"].integer()
     fit = block["fit"]
     Q = {"known": 0, "still": 6, "moving": 1}[camera]
-    return ActiveLens(
+    return ZoomLens(
         controls=controls,
         settings=settings,
         names=names,

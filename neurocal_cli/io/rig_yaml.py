@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neurocal_cli.camera import POSE_NAMES, Pose
+from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_text import calibration_lines

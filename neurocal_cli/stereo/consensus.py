@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.camera import Pose
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation
 from neurocal_cli.stereo.problem import RigProblem
 

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import Pose
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
 from neurocal_cli.points import Correspondences
-from neurocal_cli.stereo.fitting import fit_rig, poses_on_rig
+from neurocal_cli.stereo.fit_rig import fit_rig, poses_on_rig
 from neurocal_cli.stereo.pairing import Pairs, ViewPairs, pair_points, pair_views
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError, space_error

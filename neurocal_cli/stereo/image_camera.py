@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from neurocal_cli.adjustment.pixel_error import ENTRIES
-from neurocal_cli.adjustment.problems import KnownCamera
+from neurocal_cli.bundle_adjustment.problem import KnownCamera
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
+from neurocal_cli.camera.distortion_models import bend
+from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import bend
-from neurocal_cli.lens_domain import undistort
 
 __all__ = ["ImageCamera"]
 

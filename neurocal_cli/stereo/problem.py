@@ -7,17 +7,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.pixel_error import ENTRIES, CameraState, normal_blocks
-from neurocal_cli.adjustment.reweighting import weighed
-from neurocal_cli.adjustment.tiles import tile
-from neurocal_cli.adjustment.views import Views
+from neurocal_cli.bundle_adjustment.point_batches import batches_of
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.bundle_adjustment.reweighting import weighed
+from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import Pose
+from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import Array
-from neurocal_cli.lens import coefficient_names
 from neurocal_cli.stereo.pairing import ViewPairs
-from neurocal_cli.stereo.pixel_error import Frames, RigState, Sightings
+from neurocal_cli.stereo.reprojection import Frames, RigState, Sightings
 
 __all__ = ["RigProblem", "free_parameters", "rig_problem"]
 
@@ -140,7 +140,7 @@ def _side(
     centre, scale = frames.centre[frame], frames.scale[frame]
     local = views.local * np.repeat(views.scale / scale, views.counts)[:, None]
     local += np.repeat((views.centre - centre) / scale[:, None], views.counts, axis=0)
-    tiles = tile(local, views.pixels, views.whitening, views.index, views.n_views)
+    batches = batches_of(local, views.pixels, views.whitening, views.index, views.n_views)
     entries = calibration.K[ENTRIES]
     entries[3:] -= views.pixel_centre
     poses = [calibration.views[name].pose for name in views.names]
@@ -152,11 +152,11 @@ def _side(
         calibration.distortion_model,
         np.array(calibration.distortion, dtype=float),
     )
-    cost = normal_blocks(tiles, state)[0][:, -1, -1]
+    cost = normal_blocks(batches, state)[0][:, -1, -1]
     spare = views.n_equations - int(free_parameters(calibration).sum()) - 6 * views.n_views
     noise = float(np.sqrt(cost.sum() / max(spare, 1)))
     seen = Sightings(
-        tiles, frame, views.pixel_centre, views.pixel_scale, 1.0, len(views.index), views.n_equations
+        batches, frame, views.pixel_centre, views.pixel_scale, 1.0, len(views.index), views.n_equations
     )
     return seen, state, cost, noise
 

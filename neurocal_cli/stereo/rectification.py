@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.errors import UsageError
 from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
-from neurocal_cli.lens_domain import undistort
 from neurocal_cli.stereo.rig import Rig
 
 __all__ = ["Rectification", "rectify"]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array, cross_matrix
 
 __all__ = ["Rig", "essential_matrix", "fundamental_matrix"]

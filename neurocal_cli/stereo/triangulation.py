@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.adjustment.problems import KnownCamera
-from neurocal_cli.camera import Pose
+from neurocal_cli.bundle_adjustment.problem import KnownCamera
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.image_camera import ImageCamera
-from neurocal_cli.stereo.point_batch import PointBatch
+from neurocal_cli.stereo.two_view_points import PointBatch
 
 __all__ = ["METHODS", "Triangulated", "epipolar_limit", "triangulate"]
 

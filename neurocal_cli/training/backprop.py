@@ -152,7 +152,7 @@ def _presenter(method: str) -> tuple[_Present, _Bound | None]:
 
         if rule.COMPILING or method == "patterns":
             return rule.present, None
-    from neurocal_cli.training import blocks
+    from neurocal_cli.training import rule_in_blocks as blocks
 
     return blocks.present, blocks.stable_rate
 

@@ -16,7 +16,7 @@ from bent import through
 from scenes import random_flat_set, table_1
 
 from neurocal_cli import Correspondences, calibrate, read_points
-from neurocal_cli.camera import project
+from neurocal_cli.camera.pinhole import project
 
 VIEWS = [13, 100, 1000]
 

@@ -1,0 +1,74 @@
+"""Covariance of the estimated parameters: the inverse normal matrix times the residual variance.
+
+For Gaussian noise this is the Cramer-Rao bound at the estimate. The intrinsics' block comes from
+the Schur complement over the views, each pose's block from its own view plus what the intrinsics'
+uncertainty adds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.schur_complement import inverse_scaled, schur_covariance
+
+__all__ = ["Covariance", "covariance"]
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Covariances in normalised units.
+
+    Attributes
+    ----------
+    entries : (f, f) array
+        Of A's free entries and the lens's free coefficients.
+    poses : (V, 6, 6) array
+        Of omega and tau of each view; zero where poses are given.
+    smallest : float
+        Smallest eigenvalue of the normal matrices scaled to a unit diagonal, 0 when singular.
+    """
+
+    entries: Array
+    poses: Array
+    smallest: float
+
+
+def covariance(
+    normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: float, shared: Array | None = None
+) -> Covariance:
+    """Invert the normal matrix of a adjusted calibration.
+
+    Parameters
+    ----------
+    normal : (V, 12 + K, 12 + K) array
+        From `adjust`.
+    free : (5 + K,) bool array
+        Of A's entries and the lens's coefficients.
+    free_pose : bool
+    n_residuals : int
+        Number of equations: two for most points; see `directions`.
+    shared : (f, f) array, optional
+        Covariance of what is free of A and the lens, where it comes from elsewhere; the poses' follows.
+    """
+    f = camera_columns(len(free) - 5)[np.flatnonzero(free)]
+    V = len(normal)
+    unknowns = len(f) + (6 * V if free_pose else 0)
+    variance = float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
+    if not free_pose:
+        if shared is not None:
+            return Covariance(shared, np.zeros((V, 6, 6)), 1.0)
+        U = normal[:, f[:, None], f].sum(axis=0)
+        inverse, smallest = inverse_scaled(U, U)
+        return Covariance(variance * inverse, np.zeros((V, 6, 6)), smallest)
+    if shared is None:
+        found = schur_covariance(normal, f, np.arange(POSE.start, POSE.stop))
+        return Covariance(variance * found.shared, variance * found.own, found.smallest)
+    B = normal[:, POSE, POSE]
+    B_inverse, smallest = inverse_scaled(B, B)
+    gain = normal[:, f, POSE] @ B_inverse
+    return Covariance(shared, variance * B_inverse + np.swapaxes(gain, 1, 2) @ shared @ gain, smallest)

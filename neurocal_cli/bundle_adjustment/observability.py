@@ -1,0 +1,211 @@
+"""What the points can and cannot determine: refusals with a reason, before and after training."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.covariance import Covariance
+from neurocal_cli.bundle_adjustment.problem import Known
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array
+
+__all__ = ["check_determined", "check_points", "parameter_count", "refuse_undetermined"]
+
+_COLLINEAR = 1e-6  # second extent as a share of the first
+_SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which rounding rules
+# Std of a focal length over its value. Parallel boards under noise fit best with tilts of about one
+# standard deviation each, and V boards then seem to tell the focal length to 1 / sqrt(2 V): flat
+# targets have to do better than that by this factor.
+_MEANINGLESS = 0.5
+_NEARLY_PARALLEL = 5.0  # degrees
+
+
+def parameter_count(known: Known, n_views: int) -> int:
+    """Number of unknowns."""
+    return int(known.free_camera.sum()) + (6 * n_views if known.free_poses else 0)
+
+
+def check_points(views: Views, known: Known) -> None:
+    """Refuse points that cannot do, each with its reason.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        Points on one line or too few, a single plane, too few views.
+    """
+    if known.free_poses:
+        _check_each_view(views)
+    if known.type in (1, 2):
+        _check_planes(views, known)
+        _check_helpers(views, known)
+    unknowns, equations = parameter_count(known, views.n_views), views.n_distinct_equations
+    if equations <= unknowns:
+        of_point = 2 if views.across is None else 1
+        raise DegenerateGeometryError(
+            f"{views.distinct.sum()} different points give {equations:.0f} equations for {unknowns} "
+            f"unknowns; give at least {unknowns // of_point + 1} points"
+            + (f", or more of the camera ({_givable(known)})" if known.type == 1 else "")
+        )
+
+
+def _check_each_view(views: Views) -> None:
+    few = views.distinct < 4
+    line = views.extent[:, 1] <= _COLLINEAR * views.extent[:, 0]
+    for bad, reason in (
+        (views.counts == 1, "there is only one point; give at least 4 (6 for a solid target of type 1)"),
+        (views.distinct < 2, "all points are the same world point; check the columns X,Y,Z"),
+        (line, "all points lie on one line; give points that spread over a plane or in space"),
+        (_on_one_line(views), "all pixels u,v lie on one line; check the columns"),
+        (few, "fewer than 4 different points; give at least 4 (6 for a solid target of type 1)"),
+    ):
+        if bad.any():
+            which = int(np.argmax(bad))
+            many = f" (and {int(bad.sum()) - 1} more views)" if bad.sum() > 1 else ""
+            raise DegenerateGeometryError(f"view {views.names[which]!r}{many}: {reason}")
+
+
+def _on_one_line(views: Views) -> NDArray[np.bool_]:
+    """(V,) whether all the view's pixels do, or are the same."""
+    centre = np.add.reduceat(views.pixels, views.first) / views.counts[:, None]
+    du, dv = (views.pixels - np.repeat(centre, views.counts, axis=0)).T
+    suu, suv, svv = (np.add.reduceat(product, views.first) for product in (du * du, du * dv, dv * dv))
+    total = suu + svv
+    return np.asarray(total - np.hypot(suu - svv, 2 * suv) <= 2 * _COLLINEAR**2 * total)
+
+
+def _check_planes(views: Views, known: Known) -> None:
+    """Each flat view gives two conditions on the intrinsics, a solid one all five."""
+    free = int(known.free.sum())
+    flat = views.exactly_flat
+    if not flat.all() or 2 * len(flat) >= free:
+        return
+    needed = -(-free // 2)
+    names = "the intrinsics and the pose" if known.type == 1 else "alpha_u, alpha_v and theta"
+    ways = [f"{needed} views of the board from different angles", "points in two planes"]
+    if 2 * len(flat) >= free - known.free[1]:
+        ways.append("--no-skew")
+    elif known.type == 1:
+        ways.append("--type 2 --no-skew" if known.free[1] else "--type 2")
+    views_text = "one view" if len(flat) == 1 else f"{len(flat)} views"
+    raise DegenerateGeometryError(
+        f"{views_text} of one plane cannot tell {names} apart; give {', '.join(ways[:-1])} or {ways[-1]}"
+    )
+
+
+def _check_helpers(views: Views, known: Known) -> None:
+    """Views with too few points of their own join the others, which must tell the camera alone.
+
+    All together might have the equations for it, but from the wrong camera that they begin with they
+    mostly end in a wrong minimum, and nothing shows it.
+    """
+    able = views.distinct >= np.where(views.nearly_flat, 4, 6)
+    needed = -(-int(known.free.sum()) // 2)
+    if able.all() or not able.any() or (able & ~views.nearly_flat).any() or able.sum() >= needed:
+        return
+    which = int(np.argmin(able))
+    raise DegenerateGeometryError(
+        f"view {views.names[which]!r} has only {views.distinct[which]} different points, and the views of "
+        f"one plane cannot tell the camera without it; give it at least 6 points, or {needed} views of the "
+        "board from different angles"
+    )
+
+
+def refuse_undetermined(views: Views, known: Known, state: CameraState, cov: Covariance) -> None:
+    """Refuse an answer that the points leave open.
+
+    Parameters
+    ----------
+    views : Views
+    known : Known
+    state : CameraState
+        At the minimum.
+    cov : Covariance
+
+    Raises
+    ------
+    DegenerateGeometryError
+        A singular normal matrix, or a focal length that is hardly known.
+    """
+    free = np.flatnonzero(known.free)
+    relative = np.zeros(2)
+    for slot, entry in enumerate((0, 2)):
+        if entry in free:
+            place = int(np.flatnonzero(free == entry)[0])
+            relative[slot] = np.sqrt(cov.entries[place, place]) / state.entries[0, entry]
+    check_determined(views, known, relative, cov.smallest, (state.R @ views.basis)[:, :, 2])
+
+
+def check_determined(
+    views: Views, known: Known, relative_std: Array, smallest: float, normals: Array
+) -> None:
+    """Refuse an answer that the points leave open.
+
+    Parameters
+    ----------
+    views : Views
+    known : Known
+    relative_std : (2,) array
+        Standard deviations of A11 and A22 over their values; 0 where given.
+    smallest : float
+        Smallest eigenvalue of the normal matrix scaled to a unit diagonal: 0 when singular.
+    normals : (V, 3) array
+        Normal of each view's plane in the camera's frame.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        A singular normal matrix, or a focal length known no better than to `_MEANINGLESS`.
+    """
+    singular = not smallest > _SINGULAR
+    boards = views.nearly_flat.all() and known.free_poses and known.free[[0, 2]].any()
+    limit = _MEANINGLESS / np.sqrt(2 * views.n_views) if boards else _MEANINGLESS
+    if not singular and relative_std.max(initial=0.0) < limit:
+        return
+    if boards:
+        _check_tilts(views, normals, singular)
+    more = f", or give more of the camera ({ways})" if (ways := _givable(known)) else ""
+    if singular and known.free_lens:
+        raise DegenerateGeometryError(
+            f"the points do not determine all coefficients of the {known.lens.model} lens; choose a simpler "
+            "--distortion, or give points over more of the image"
+        )
+    if singular:
+        raise DegenerateGeometryError(
+            "the points do not determine all unknowns (the normal matrix is singular); "
+            f"spread the points in depth{more}"
+        )
+    share = relative_std.max()
+    known_to = f"is known no better than to {100 * share:.0f} % of itself" if share < 1 else "cannot be told"
+    raise DegenerateGeometryError(
+        f"the focal length {known_to}; bring the target nearer, tilt it more{more}, and check that each "
+        "pixel belongs to its point"
+    )
+
+
+def _check_tilts(views: Views, normals: Array, singular: bool) -> None:
+    """Refuse flat boards that stand parallel, to the image or to each other."""
+    if views.n_views == 1:
+        raise DegenerateGeometryError(
+            "one view of a board that is (nearly) parallel to the image cannot tell the focal length; "
+            "tilt the board by 20 to 50 degrees"
+        )
+    angle = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T).min(), 0, 1)))
+    if singular and angle >= _NEARLY_PARALLEL:
+        return
+    # Noise on parallel boards reads as a long lens and large tilts: the angle means nothing then.
+    found = "parallel as far as the noise lets one tell"
+    if angle < _NEARLY_PARALLEL:
+        found = f"all parallel (within {angle:.1f} degrees)"
+    raise DegenerateGeometryError(
+        f"the {views.n_views} boards are {found}, so no focal length can be told from them; "
+        "tilt the board by 20 to 50 degrees in different directions"
+    )
+
+
+def _givable(known: Known) -> str:
+    """Options that would leave fewer unknowns."""
+    ways = ["--no-skew"] if known.free[1] else []
+    return ", ".join(ways + [f"--type {more}" for more in (2, 3) if more > known.type])

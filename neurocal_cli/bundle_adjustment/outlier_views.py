@@ -1,0 +1,113 @@
+"""Views that contradict the others as wholes, though their own points agree with each other.
+
+Such a view is of another camera (another zoom, another picture size), or of a target whose points are
+not where its world coordinates say: read in the wrong order, mirrored, with the wrong size of square.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.cross_validation import (
+    Quadratics,
+    inverse,
+    moves_without_each,
+    reduced,
+    without_each,
+)
+from neurocal_cli.bundle_adjustment.job import Job, Solution
+from neurocal_cli.bundle_adjustment.observability import parameter_count
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+
+__all__ = ["find_outlier_view", "free_networks", "seen_from_behind"]
+
+_FEWEST = 4  # views, of which the others must outvote one
+_MOVES = 2.5  # standard deviations of any shared parameter that leaving a view out must move
+_ODD = 25.0  # times what noise, and what the others contradict each other by
+_STEPS = 60
+_SAME_PLANE = 1e-3
+_CONDITIONS = {True: 2, False: 5}  # that a common camera puts on a flat and on a solid view's network
+
+
+def find_outlier_view(job: Job, solution: Solution) -> str | None:
+    """The view that contradicts the others most, if any does.
+
+    By how much is measured by the squared error that it would spare if it had a camera of its own,
+    for each of the conditions that the common camera puts on it, in units of the noise's variance: 1
+    for noise alone. On real boards, which are not quite flat, it is some tens for every view; an odd
+    view's stands out from the others'.
+    """
+    views, known, adjusted = job.views, job.known, solution.adjusted
+    V = views.n_views
+    if V < _FEWEST or known.type == 3 or not known.free_poses:
+        return None
+    quadratics = reduced(adjusted.normal, known.free_camera, known.free_poses)
+    spare = views.n_equations - parameter_count(known, V)
+    if _largest_move(quadratics, float(adjusted.cost.sum()) / max(spare, 1)) < _MOVES:
+        return None
+    conditions = np.where(views.nearly_flat, _CONDITIONS[True], _CONDITIONS[False])
+    own = free_networks(views, adjusted.state)
+    own_spare = views.equations - 6 - conditions
+    if own_spare.min() <= 0:
+        return None
+    variance = float(np.median(own / own_spare)) + 1e-24
+    contradiction = _contradictions(quadratics, own, conditions) / variance
+    view = int(np.argmax(contradiction))
+    if not contradiction[view] > _ODD:
+        return None
+    rest = np.delete(np.arange(V), view)
+    others = adjust(views.subset(rest).batches, _of(adjusted.state, rest), known.free_camera, True, _STEPS)
+    left = reduced(others.normal, known.free_camera, True)
+    among = float(np.median(_contradictions(left, own[rest], conditions[rest]))) / variance
+    return views.names[view] if contradiction[view] > _ODD * max(among, 1.0) else None
+
+
+def _largest_move(q: Quadratics, variance: float) -> float:
+    """Most standard deviations by which leaving one view out moves a shared parameter."""
+    S = q.S.sum(axis=0)
+    with np.errstate(invalid="ignore"):
+        std = np.sqrt(np.abs(np.diagonal(inverse(S))) * variance)
+        moves = np.abs(moves_without_each(q)) / std
+    return float(np.where(np.isfinite(moves), moves, np.inf).max(initial=0.0))
+
+
+def _contradictions(q: Quadratics, own: Array, conditions: NDArray[np.intp]) -> Array:
+    """(V,) squared error that each view would spare with a camera of its own, by condition."""
+    with np.errstate(invalid="ignore"):
+        spared = q.cost.sum() - without_each(q) - own
+    return np.asarray(np.where(np.isfinite(spared), spared, 0.0) / conditions)
+
+
+def _of(state: CameraState, views: NDArray[np.intp]) -> CameraState:
+    return CameraState(state.entries, state.R[views], state.t[views], state.lens, state.k)
+
+
+def free_networks(views: Views, state: CameraState) -> Array:
+    """Squared pixel error of a free camera for each view, with the lens as it is; (V,).
+
+    Eleven parameters for each view are as free as its product W V: what no camera common to all the
+    views can go below, and so the precision of the points themselves.
+    """
+    own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.lens, state.k)
+    free = np.concatenate([np.ones(5, dtype=bool), np.zeros(len(state.k), dtype=bool)])
+    return adjust(views.batches, own, free, True, _STEPS).cost
+
+
+def seen_from_behind(views: Views, state: CameraState) -> list[str]:
+    """Views that show a flat target from the side that the other views do not show.
+
+    Nobody sees through a board: its points are mirrored in those views (or in the others).
+    """
+    if views.n_views < _FEWEST or not views.nearly_flat.all():
+        return []
+    normal = views.basis[:, :, 2] * np.sign(views.basis[:, :, 2] @ views.basis[0, :, 2])[:, None]
+    if np.abs(normal - normal[0]).max() > _SAME_PLANE:
+        return []
+    # The centroid lies along t: on which side of the plane is the camera?
+    side = ((state.R @ normal[..., None])[..., 0] * state.t).sum(axis=1)
+    behind = (side < 0) != (np.median(np.sign(side)) < 0)
+    return [views.names[k] for k in np.flatnonzero(behind)]

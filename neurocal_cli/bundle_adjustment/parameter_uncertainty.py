@@ -1,0 +1,114 @@
+"""From the covariance of normalised unknowns to parameters with standard deviations, and what to warn of.
+
+The estimators work on A's entries in normalised pixels and on each pose about its target's centre; users
+want the paper's parameters in pixels, radians and their own unit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+
+import numpy as np
+
+from neurocal_cli.camera.distortion_models import Lens, coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
+from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
+
+__all__ = ["parameter_covariance", "parameter_warnings", "pose_std"]
+
+# A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
+_POOR = 0.05
+_POOR_THETA = 0.02  # rad
+_TOLD_APART = 2.0  # standard deviations
+
+
+def parameter_covariance(
+    intrinsics: Intrinsics, model: str, covariance: Array, pixel_scale: float, given: Collection[str]
+) -> tuple[Array, dict[str, float]]:
+    """Covariance of the intrinsic parameters and the lens's coefficients, and their std.
+
+    Parameters
+    ----------
+    intrinsics : Intrinsics
+    model : str
+        Of the lens, with K coefficients.
+    covariance : (5 + K, 5 + K) array
+        Of A's entries A11, A12, A22, A13, A23 in normalised pixels and the coefficients; 0 for given ones.
+    pixel_scale : float
+        S1 [px].
+    given : collection of str
+        Names whose std is 0.
+
+    Returns
+    -------
+    block : (5 + K, 5 + K) array
+    std : dict of float by name
+    """
+    names = (*INTRINSIC_NAMES, *coefficient_names(model))
+    J = np.eye(len(names))
+    J[:5, :5] = intrinsics.entry_jacobian() * pixel_scale
+    block = J @ covariance @ J.T
+    std = {name: 0.0 if name in given else float(np.sqrt(block[n, n])) for n, name in enumerate(names)}
+    return block, std
+
+
+def pose_std(R: Array, centre: Array, scale: Array, covariance: Array) -> Array:
+    """Standard deviations of angles and translations, (V, 6).
+
+    Parameters
+    ----------
+    R : (V, 3, 3) array
+    centre : (V, 3) array
+        Of each target, R c [world unit].
+    scale : (V,) array
+        S2 [world unit].
+    covariance : (V, 6, 6) array
+        Of omega and tau about the centre, normalised.
+    """
+    # t = scale tau - R c: omega turns R c with it.
+    J = np.zeros((len(R), 6, 6))
+    J[:, :3, :3] = euler_jacobian(R)
+    J[:, 3:, :3] = cross_matrix(centre)
+    J[:, 3:, 3:] = np.eye(3) * scale[:, None, None]
+    block = J @ covariance @ np.swapaxes(J, 1, 2)
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(block, axis1=1, axis2=2), 0.0)))
+
+
+def parameter_warnings(
+    intrinsics: Intrinsics, lens: Lens, std: Mapping[str, float], lens_chosen: bool
+) -> tuple[str, ...]:
+    """Parameters that exist but are badly determined, and coefficients that the data does not tell from 0.
+
+    A lens model that was chosen for what it predicts may well have one of those.
+    """
+    return (*_poor(intrinsics, std), *(() if lens_chosen else _noise_coefficients(lens, std)))
+
+
+def _poor(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:
+    """Parameters that exist but are badly determined."""
+    alpha = max(intrinsics.alpha_u, intrinsics.alpha_v)
+    limits = {
+        "alpha_u": _POOR * intrinsics.alpha_u,
+        "alpha_v": _POOR * intrinsics.alpha_v,
+        "u0": _POOR * alpha,
+        "v0": _POOR * alpha,
+        "theta": _POOR_THETA,
+    }
+    poor = [f"{name} (std {std[name]:.2g})" for name in INTRINSIC_NAMES if std[name] > limits[name]]
+    if not poor:
+        return ()
+    return (
+        f"badly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
+        "the target more, or give what is known (--no-skew, --type 2)",
+    )
+
+
+def _noise_coefficients(lens: Lens, std: Mapping[str, float]) -> tuple[str, ...]:
+    """Warn of coefficients that the data does not tell from 0."""
+    pairs = zip(coefficient_names(lens.model), lens.coefficients, strict=True)
+    noise = [
+        f"{name} ({k:.2g} +- {std[name]:.2g})" for name, k in pairs if 0 < abs(k) < _TOLD_APART * std[name]
+    ]
+    if not noise:
+        return ()
+    return (f"not told from 0: {', '.join(noise)}; a simpler --distortion would do",)

@@ -1,0 +1,123 @@
+"""Observations laid out for batched arithmetic: batches of equally many points, each batch from one view.
+
+Views differ in their number of points, from four to a million. Cut into batches of one size (the
+last of a view padded with weight 0) they are plain arrays without a Python loop over views, and a
+handful of batches at a time stays in the processor's cache.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["PointBatches", "batches_of"]
+
+_LARGEST_TILE = 512
+_POINTS_AT_ONCE = 4096  # about 1.5 MB of derivatives, a share of the second-level cache
+
+
+@dataclass(frozen=True, eq=False)
+class PointBatches:
+    """Points of several views in batches of n points.
+
+    Attributes
+    ----------
+    local : (T, 3, n) array
+        World points of each batch in its view's own normalised frame.
+    pixels : (T, 2, n) array
+        Normalised pixels.
+    whitening : (T, 3, n) array or None
+        Entries (0, 0), (0, 1), (1, 1) of the upper triangular factor that whitens a residual; None
+        when every point counts the same and no batch is padded.
+    first : (V,) int array
+        First batch of each view.
+    view : (T,) int array
+        View of each batch.
+    counts : (V,) int array
+        Points of each view.
+    """
+
+    local: Array
+    pixels: Array
+    whitening: Array | None
+    first: NDArray[np.intp]
+    view: NDArray[np.intp]
+    counts: NDArray[np.intp]
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+        return len(self.counts)
+
+    def chunks(self) -> Iterator[slice]:
+        """Slices of batches, each a few thousand points."""
+        step = max(1, _POINTS_AT_ONCE // self.local.shape[2])
+        for start in range(0, len(self.view), step):
+            yield slice(start, min(start + step, len(self.view)))
+
+    def sum_by_view(self, by_batch: Array) -> Array:
+        """Sum of the batches' values over each view; (T, ...) -> (V, ...)."""
+        if len(by_batch) == self.n_views:
+            return by_batch
+        return np.add.reduceat(by_batch, self.first, axis=0)
+
+
+def batches_of(
+    local: Array, pixels: Array, whitening: Array | None, view: NDArray[np.intp], n_views: int
+) -> PointBatches:
+    """Cut points into batches.
+
+    Parameters
+    ----------
+    local : (N, 3) array
+    pixels : (N, 2) array
+    whitening : (N, 3) array or None
+    view : (N,) int array
+        View of each point; each of the `n_views` views has at least one.
+    n_views : int
+    """
+    counts = np.bincount(view, minlength=n_views)
+    order = np.argsort(view, kind="stable") if np.any(view[1:] < view[:-1]) else None
+    size = _tile_size(counts)
+    per_view = -(-counts // size)
+    first = np.concatenate([[0], np.cumsum(per_view)[:-1]])
+    n_batches = int(per_view.sum())
+    padded = n_batches * size != len(view)
+    # Slot of each point: its view's first batch, then its rank within the view.
+    rank = np.arange(len(view)) - np.repeat(np.cumsum(counts) - counts, counts)
+    slot = np.repeat(first * size, counts) + rank if padded else None
+
+    def lay(values: Array, columns: int) -> Array:
+        values = values if order is None else values[order]
+        if slot is not None:
+            # Padding repeats a real point, so that no padded slot ever divides by zero.
+            filled = np.repeat(values[np.cumsum(counts) - 1], per_view * size, axis=0)
+            filled[slot] = values
+            values = filled
+        return np.ascontiguousarray(np.swapaxes(values.reshape(n_batches, size, columns), 1, 2))
+
+    if whitening is None and padded:
+        whitening = np.tile([1.0, 0.0, 1.0], (len(view), 1))
+    factors = None if whitening is None else lay(whitening, 3)
+    if factors is not None and slot is not None:
+        real = np.zeros(n_batches * size)
+        real[slot] = 1.0
+        factors *= real.reshape(n_batches, 1, size)
+    tile_view = np.repeat(np.arange(n_views), per_view)
+    return PointBatches(lay(local, 3), lay(pixels, 2), factors, first, tile_view, counts)
+
+
+def _tile_size(counts: NDArray[np.intp]) -> int:
+    """The batch size that costs least: padding costs points, batches cost a fixed overhead each."""
+    most = int(counts.max())
+    if most <= _LARGEST_TILE and most == counts.min():
+        return most
+    candidates = {min(int(c), _LARGEST_TILE) for c in np.quantile(counts, [0, 0.25, 0.5, 0.75, 1])}
+    candidates |= {-(-int(c) // -(-int(c) // _LARGEST_TILE)) for c in (most, np.median(counts))}
+    overhead = 16
+    return min(sorted(candidates), key=lambda n: float((-(-counts // n)).sum() * (n + overhead)))

@@ -1,0 +1,268 @@
+"""Points sorted by view and normalised: the paper's S1 and S2, centred, one S2 for each view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.measured_directions import LEAST, equations, loosened
+from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array, similarity
+from neurocal_cli.network import Patterns
+from neurocal_cli.points import Correspondences
+
+__all__ = ["Views", "arrange", "noise_model"]
+
+# A target thinner than this share of its length is a plane up to rounding ...
+_EXACTLY_FLAT = 1e-6
+# ... and thinner than this it is treated as one until the last step, which sees every coordinate.
+_NEARLY_FLAT = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Views:
+    """All points, sorted by view, in normalised coordinates.
+
+    Attributes
+    ----------
+    names : tuple of str
+    order : (N,) int array or None
+        Row of the original data at each place; None when it was sorted already.
+    index : (N,) int array
+        View of each point.
+    counts, first : (V,) int arrays
+        Points of each view and its first place.
+    distinct : (V,) int array
+        Different world points of each view.
+    local : (N, 3) array
+        (M - centre) / scale, each view with its own.
+    pixels : (N, 2) array
+        (m - pixel_centre) / pixel_scale.
+    weights : (N,) array
+        Scalar importance, mean 1.
+    across : (N, 2) array or None
+        Direction in which each point was measured; see `directions`.
+    along : float
+        Say of such points in the other direction.
+    whitening : (N, 3) array or None
+        Upper triangular factor of the inverse covariance: entries (0, 0), (0, 1), (1, 1).
+    centre : (V, 3) array
+    scale : (V,) array
+        S2 of each view [world unit].
+    basis : (V, 3, 3) array
+        Columns: principal axes of each view's points, longest first; a rotation.
+    extent : (V, 3) array
+        Rms extents along them, normalised.
+    pixel_centre : (2,) array
+    pixel_scale : float
+        S1 [px].
+    """
+
+    names: tuple[str, ...]
+    order: NDArray[np.intp] | None
+    index: NDArray[np.intp]
+    counts: NDArray[np.intp]
+    first: NDArray[np.intp]
+    distinct: NDArray[np.intp]
+    local: Array
+    pixels: Array
+    weights: Array
+    across: Array | None
+    whitening: Array | None
+    centre: Array
+    scale: Array
+    basis: Array
+    extent: Array
+    pixel_centre: Array
+    pixel_scale: float
+    along: float = LEAST
+
+    @property
+    def n_views(self) -> int:
+        """Number of views."""
+        return len(self.names)
+
+    @cached_property
+    def equations(self) -> Array:
+        """(V,) equations that each view's points give."""
+        return np.asarray(np.add.reduceat(equations(self.across, len(self.index), self.along), self.first))
+
+    @property
+    def n_equations(self) -> float:
+        """Equations that all points give."""
+        return float(self.equations.sum())
+
+    @property
+    def n_distinct_equations(self) -> float:
+        """Equations that different points give; a point given twice is one."""
+        return float(np.minimum(2 * self.distinct, self.equations).sum())
+
+    @property
+    def exactly_flat(self) -> NDArray[np.bool_]:
+        """(V,) whether the view's points lie in one plane."""
+        return np.asarray(self.extent[:, 2] <= _EXACTLY_FLAT * self.extent[:, 0])
+
+    @property
+    def nearly_flat(self) -> NDArray[np.bool_]:
+        """(V,) whether they nearly do."""
+        return np.asarray(self.extent[:, 2] <= _NEARLY_FLAT * self.extent[:, 0])
+
+    @property
+    def S1(self) -> Array:
+        """(3, 3) normalised to real pixels, eq. (12)."""
+        s, (u, v) = self.pixel_scale, self.pixel_centre
+        return np.array([[s, 0.0, u], [0.0, s, v], [0.0, 0.0, 1.0]])
+
+    def S2(self, view: int) -> Array:
+        """(4, 4) real to normalised world coordinates of a view, eq. (12)."""
+        S2 = np.eye(4) / self.scale[view]
+        S2[:3, 3] = -self.centre[view] / self.scale[view]
+        S2[3, 3] = 1.0
+        return S2
+
+    def subset(self, views: NDArray[np.intp]) -> Views:
+        """Only these views, normalised as before."""
+        rows = np.concatenate([np.arange(self.first[v], self.first[v] + self.counts[v]) for v in views])
+        counts = self.counts[views]
+        return replace(
+            self,
+            names=tuple(self.names[v] for v in views),
+            order=None,
+            index=np.repeat(np.arange(len(views)), counts),
+            counts=counts,
+            first=np.cumsum(counts) - counts,
+            distinct=self.distinct[views],
+            local=self.local[rows],
+            pixels=self.pixels[rows],
+            weights=self.weights[rows],
+            across=None if self.across is None else self.across[rows],
+            whitening=None if self.whitening is None else self.whitening[rows],
+            centre=self.centre[views],
+            scale=self.scale[views],
+            basis=self.basis[views],
+            extent=self.extent[views],
+        )
+
+    @cached_property
+    def batches(self) -> PointBatches:
+        """All points, laid out for the last step."""
+        return batches_of(self.local, self.pixels, self.whitening, self.index, self.n_views)
+
+    def patterns(
+        self, views: NDArray[np.intp], flat: bool, most: int, rng: np.random.Generator | None = None
+    ) -> Patterns:
+        """Patterns of some views' networks, at most `most` of each.
+
+        Fewer than there are: one drawn from each of `most` equal stretches of the view's rows, at
+        random or, without a generator, the middle one. Fewer points than the longest view: padded
+        with weight 0.
+        """
+        n = self.counts[views]
+        width = min(int(n.max()), most)
+        slot = np.arange(width)
+        inside = 0.5 if rng is None else rng.random((len(views), width))
+        stretch = np.maximum(n / width, 1.0)[:, None]
+        rank = np.minimum((slot + inside * (stretch > 1)) * stretch, n[:, None] - 1).astype(np.intp)
+        rows = self.first[views][:, None] + rank
+        local = self.local[rows]
+        if flat:
+            local = (local @ self.basis[views])[:, :, :2]
+        ones = np.ones((*rows.shape, 1))
+        weights = np.where(slot < n[:, None], self.weights[rows], 0.0)
+        return Patterns(
+            np.concatenate([local, ones], axis=2), np.concatenate([self.pixels[rows], ones], axis=2), weights
+        )
+
+
+def arrange(points: Correspondences) -> Views:
+    """Sort points by view and normalise them.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        All pixels coincide.
+    """
+    index, V = points.view_index, points.n_views
+    world, pixels, covariance, across = points.world, points.pixels, points.covariance, points.across
+    order = None
+    if np.any(index[1:] < index[:-1]):
+        order = np.argsort(index, kind="stable")
+        index, world, pixels = index[order], world[order], pixels[order]
+        covariance = None if covariance is None else covariance[order]
+        across = None if across is None else across[order]
+    counts = np.bincount(index, minlength=V)
+    first = np.cumsum(counts) - counts
+    centre = np.add.reduceat(world, first) / counts[:, None]
+    local = world - np.repeat(centre, counts, axis=0)
+    scale = np.maximum.reduceat(np.abs(local).max(axis=1), first)
+    scale = np.where(scale > 0, scale, 1.0)
+    local /= np.repeat(scale, counts)[:, None]
+    pixel_centre, pixel_scale = similarity(pixels)
+    if np.ptp(pixels, axis=0).max() == 0 and len(pixels) > 1:
+        raise DegenerateGeometryError(f"{points.source}: all pixels u,v are the same; check the columns")
+    basis, extent = _principal_axes(local, counts, first)
+    weights, whitening = noise_model(covariance, across)
+    if weights is None:
+        weights = np.ones(len(index))
+    return Views(
+        points.view_names, order, index, counts, first, _distinct(local, index, V), local,
+        (pixels - pixel_centre) / pixel_scale, weights, across, whitening, centre, scale, basis,
+        extent, pixel_centre, pixel_scale,
+    )  # fmt: skip
+
+
+def _principal_axes(local: Array, counts: NDArray[np.intp], first: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Principal axes (V, 3, 3) and rms extents (V, 3) of each view's centred points."""
+    scatter = np.empty((len(counts), 3, 3))
+    columns = np.ascontiguousarray(local.T)
+    for a, b in zip(*np.triu_indices(3), strict=True):
+        scatter[:, a, b] = scatter[:, b, a] = np.add.reduceat(columns[a] * columns[b], first)
+    values, basis = np.linalg.eigh(scatter / counts[:, None, None])
+    basis = basis[:, :, ::-1] * np.where(np.linalg.det(basis[:, :, ::-1]) < 0, -1.0, 1.0)[:, None, None]
+    # Rounding leaves 1e-16 in an eigenvalue that is 0, so 1e-8 in the extent: enough to tell a plane.
+    return basis, np.sqrt(np.maximum(values[:, ::-1], 0.0))
+
+
+def _distinct(local: Array, index: NDArray[np.intp], n_views: int) -> NDArray[np.intp]:
+    """Number of different world points of each view.
+
+    A fixed irrational combination of the coordinates tells points apart; one sort does all views.
+    """
+    key = local @ np.array([0.4142135623730951, 0.2360679774997898, 0.1231056256176606])
+    key = np.sort(index + 0.5 * (np.round(key, 11) + 0.8) / 1.6)
+    view = np.floor(key).astype(np.intp)
+    fresh = np.concatenate([[True], np.diff(key) > 1e-13 * n_views])
+    return np.bincount(view[fresh], minlength=n_views)
+
+
+def noise_model(
+    covariance: Array | None, across: Array | None = None, along: float = LEAST
+) -> tuple[Array | None, Array | None]:
+    """Scalar weights (N,) of mean 1 and whitening factors (N, 3) of mean square 1 for each equation.
+
+    Parameters
+    ----------
+    covariance : (N, 3) array or None
+        suu, suv, svv; None: all the same.
+    across : (N, 2) array, optional
+        Direction in which each point was measured; see `directions`.
+    along : float
+        Their say in the other direction.
+    """
+    if covariance is None:
+        if across is None:
+            return None, None
+        covariance = np.tile([1.0, 0.0, 1.0], (len(across), 1))
+    suu, suv, svv = loosened(covariance, across, along).T
+    # Inverse covariance = U^T U with U upper triangular.
+    v11 = 1.0 / np.sqrt(svv)
+    u00 = 1.0 / np.sqrt(suu - suv**2 / svv)
+    u01 = -u00 * suv / svv
+    factors = np.column_stack([u00, u01, v11])
+    of_point, count = (factors**2).sum(axis=1), equations(across, len(factors), along)
+    information = of_point / count
+    return information / information.mean(), factors / np.sqrt(of_point.sum() / count.sum())

@@ -1,0 +1,1 @@
+"""The camera: its intrinsic matrix and pose, the lens's distortion, and where that is monotonic."""

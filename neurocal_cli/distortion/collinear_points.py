@@ -1,0 +1,244 @@
+"""Straight lines among known points: which points of a view are collinear in X, Y, Z.
+
+Collinear points are seen on a straight line by any pinhole camera, wherever it stands. Nothing is
+known of the target but its coordinates: rows, columns and diagonals of boards are found as any other
+line is, through pairs of points that have the direction and the offset of their line in common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.measured_directions import unit
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+
+__all__ = ["FEWEST_ON_LINE", "LinesSeen", "find_lines"]
+
+FEWEST_ON_LINE = 4
+_FEWEST_OF_EDGES = 3  # of points that are seen across their edges, for which only lines along these count
+
+# Points off a line by this share of the target's size are on it: 2 micrometres of a 200 mm board.
+_TOLERANCE = 1e-5
+_LINES_A_POINT = 4  # rows, columns and diagonals of a board
+_OF_EDGES = 8  # and more where only those along the edges count
+_ALONG = 0.25  # sine of the angle between an edge and a line that it lies on
+_ALL_PAIRS = 700  # points of a target whose pairs are all looked at
+_MOST_PAIRS = 500_000  # of larger targets: pairs of some points with all others
+_MOST_PLACES = 200_000  # places on lines; more tell nothing that these do not
+
+Index = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class LinesSeen:
+    """Lines of the target in the views that show them.
+
+    Attributes
+    ----------
+    row : (M,) int array
+        Row of the points at each place on a line; a row has as many places as lines through it.
+    first : (L,) int array
+        First place of each line.
+    """
+
+    row: Index
+    first: Index
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    @property
+    def counts(self) -> Index:
+        """(L,) points of each line."""
+        return np.diff(self.first, append=len(self.row))
+
+    @property
+    def line(self) -> Index:
+        """(M,) line of each place."""
+        return np.repeat(np.arange(len(self.first)), self.counts)
+
+
+def find_lines(points: Correspondences) -> LinesSeen:
+    """Find the lines of at least `FEWEST_ON_LINE` known points in each view, or of three along edges.
+
+    Each point is used on the four longest lines through it, so rows, columns and diagonals of a board;
+    one that was measured across an edge, on lines along that edge.
+    """
+    ids, target = _distinct(points.world)
+    fewest, most = FEWEST_ON_LINE, _LINES_A_POINT
+    if points.across is not None:
+        fewest, most = _FEWEST_OF_EDGES, _OF_EDGES
+    line, member = _longest(*_lines_of(target, fewest), len(target), most)
+    # Each line in each view: join the rows with the lines through their points.
+    order = np.argsort(member, kind="stable")
+    line, through = line[order], np.bincount(member, minlength=len(target))
+    begins = np.cumsum(through) - through
+    copies = through[ids]
+    row = np.repeat(np.arange(len(ids)), copies)
+    rank = np.arange(len(row)) - np.repeat(np.cumsum(copies) - copies, copies)
+    label = line[np.repeat(begins[ids], copies) + rank].astype(np.int64)
+    label = label * points.n_views + points.view_index[row]
+    order = np.argsort(label, kind="stable")
+    row, first = row[order], _run_starts(label[order])
+    return _thinned(*_along_edges(points, *_enough(row, first, fewest)))
+
+
+def _along_edges(points: Correspondences, row: Index, first: Index) -> tuple[Index, Index]:
+    """Drop lines that points were not measured across: where along its edge one lies is not its own word."""
+    if points.across is None or not first.size:
+        return row, first
+    counts = np.diff(first, append=len(row))
+    pixels, line = points.pixels, np.repeat(np.arange(len(first)), counts)
+    chord = pixels[row[first + counts - 1]] - pixels[row[first]]
+    order = np.lexsort(((pixels[row] * chord[line]).sum(axis=1), line))
+    row = row[order]
+    # The line runs from the place before each to the one after it: a lens may bend it much in all.
+    place = np.arange(len(row))
+    before = np.maximum(place - 1, first[line])
+    after = np.minimum(place + 1, (first + counts - 1)[line])
+    n = unit(points.across)[row]
+    slant = np.abs((n * unit(pixels[row[after]] - pixels[row[before]])).sum(axis=1))
+    keep = ~np.logical_or.reduceat(slant > _ALONG, first)
+    return row[np.repeat(keep, counts)], np.cumsum(counts[keep]) - counts[keep]
+
+
+def _run_starts(sorted_labels: NDArray[np.int64]) -> Index:
+    if not sorted_labels.size:
+        return np.zeros(0, dtype=np.intp)
+    return np.flatnonzero(np.concatenate([[True], sorted_labels[1:] != sorted_labels[:-1]]))
+
+
+def _enough(row: Index, first: Index, fewest: int) -> tuple[Index, Index]:
+    """Drop lines with too few points."""
+    counts = np.diff(first, append=len(row))
+    keep = counts >= fewest
+    kept = counts[keep]
+    return row[np.repeat(keep, counts)], np.cumsum(kept) - kept
+
+
+def _thinned(row: Index, first: Index) -> LinesSeen:
+    """Some of the lines, evenly chosen, where there are very many."""
+    every = -(-len(row) // _MOST_PLACES)
+    if every > 1:
+        counts = np.diff(first, append=len(row))
+        keep = np.arange(len(first)) % every == 0
+        row, kept = row[np.repeat(keep, counts)], counts[keep]
+        first = np.cumsum(kept) - kept
+    return LinesSeen(row, first)
+
+
+def _distinct(world: Array) -> tuple[Index, Array]:
+    """Which distinct point each row is, and these points centred and scaled to a size of about 1."""
+    centre = world.mean(axis=0)
+    size = float(np.ptp(world, axis=0).max()) or 1.0
+    local = (world - centre) / size
+    ids = _clusters(local @ np.array([0.4142135623730951, 0.2360679774997898, 0.1231056256176606]), 1e-11)
+    _, first = np.unique(ids, return_index=True)
+    return ids, local[first]
+
+
+def _clusters(values: Array, gap: float) -> Index:
+    """Number groups of values that are nearer than a gap to the next one."""
+    order = np.argsort(values, kind="stable")
+    labels = np.empty(len(values), dtype=np.intp)
+    labels[order] = np.cumsum(np.diff(values[order], prepend=values[order[:1]]) > gap)
+    return labels
+
+
+def _lines_of(target: Array, fewest: int) -> tuple[Index, Index]:
+    """Line and point of each place on the lines of a target."""
+    n = len(target)
+    if n <= _ALL_PAIRS:
+        a, b = np.triu_indices(n, 1)
+        line, member, _ = _through_pairs(target, a, b, fewest)
+        return line, member
+    anchors = np.linspace(0, n - 1, int(np.clip(_MOST_PAIRS // n, 4, 64))).astype(np.intp)
+    a, b = np.repeat(anchors, n), np.tile(np.arange(n), len(anchors))
+    line, member, directions = _through_pairs(target, a[a != b], b[a != b], fewest)
+    common = _commonest(directions, np.bincount(line), int(np.clip(10**7 // n, 6, 24)))
+    return _parallels(target, common, fewest)
+
+
+def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Index, Index, Array]:
+    """Lines on which some pairs of points agree: line and point of each place, direction of each line."""
+    along = target[b] - target[a]
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    along *= _sign(along)[:, None]
+    offset = target[a] - (target[a] * along).sum(axis=1)[:, None] * along
+    by_direction = _clusters(along @ np.array([0.618, 0.4142, 0.2361]), _TOLERANCE)
+    place = offset @ np.array([0.7321, 0.2361, 0.6458])
+    # Gaps in the offset count only among pairs of one direction.
+    labels = _clusters(4.0 * by_direction + place, _TOLERANCE)
+    counts = np.bincount(labels)
+    common = counts[labels] >= fewest - 1
+    labels, a, b, along = labels[common], a[common], b[common], along[common]
+    key = np.unique(np.concatenate([labels, labels]) * len(target) + np.concatenate([a, b]))
+    line, member = np.divmod(key, len(target))
+    return _checked(line, member, target, labels, along, fewest)
+
+
+def _sign(along: Array) -> Array:
+    """Sign that makes the first component that is not 0 positive."""
+    x, y, z = along.T
+    small = 1e-3
+    leading = np.where(np.abs(x) > small, x, np.where(np.abs(y) > small, y, z))
+    return np.where(leading < 0, -1.0, 1.0)
+
+
+def _checked(
+    line: Index, member: Index, target: Array, labels: Index, along: Array, fewest: int
+) -> tuple[Index, Index, Array]:
+    """Keep the lines with enough points, if these are indeed collinear; number them anew."""
+    names, first, counts = np.unique(line, return_index=True, return_counts=True)
+    given, where = np.unique(labels, return_index=True)
+    direction = along[where[np.searchsorted(given, names)]]
+    index = np.repeat(np.arange(len(names)), counts)
+    start = target[member[first]]
+    off = target[member] - start[index]
+    off -= (off * direction[index]).sum(axis=1)[:, None] * direction[index]
+    astray = np.linalg.norm(off, axis=1) > 3 * _TOLERANCE
+    good = (counts >= fewest) & (np.bincount(index, astray, len(names)) == 0)
+    number = np.cumsum(good) - 1
+    keep = good[index]
+    return number[index[keep]], member[keep], direction[good]
+
+
+def _commonest(directions: Array, members: Index, most: int) -> Array:
+    """Directions of the lines with the most points."""
+    labels = _clusters(directions @ np.array([0.618, 0.4142, 0.2361]), _TOLERANCE)
+    _, first = np.unique(labels, return_index=True)
+    weight = np.bincount(labels, members)
+    return directions[first[np.argsort(-weight, kind="stable")[:most]]]
+
+
+def _parallels(target: Array, directions: Array, fewest: int) -> tuple[Index, Index]:
+    """All lines along some directions."""
+    lines, members, total = [], [], 0
+    for direction in directions:
+        offset = target - (target @ direction)[:, None] * direction
+        labels = _clusters(offset @ np.array([0.7321, 0.2361, 0.6458]), _TOLERANCE)
+        order = np.argsort(labels, kind="stable")
+        along = np.broadcast_to(direction, (len(target), 3))
+        line, member, kept = _checked(labels[order], order, target, labels, along, fewest)
+        lines.append(line + total)
+        members.append(member)
+        total += len(kept)
+    none = np.zeros(0, dtype=np.intp)
+    return np.concatenate([none, *lines]), np.concatenate([none, *members])
+
+
+def _longest(line: Index, member: Index, n: int, most: int) -> tuple[Index, Index]:
+    """Keep the lines that are among those `most` with the most points for at least half of their points."""
+    if not line.size:
+        return line, member
+    counts = np.bincount(line)
+    order = np.lexsort((line, -counts[line], member))
+    through = np.bincount(member, minlength=n)
+    rank = np.empty(len(line), dtype=np.intp)
+    rank[order] = np.arange(len(line)) - np.repeat(np.cumsum(through) - through, through)
+    chosen = np.bincount(line, rank < most) >= 0.5 * counts
+    return line[chosen[line]], member[chosen[line]]

@@ -1,0 +1,138 @@
+"""Corrected images: pixels taken from where the lens put them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.problem import KnownCamera
+from neurocal_cli.distortion.undistortion import Undistortion, undistortion
+from neurocal_cli.errors import InputError
+
+__all__ = ["INTERPOLATIONS", "Remapping", "undistort_image"]
+
+INTERPOLATIONS = {
+    "nearest": cv2.INTER_NEAREST,
+    "linear": cv2.INTER_LINEAR,
+    "cubic": cv2.INTER_CUBIC,
+    "lanczos": cv2.INTER_LANCZOS4,
+}
+
+_AT_ONCE = 1 << 20  # pixels whose sources are computed together
+_KEPT = 1 << 25  # pixels of images whose sources are kept for the next image, 8 bytes each
+_LONGEST = 32767  # px; OpenCV's remap counts a side in 16 bits
+_NOWHERE = -1e6  # a source outside of any image, so black
+
+Sources = tuple[slice, NDArray[np.float32], NDArray[np.float32]]
+
+
+class Remapping:
+    """Takes the lens off images of one size.
+
+    Parameters
+    ----------
+    step : Undistortion
+    size : (width, height) [px]
+    interpolation : str
+        One of `INTERPOLATIONS`.
+
+    Raises
+    ------
+    InputError
+        A side too long for OpenCV.
+    """
+
+    def __init__(self, step: Undistortion, size: tuple[int, int], interpolation: str = "cubic") -> None:
+        if max(size) > _LONGEST:
+            raise InputError(
+                f"images of {size[0]} x {size[1]} px cannot be corrected: a side has at most {_LONGEST} px; "
+                "cut them into parts"
+            )
+        self.step, self.size = step, size
+        self._how = INTERPOLATIONS[interpolation]
+        self._kept: list[Sources] = []
+
+    def __call__(
+        self, image: NDArray[np.uint8] | NDArray[np.uint16]
+    ) -> NDArray[np.uint8] | NDArray[np.uint16]:
+        """Corrected image of the same size and kind; black where nothing was seen.
+
+        Parameters
+        ----------
+        image : (height, width) or (height, width, channels) uint8 or uint16 array
+
+        Raises
+        ------
+        InputError
+            An image of another size.
+        """
+        height, width = image.shape[:2]
+        if (width, height) != self.size:
+            raise InputError(
+                f"has {width} x {height} px, the camera's images have {self.size[0]} x {self.size[1]}; give "
+                "images as the camera took them"
+            )
+        whole: NDArray[Any] = np.ascontiguousarray(image)
+        corrected = np.empty_like(image, order="C")
+        for rows, u, v in self._sources():
+            part = cv2.remap(whole, u, v, self._how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+            corrected[rows] = part.reshape(corrected[rows].shape)
+        return corrected
+
+    def _sources(self) -> Iterator[Sources]:
+        """Places in the image as seen, block by block of rows."""
+        if self._kept:
+            yield from self._kept
+            return
+        width, height = self.size
+        rows = max(1, _AT_ONCE // width)
+        keep = width * height <= _KEPT
+        blocks = []
+        for start in range(0, height, rows):
+            part = slice(start, min(start + rows, height))
+            u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(part.start, part.stop, dtype=float))
+            places = [
+                np.nan_to_num(s, nan=_NOWHERE).clip(_NOWHERE, -_NOWHERE) for s in self.step.sources(u, v)
+            ]
+            block = (part, places[0].astype(np.float32), places[1].astype(np.float32))
+            if keep:
+                blocks.append(block)
+            yield block
+        self._kept = blocks
+
+
+def undistort_image(
+    image: NDArray[np.uint8] | NDArray[np.uint16],
+    camera: KnownCamera,
+    alpha: float | None = None,
+    interpolation: str = "cubic",
+) -> NDArray[np.uint8] | NDArray[np.uint16]:
+    """Image as a camera without the lens would have seen it.
+
+    Parameters
+    ----------
+    image : (height, width) or (height, width, channels) uint8 or uint16 array
+    camera : Calibration, or a camera file
+    alpha : float, optional
+        See `undistortion.new_camera`; None keeps the camera's own matrix.
+    interpolation : {"nearest", "linear", "cubic", "lanczos"}
+
+    Returns
+    -------
+    corrected : array like the image
+        Black where nothing was seen.
+
+    Raises
+    ------
+    InputError
+        An image of another size than the camera's.
+    """
+    if interpolation not in INTERPOLATIONS:
+        raise InputError(f"interpolation must be one of {', '.join(INTERPOLATIONS)}, not {interpolation!r}")
+    height, width = image.shape[:2]
+    size = getattr(camera, "image_size", None) or (width, height)
+    return Remapping(undistortion(camera, alpha, size), size, interpolation)(image)

@@ -1,0 +1,58 @@
+"""Stage 2: the trained products become cameras, one W for all views and a pose for each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.job import Job
+from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.orthogonality import pose_from_product, shared_intrinsics
+from neurocal_cli.initialisation.view_networks import Group
+
+__all__ = ["cameras_from_products", "candidate_intrinsics"]
+
+_MOST_CANDIDATES = 4
+_NEAREST = 1.05  # depth of the nearest point's side, in units of what puts it into the focal plane
+
+
+def candidate_intrinsics(job: Job, groups: Sequence[Group]) -> Array:
+    """Entries of W that the orthogonality conditions of all views agree on, best first; (C, 1, 5)."""
+    flat, solid = np.zeros((0, 3, 2)), np.zeros((0, 3, 3))
+    for group in groups:
+        if group.flat:
+            flat = group.product[:, :, :2]
+        else:
+            solid = group.product[:, :, :3]
+    shared = shared_intrinsics(solid, flat, job.entries, job.known.free, job.rng)
+    return shared.entries[:_MOST_CANDIDATES, None]
+
+
+def cameras_from_products(job: Job, groups: Sequence[Group], entries: Array) -> CameraState:
+    """Poses of the trained views, given W's entries (1, 5); all points in front.
+
+    Views that are in no group get the identity.
+    """
+    V = job.views.n_views
+    R, t = np.tile(np.eye(3), (V, 1, 1)), np.tile([0.0, 0.0, 2.0], (V, 1))
+    W = intrinsic_matrix(entries[0])
+    for group in groups:
+        rotation, t[group.views] = pose_from_product(W, group.product)
+        if group.flat:
+            rotation = rotation @ np.swapaxes(job.views.basis[group.views], 1, 2)
+        R[group.views] = rotation
+    return CameraState(entries, R, _in_front(job, R, t))
+
+
+def _in_front(job: Job, R: Array, t: Array) -> Array:
+    """Push views that an inexact W puts partly behind the camera out along their ray."""
+    views = job.views
+    # The local coordinates are at most 1: a quick bound that nearly always decides.
+    if (t[:, 2] > np.abs(R[:, 2]).sum(axis=1)).all():
+        return t
+    depth = (views.local * np.repeat(R[:, 2], views.counts, axis=0)).sum(axis=1)
+    lowest = np.minimum.reduceat(depth, views.first)
+    return np.asarray(t * (np.maximum(t[:, 2], -_NEAREST * lowest) / t[:, 2])[:, None])

@@ -1,0 +1,219 @@
+"""Which points each view's network can agree on: robust training from random weights.
+
+A network that learns all points at once is drawn away by wrong ones. Here every start sees a few
+points only, drawn at random, and is judged by the median error of all of them (Rousseeuw 1984): a
+start whose points are all right has a small one, as long as most of the points are right. The best
+starts then learn from all points near them, a few times over, until two starts agree on the same
+points. What is far from their network is grossly wrong. A view whose points no network brings
+together is wrong as a whole.
+
+A lens that bends makes the errors of all points larger, and with them what counts as far. What was
+left out here by mistake comes back when the camera is known (`rejection`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+from neurocal_cli.network import Patterns, random_weights
+from neurocal_cli.training import Task
+from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
+
+__all__ = ["Consensus", "find_consensus"]
+
+# Of a flat and of a solid target: points that a start sees, and fewest points that can outvote others.
+_SEEN = {True: 5, False: 7}
+_FEWEST = {True: 8, False: 11}
+_STARTS, _ROUNDS = 24, 5
+_FINALISTS = 4  # starts of each round that learn on
+_PASSES = 6
+_FAR = 6.0  # standard deviations
+_MOST_SEEN = 512  # points of a view that take part in the search
+_AGREED = 0.97  # share of points on which two starts have to agree
+# A view is wrong as a whole when fewer points than this share agree, or only to this share of its size.
+_MAJORITY, _TIGHT = 0.5, 0.05
+_LOOSE, _LOOSER = 0.01, 10.0  # or to this share, and so many times worse than most views
+_NETWORKS_AT_ONCE = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """What the views' networks agree on, sorted as the views are.
+
+    Attributes
+    ----------
+    kept : (N,) bool array
+        Points near their view's network; all points of views that have too few to tell.
+    hopeless : (V,) bool array
+        Views whose points agree on nothing.
+    """
+
+    kept: NDArray[np.bool_]
+    hopeless: NDArray[np.bool_]
+
+
+def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generator) -> Consensus:
+    """Look for the points of each view that one network explains.
+
+    Parameters
+    ----------
+    views : Views
+    flat : (V,) bool array
+        Which views' networks take their target as a plane.
+    rng : numpy.random.Generator
+    """
+    kept = np.ones(len(views.index), dtype=bool)
+    hopeless = np.zeros(views.n_views, dtype=bool)
+    loose = np.full(views.n_views, np.nan)
+    for kind in (True, False):
+        members = np.flatnonzero((flat == kind) & (views.distinct >= _FEWEST[kind]))
+        at_once = max(1, _NETWORKS_AT_ONCE // _STARTS)
+        for first in range(0, len(members), at_once):
+            some = members[first : first + at_once]
+            search = _Search(views, some, kind, rng)
+            search.run()
+            hopeless[some] = search.judge(kept)
+            # A view all of whose pixels are one tells nothing.
+            loose[some] = np.divide(
+                search.scale, search.spread, np.full(len(some), np.inf), where=search.spread > 0
+            )
+    # A lens may loosen all views, but one view far more than the others is another matter.
+    told = loose[~np.isnan(loose)]
+    if len(told) > 2:
+        with np.errstate(invalid="ignore"):
+            hopeless |= (loose > _LOOSE) & (loose > _LOOSER * np.median(told))
+    return Consensus(kept, hopeless)
+
+
+class _Search:
+    """Starts on a few points each, for K views of one kind."""
+
+    def __init__(self, views: Views, members: NDArray[np.intp], flat: bool, rng: np.random.Generator) -> None:
+        self.views, self.members, self.flat, self.rng = views, members, flat, rng
+        self.patterns = views.patterns(members, flat, _MOST_SEEN, rng)
+        self.real = self.patterns.weights > 0
+        K, n = self.real.shape
+        self.product = np.zeros((K, 3, self.patterns.n_inputs))
+        self.scale = np.full(K, np.inf)
+        self.near = np.zeros((K, n), dtype=bool)
+        self.agreed = np.zeros(K, dtype=np.int64)
+        seen = np.where(self.real[..., None], self.patterns.targets[..., :2], np.nan)
+        self.spread = np.sqrt(np.nanvar(seen, axis=1).sum(axis=1))
+
+    def run(self) -> None:
+        open_views = np.arange(len(self.members))
+        for _ in range(_ROUNDS):
+            if not open_views.size:
+                return
+            self._round(open_views)
+            open_views = open_views[self.agreed[open_views] < 2]
+
+    def _round(self, which: NDArray[np.intp]) -> None:
+        product = self._few_points(which)  # (K', S, 3, I)
+        scale = self._scale(self._errors(which, product), self.real[which][:, None])
+        order = np.argsort(scale, axis=1, kind="stable")[:, :_FINALISTS]
+        product = np.take_along_axis(product, order[..., None, None], axis=1)
+        product, scale, near = self._learn_on(which, product)
+        for start in range(product.shape[1]):
+            self._enter(which, product[:, start], scale[:, start], near[:, start])
+
+    def _few_points(self, which: NDArray[np.intp]) -> Array:
+        """Train starts from random weights on a few points each."""
+        real = self.real[which]
+        seen = _SEEN[self.flat]
+        key = self.rng.random((len(which), _STARTS, real.shape[1])) + 2.0 * ~real[:, None]
+        slots = np.argpartition(key, seen, axis=2)[..., :seen].reshape(len(which), -1)
+        chosen = Patterns(
+            np.take_along_axis(self.patterns.inputs[which], slots[..., None], axis=1),
+            np.take_along_axis(self.patterns.targets[which], slots[..., None], axis=1),
+            np.ones(slots.shape),
+        )
+        few = Patterns(*(a.reshape(len(which) * _STARTS, seen, *a.shape[2:]) for a in _arrays(chosen)))
+        W, V = random_weights(self.rng, len(few.weights), few.n_inputs)
+        product = _trained(few, W @ V, LMOptions(tolerance=1e-4, max_iterations=40))
+        return product.reshape(len(which), _STARTS, 3, few.n_inputs)
+
+    def _learn_on(self, which: NDArray[np.intp], product: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Learn from all points near each network, a few times over."""
+        K, S = product.shape[:2]
+        view = np.repeat(which, S)
+        patterns = self.patterns.take(view)
+        options = LMOptions(stiffness=(0.0,), tolerance=1e-3, damping=1e-6, max_iterations=15)
+        near = np.zeros((K, S, patterns.weights.shape[1]), dtype=bool)
+        real = self.real[which][:, None]
+        for _ in range(_PASSES):
+            error = self._errors(which, product)
+            scale = self._scale(error, real)
+            before, near = near, real & (error < _FAR * scale[..., None])
+            if (near == before).all():
+                break
+            weights = np.where(near.reshape(K * S, -1), patterns.weights, 0.0)
+            flat = product.reshape(K * S, 3, -1)
+            product = _trained(replace(patterns, weights=weights), flat, options).reshape(product.shape)
+        error = self._errors(which, product)
+        scale = self._scale(error, real)
+        return product, scale, real & (error < _FAR * scale[..., None])
+
+    def _enter(self, which: NDArray[np.intp], product: Array, scale: Array, near: NDArray[np.bool_]) -> None:
+        """Enter one start of each view: the one with the lowest median stays."""
+        same = ((near == self.near[which]) | ~self.real[which]).sum(1) >= _AGREED * near.shape[1]
+        # Starts that lost their way may agree too: that everything is near.
+        same &= self.scale[which] < _TIGHT * self.spread[which]
+        better = scale < self.scale[which]
+        self.agreed[which] = np.where(same, self.agreed[which] + 1, np.where(better, 1, self.agreed[which]))
+        won = which[better]
+        self.product[won], self.scale[won], self.near[won] = product[better], scale[better], near[better]
+
+    def _errors(self, which: NDArray[np.intp], product: Array) -> Array:
+        """Distance between each point and where the networks put it; (K', S, n)."""
+        o = self.patterns.inputs[which][:, None] @ np.swapaxes(product, -1, -2)
+        with np.errstate(all="ignore"):
+            error = np.hypot(
+                *np.moveaxis(o[..., :2] / o[..., 2:] - self.patterns.targets[which][:, None, :, :2], -1, 0)
+            )
+        return np.where(np.isfinite(error), error, 1e9)
+
+    def _scale(self, error: Array, real: NDArray[np.bool_]) -> Array:
+        """Standard deviation by the median; of two coordinates' length it is 1.18."""
+        return _median(error, np.broadcast_to(real, error.shape)) / 1.1774 + 1e-9
+
+    def judge(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Enter what is near into `kept`; the views that agree on nothing."""
+        hopeless = np.zeros(len(self.members), dtype=bool)
+        for k, view in enumerate(self.members):
+            rows = slice(self.views.first[view], self.views.first[view] + self.views.counts[view])
+            local = self.views.local[rows]
+            if self.flat:
+                local = (local @ self.views.basis[view])[:, :2]
+            o = np.column_stack([local, np.ones(len(local))]) @ self.product[k].T
+            with np.errstate(all="ignore"):
+                error = np.hypot(*(o[:, :2] / o[:, 2:] - self.views.pixels[rows]).T)
+            near = error < _FAR * self.scale[k]
+            extent = np.sqrt(self.views.pixels[rows][near].var(axis=0).sum()) if near.any() else 0.0
+            hopeless[k] = near.mean() <= _MAJORITY or self.scale[k] > _TIGHT * extent
+            kept[rows] = near
+        return hopeless
+
+
+def _arrays(patterns: Patterns) -> tuple[Array, Array, Array]:
+    return patterns.inputs, patterns.targets, patterns.weights
+
+
+def _trained(patterns: Patterns, product: Array, options: LMOptions) -> Array:
+    """Train the products themselves, W being the identity."""
+    n, inputs = len(product), product.shape[2]
+    W = np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
+    free = np.ones((3, 3), dtype=bool), np.ones((3, inputs), dtype=bool)
+    return train_lm(Task(patterns, W, product, *free), options).product
+
+
+def _median(values: Array, real: NDArray[np.bool_]) -> Array:
+    """Median over the last axis of the real entries."""
+    ordered = np.sort(np.where(real, values, np.inf), axis=-1)
+    middle = (real.sum(axis=-1) - 1) // 2
+    return np.asarray(np.take_along_axis(ordered, middle[..., None], axis=-1)[..., 0])

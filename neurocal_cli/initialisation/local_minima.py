@@ -1,0 +1,153 @@
+"""Whether a minimum is the right one, and what else it could be.
+
+A free network has more freedom than a camera, so its pixel error bounds from below what the camera
+can reach. A camera that comes as near to the bound as noise allows is the right one. Otherwise its
+rivals are tried: other intrinsics, the mirrored pose of a flat board, random cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
+from neurocal_cli.bundle_adjustment.job import Job
+from neurocal_cli.bundle_adjustment.observability import parameter_count
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.initialisation.view_networks import Group
+
+__all__ = [
+    "better_by_view",
+    "reaches_bound",
+    "refuse_mirrored",
+    "short_of_bound",
+    "try_mirrored",
+    "try_start",
+]
+
+_TRIAL_STEPS = 15  # a rival must be ahead after so many
+# A mirrored pose is a rival while its rms error is below so many times the other's: at first, and
+# after a few steps.
+_FLIP_RANGE, _FLIP_STEPS, _FLIP_CLOSE = 10.0, 3, 2.0
+# Data are taken for mirrored when a mirrored camera's rms error is so many times lower, and there
+# are enough points that chance does not do that.
+_MIRRORED_BETTER, _MIRRORED_POINTS = 3.0, 12
+_FREEDOM = {True: 8, False: 11}  # of a flat and of a solid view's product, up to scale
+
+
+def reaches_bound(job: Job, adjusted: Adjusted, groups: Sequence[Group]) -> bool:
+    """Whether the camera fits as well as the free networks, up to what noise explains."""
+    bound = sum(float(g.bound.sum()) for g in groups)
+    freedom = sum(len(g.views) * _FREEDOM[g.flat] for g in groups)
+    conditions = freedom - parameter_count(job.known, job.views.n_views)
+    return bool(_explained(adjusted.cost.sum(), bound, conditions, job.views.n_equations - freedom))
+
+
+def short_of_bound(job: Job, adjusted: Adjusted, groups: Sequence[Group]) -> NDArray[np.bool_]:
+    """(V,) views of given intrinsics (type 3) whose pose does not fit as well as their network."""
+    short = np.zeros(job.views.n_views, dtype=bool)
+    for group in groups:
+        freedom = _FREEDOM[group.flat]
+        spare = job.views.equations[group.views] - freedom
+        short[group.views] = ~_explained(adjusted.cost[group.views], group.bound, freedom - 6, spare)
+    return short
+
+
+def _explained(cost: Array, bound: Array | float, conditions: int, spare: Array | float) -> NDArray[np.bool_]:
+    """Whether an excess over the bound is what `conditions` imposed on noise would cost.
+
+    The excess over the residual variance is chi-squared distributed; the limit is its mean and six
+    standard deviations.
+    """
+    limit = conditions + 6 * np.sqrt(2.0 * max(conditions, 1)) + 10
+    variance = np.where(np.greater(spare, 0), np.asarray(bound) / np.maximum(spare, 1), 0.0)
+    return np.asarray(cost <= bound * (1 + 1e-9) + 1e-20 + limit * variance)
+
+
+def refuse_mirrored(job: Job, adjusted: Adjusted, groups: Sequence[Group]) -> None:
+    """Refuse points in space that a free network fits well, but as a mirrored camera.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        X,Y,Z left-handed, two columns swapped, v upwards.
+    """
+    for group in groups:
+        if group.flat:
+            continue
+        # The normalised origin is the points' centroid: in front with P's right sign.
+        mirrored = np.linalg.det(group.product[:, :, :3]) * group.product[:, 2, 3] < 0
+        mirrored &= adjusted.cost[group.views] > _MIRRORED_BETTER**2 * group.bound + 1e-20
+        mirrored &= job.views.distinct[group.views] >= _MIRRORED_POINTS
+        if mirrored.any():
+            raise DegenerateGeometryError(
+                f"view {job.views.names[group.views[int(np.argmax(mirrored))]]!r}: only a mirrored camera "
+                "could see these points; check the axes of X,Y,Z (right-handed?) and of u,v (v downwards?)"
+            )
+
+
+def try_start(job: Job, best: Adjusted, state: CameraState) -> Adjusted:
+    """The better of a result and what another start leads to, given a few steps to show it."""
+    trial = job.adjust(state, _TRIAL_STEPS)
+    if trial.cost.sum() >= best.cost.sum():
+        return best
+    return trial if trial.converged else job.adjust(trial.state)
+
+
+def better_by_view(job: Job, one: Adjusted, two: Adjusted) -> Adjusted:
+    """View by view the better of two results; for views that are independent (type 3)."""
+    better = two.cost < one.cost
+    R = np.where(better[:, None, None], two.state.R, one.state.R)
+    t = np.where(better[:, None], two.state.t, one.state.t)
+    return job.adjust(replace(one.state, R=R, t=t))
+
+
+def try_mirrored(job: Job, adjusted: Adjusted) -> Adjusted:
+    """Far flat boards have a second pose, tilted the other way, that fits nearly as well."""
+    views, state = job.views, adjusted.state
+    flat = np.flatnonzero(views.nearly_flat)
+    if not flat.size:
+        return adjusted
+    R, t = state.R.copy(), state.t.copy()
+    R[flat] = _mirrored(R[flat], t[flat], views.basis[flat])
+    normal, in_front = normal_blocks(views.batches, replace(state, R=R, t=t))
+    near = in_front & (normal[:, -1, -1] < _FLIP_RANGE**2 * adjusted.cost + 1e-20)
+    rivals = np.flatnonzero(near & views.nearly_flat)
+    for steps in (_FLIP_STEPS, 200):
+        if not rivals.size:
+            return adjusted
+        posed = _pose_alone(job, replace(state, R=R[rivals], t=t[rivals]), rivals, steps)
+        R[rivals], t[rivals] = posed.state.R, posed.state.t
+        close = posed.cost < _FLIP_CLOSE**2 * adjusted.cost[rivals] + 1e-20
+        if steps == _FLIP_STEPS:
+            rivals = rivals[close]
+    better = posed.cost < adjusted.cost[rivals] * (1 - 1e-9)
+    if not better.any():
+        return adjusted
+    moved_R, moved_t = state.R.copy(), state.t.copy()
+    moved_R[rivals[better]], moved_t[rivals[better]] = R[rivals[better]], t[rivals[better]]
+    again = job.adjust(replace(state, R=moved_R, t=moved_t))
+    return again if again.cost.sum() < adjusted.cost.sum() else adjusted
+
+
+def _pose_alone(job: Job, state: CameraState, views: NDArray[np.intp], steps: int) -> Adjusted:
+    """Refine some views' poses with the intrinsics as they are."""
+    posed = adjust(
+        job.views.subset(views).batches, state, np.zeros(5 + len(state.k), dtype=bool), max_iterations=steps
+    )
+    job.tally.refinements += posed.iterations
+    return posed
+
+
+def _mirrored(R: Array, t: Array, basis: Array) -> Array:
+    """The pose that a far flat board is mistaken for: its depths mirrored along the viewing ray."""
+    ray = t / np.linalg.norm(t, axis=1, keepdims=True)
+    normal = basis[:, :, 2]
+    across_ray = np.eye(3) - 2 * ray[:, :, None] * ray[:, None, :]
+    across_plane = np.eye(3) - 2 * normal[:, :, None] * normal[:, None, :]
+    return nearest_rotation(across_ray @ R @ across_plane)

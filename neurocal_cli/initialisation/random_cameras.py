@@ -1,0 +1,165 @@
+"""Cameras from random weights when a free network cannot be trained.
+
+A product W V has 11 degrees of freedom; with fewer points than it needs, or all but one in a
+plane, the points still determine a pose (type 3) or a camera with a given centre (type 2). Then
+random weights are made a camera at once, V's left block by the nearest rotation and its last
+column by the linear conditions that the pixels put on t, and each start is trained on the pixel
+error (3) directly.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.point_batches import PointBatches
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.network import Patterns
+
+__all__ = ["Found", "find_camera", "find_poses"]
+
+_MOST_POINTS = 64
+_NEAREST = 1.2  # depth of the nearest point's side of the target, in target radii
+_TIE = 1e-4
+# With hardly more equations than unknowns several minima fit well, and two starts may agree on a
+# wrong one: so many are trained side by side, and all of them before any is believed.
+_BATCH = 48
+
+
+class Found:
+    """Best random starts.
+
+    Attributes
+    ----------
+    state : CameraState
+    cost : (K,) array
+        Squared pixel error of each view (of all, for `find_camera`).
+    agreed : (K,) int array
+    starts, iterations : int
+    """
+
+    def __init__(
+        self, state: CameraState, cost: Array, agreed: NDArray[np.int64], starts: int, iterations: int
+    ) -> None:
+        self.state, self.cost, self.agreed = state, cost, agreed
+        self.starts, self.iterations = starts, iterations
+
+
+def find_poses(
+    views: Views, which: NDArray[np.intp], entries: Array, rng: np.random.Generator, starts: int
+) -> Found:
+    """Poses of some views for known intrinsics, all starts of all views side by side.
+
+    Parameters
+    ----------
+    views : Views
+    which : (K,) int array
+    entries : (1, 5) array
+        Normalised A11, A12, A22, A13, A23.
+    rng : numpy.random.Generator
+    starts : int
+        For each view.
+    """
+    patterns = views.patterns(which, flat=False, most=_MOST_POINTS, rng=rng)
+    many = patterns.take(np.repeat(np.arange(len(which)), starts))
+    R = nearest_rotation(rng.uniform(-1, 1, (len(many.weights), 3, 3)))
+    state = CameraState(entries, R, _translation(entries, R, many))
+    adjusted = adjust(_as_tiles(many), state, np.zeros(5, dtype=bool))
+    cost = adjusted.cost.reshape(len(which), starts)
+    best = cost.argmin(axis=1)
+    lowest = cost[np.arange(len(which)), best]
+    agreed = (cost <= lowest[:, None] * (1 + _TIE) + 1e-20).sum(axis=1)
+    chosen = np.arange(len(which)) * starts + best
+    state = CameraState(entries, adjusted.state.R[chosen], adjusted.state.t[chosen])
+    return Found(state, lowest, agreed, starts * len(which), adjusted.iterations)
+
+
+def find_camera(
+    views: Views, given: Array, free: NDArray[np.bool_], rng: np.random.Generator, starts: int
+) -> Found | None:
+    """Intrinsics and pose of a single view, by batches of starts until two agree.
+
+    Parameters
+    ----------
+    views : Views
+        Of one view.
+    given : (5,) array
+        Normalised entries that are not free.
+    free : (5,) bool array
+    rng : numpy.random.Generator
+    starts : int
+        Another batch begins only below this many.
+
+    Returns
+    -------
+    Found or None
+        None when no start converged.
+    """
+    patterns = views.patterns(np.array([0]), flat=False, most=_MOST_POINTS, rng=rng)
+    best, cost, agreed, iterations, used = None, np.inf, 0, 0, 0
+    while used < starts and agreed < 2:
+        many = patterns.take(np.zeros(_BATCH, dtype=np.intp))
+        used += _BATCH
+        entries = np.where(free, rng.uniform(-1, 1, (_BATCH, 5)), given)
+        # A focal length of 0.5 to 20 image half-widths covers every lens; no skew at first.
+        focal = 0.5 * 40.0 ** rng.random(_BATCH)
+        entries[:, [0, 2]] = np.where(free[[0, 2]], focal[:, None], entries[:, [0, 2]])
+        entries[:, 1] = 0.0 if free[1] else given[1]
+        R = nearest_rotation(rng.uniform(-1, 1, (_BATCH, 3, 3)))
+        batches = _as_tiles(many)
+        # The pose first, then everything.
+        state = CameraState(entries, R, _translation(entries, R, many))
+        posed = adjust(batches, state, np.zeros(5, dtype=bool))
+        trained = adjust(batches, posed.state, free)
+        iterations += posed.iterations + trained.iterations
+        total = np.where(trained.each_settled, trained.cost, np.inf)
+        n = int(total.argmin())
+        if not np.isfinite(total[n]):
+            continue
+        if total[n] < cost * (1 - _TIE) - 1e-20:
+            chosen = slice(n, n + 1)
+            best = CameraState(
+                trained.state.entries[chosen], trained.state.R[chosen], trained.state.t[chosen]
+            )
+            cost, agreed = float(total[n]), 0
+        agreed += int((total <= cost * (1 + _TIE) + 1e-20).sum())
+    if best is None:
+        return None
+    return Found(best, np.array([cost]), np.array([agreed]), used, iterations)
+
+
+def _as_tiles(patterns: Patterns) -> PointBatches:
+    """One batch for each network."""
+    networks = np.arange(len(patterns.weights))
+    root = np.sqrt(patterns.weights)
+    whitening = np.stack([root, np.zeros_like(root), root], axis=1)
+    local = np.ascontiguousarray(np.swapaxes(patterns.inputs[..., :3], 1, 2))
+    pixels = np.ascontiguousarray(np.swapaxes(patterns.targets[..., :2], 1, 2))
+    counts = (patterns.weights > 0).sum(axis=1)
+    return PointBatches(local, pixels, whitening, networks, networks, counts)
+
+
+def _translation(entries: Array, R: Array, patterns: Patterns) -> Array:
+    """The t that the pixels ask for, given R, by linear least squares; points put in front.
+
+    With the ray (x, y) of a pixel: t1 - x t3 = x Y3 - Y1 and t2 - y t3 = y Y3 - Y2, Y = R M.
+    """
+    a, s, b, u0, v0 = np.atleast_2d(entries).T[..., None]
+    w = patterns.weights
+    y = (patterns.targets[..., 1] - v0) / b
+    x = (patterns.targets[..., 0] - u0 - s * y) / a
+    Y = patterns.inputs[..., :3] @ np.swapaxes(R, 1, 2)
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    rows = np.concatenate([np.stack([one, zero, -x], -1), np.stack([zero, one, -y], -1)], axis=1)
+    right = np.concatenate([x * Y[..., 2] - Y[..., 0], y * Y[..., 2] - Y[..., 1]], axis=1)
+    weighted = np.swapaxes(rows * np.concatenate([w, w], axis=1)[..., None], 1, 2)
+    t = np.linalg.solve(weighted @ rows + 1e-12 * np.eye(3), weighted @ right[..., None])[..., 0]
+    radius = np.abs(Y).max(axis=(1, 2))
+    t[:, 2] = np.maximum(np.abs(t[:, 2]), _NEAREST * radius)
+    total = w.sum(axis=1)
+    t[:, 0] = (w * x).sum(axis=1) / total * t[:, 2]
+    t[:, 1] = (w * y).sum(axis=1) / total * t[:, 2]
+    return t

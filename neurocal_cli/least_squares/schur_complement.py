@@ -1,0 +1,127 @@
+"""Least squares with unknowns that all blocks share and unknowns of each block's own.
+
+The normal matrix is an arrowhead: the own unknowns of different blocks (the poses of views) meet only
+in the shared ones (the cameras). Eliminating each block's own by its Schur complement leaves a small
+system, and the cost grows linearly with the blocks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["SchurCovariance", "inverse_scaled", "schur_covariance", "schur_step", "solve_scaled"]
+
+_ROUNDING = 1e-30  # an eigenvalue this far below the diagonal is not there
+_NOTHING = 1e-300
+
+
+@dataclass(frozen=True, eq=False)
+class SchurCovariance:
+    """Blocks of the inverse of an arrowhead matrix.
+
+    Attributes
+    ----------
+    shared : (f, f) array
+    own : (V, p, p) array
+    cross : (V, f, p) array
+        Between the shared unknowns and each block's own.
+    smallest : float
+        Smallest eigenvalue of the eliminated matrices scaled to a unit diagonal, 0 when singular.
+    """
+
+    shared: Array
+    own: Array
+    cross: Array
+    smallest: float
+
+
+def schur_step(
+    N: Array, shared: NDArray[np.intp], own: NDArray[np.intp], damping: float
+) -> tuple[Array, Array, float]:
+    """Damped Gauss-Newton step.
+
+    Parameters
+    ----------
+    N : (V, D, D) array
+        Products of the derivatives and, in the last column, the residuals of each block.
+    shared, own : (f,), (p,) int arrays
+        Columns of the unknowns.
+    damping : float
+        Share of the diagonal that is added to it (Marquardt).
+
+    Returns
+    -------
+    by_shared : (f,) array
+    by_own : (V, p) array
+        nan where the system is singular.
+    gain : float
+        By how much the step should lower the sum of squares.
+    """
+    f = shared
+    # Sums of what is needed only: the whole matrices are larger.
+    U, g = N[:, f[:, None], f].sum(axis=0), N[:, f, -1].sum(axis=0)
+    g_own = N[:, own, -1]
+    ridge = damping * (np.diagonal(U) + _NOTHING)
+    B = N[:, own[:, None], own]
+    ridge_own = damping * (np.diagonal(B, axis1=1, axis2=2) + _NOTHING)
+    places = np.arange(len(own))
+    B[:, places, places] += ridge_own
+    C = N[:, f[:, None], own]  # (V, f, p)
+    solved = solve_scaled(B, np.concatenate([np.swapaxes(C, 1, 2), g_own[..., None]], axis=2))
+    # (f, p V) times (p V, f + 1): one product sums over blocks and own unknowns.
+    flat_C = np.swapaxes(C, 0, 1).reshape(len(f), C.shape[0] * C.shape[2])
+    eliminated = flat_C @ solved.reshape(-1, len(f) + 1)
+    S = U + np.diag(ridge) - eliminated[:, :-1]
+    step = solve_scaled(S, (g - eliminated[:, -1])[:, None])[:, 0]
+    by_own = solved[:, :, -1] - solved[:, :, :-1] @ step
+    gain = (by_own * (g_own + ridge_own * by_own)).sum() + step @ (g + ridge * step)
+    return step, by_own, float(gain)
+
+
+def schur_covariance(N: Array, shared: NDArray[np.intp], own: NDArray[np.intp]) -> SchurCovariance:
+    """Inverse of the normal matrix, block by block; see `schur_step` for the parameters.
+
+    Times the residual variance it is the Cramer-Rao bound at the estimate.
+    """
+    U = N[:, shared[:, None], shared].sum(axis=0)
+    B_inverse, smallest = inverse_scaled(B := N[:, own[:, None], own], B)
+    C = N[:, shared[:, None], own]
+    gain = C @ B_inverse
+    S = U - (gain @ np.swapaxes(C, 1, 2)).sum(axis=0)
+    S_inverse, smallest_shared = inverse_scaled(S, U)
+    cross = -S_inverse @ gain
+    covariance_own = B_inverse - np.swapaxes(gain, 1, 2) @ cross
+    return SchurCovariance(S_inverse, covariance_own, cross, min(smallest, smallest_shared))
+
+
+def solve_scaled(H: Array, rhs: Array) -> Array:
+    """Solve symmetric systems scaled to a unit diagonal; a singular one yields nan."""
+    scale = 1.0 / np.sqrt(np.abs(np.diagonal(H, axis1=-2, axis2=-1)) + _NOTHING)
+    scaled = H * scale[..., :, None] * scale[..., None, :]
+    try:
+        return scale[..., :, None] * np.linalg.solve(scaled, scale[..., :, None] * rhs)
+    except np.linalg.LinAlgError:
+        return np.full(rhs.shape, np.nan)
+
+
+def inverse_scaled(H: Array, reference: Array) -> tuple[Array, float]:
+    """Inverse of symmetric matrices, and their smallest eigenvalue relative to `reference`'s diagonal.
+
+    The inverse is nan and the eigenvalue 0 where a matrix is singular.
+    """
+    scale = 1.0 / np.sqrt(np.diagonal(reference, axis1=-2, axis2=-1) + _NOTHING)
+    outer = scale[..., :, None] * scale[..., None, :]
+    scaled = H * outer
+    if not np.isfinite(scaled).all():
+        return np.full_like(H, np.nan), 0.0
+    values, vectors = np.linalg.eigh(scaled)
+    smallest = float(values.min(initial=1.0))
+    if smallest < _ROUNDING:
+        return np.full_like(H, np.nan), 0.0
+    inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return inverse * outer, smallest

@@ -1,0 +1,1 @@
+"""Simulated data with everything known about it: rendered chessboards, a zoom lens."""

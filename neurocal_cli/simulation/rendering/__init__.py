@@ -1,0 +1,46 @@
+"""Pictures of chessboards, rendered exactly: the yardstick that detection is measured with.
+
+`render` turns a `Scene` into an image and the exact positions of all vertices and mid-points;
+`bound` tells how well any detector can find them in it.
+"""
+
+from __future__ import annotations
+
+from neurocal_cli.simulation.rendering.bound import Bound, edge_bound, scene_bound, vertex_bound
+from neurocal_cli.simulation.rendering.render import Rendered, noise_free, render
+from neurocal_cli.simulation.rendering.scene import (
+    Background,
+    Camera,
+    Disc,
+    Illumination,
+    Occluder,
+    Rectangle,
+    Scene,
+    Sensor,
+    Sides,
+    Target,
+)
+from neurocal_cli.simulation.rendering.truth import PlaneTruth, Truth, ground_truth
+
+__all__ = [
+    "Background",
+    "Bound",
+    "Camera",
+    "Disc",
+    "Illumination",
+    "Occluder",
+    "PlaneTruth",
+    "Rectangle",
+    "Rendered",
+    "Scene",
+    "Sensor",
+    "Sides",
+    "Target",
+    "Truth",
+    "edge_bound",
+    "ground_truth",
+    "noise_free",
+    "render",
+    "scene_bound",
+    "vertex_bound",
+]

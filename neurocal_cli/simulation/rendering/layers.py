@@ -1,0 +1,193 @@
+"""What each thing in a scene contributes to small square cells of the image: boards and occluders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array
+from neurocal_cli.simulation.rendering.coverage import half_plane
+from neurocal_cli.simulation.rendering.rays import Rays
+from neurocal_cli.simulation.rendering.scene import Disc, Occluder, Rectangle, Scene, Target
+
+__all__ = ["BoardLayer", "Cover", "occluder_cover"]
+
+# Cells further than this from the paper [squares] are not looked at; also keeps off the horizon.
+_NEARBY = 2.0
+
+
+class Cover(NamedTuple):
+    """What a layer covers of each cell.
+
+    Attributes
+    ----------
+    alpha : array
+        Covered share of the cell.
+    light : array
+        Reflectance, integrated over the covered share.
+    depth : array [world unit]
+        Along the camera's axis; infinite where nothing is covered.
+    edges : int array
+        How many edges run through the cell.
+    """
+
+    alpha: Array
+    light: Array
+    depth: Array
+    edges: NDArray[np.int8]
+
+
+@dataclass(frozen=True, eq=False)
+class BoardLayer:
+    """A target as the camera sees it.
+
+    Parameters
+    ----------
+    target : Target
+    inverse : (3, 3) array
+        From rays (x, y, 1) to w (a, b, 1), w = 1 / depth, a and b in squares.
+    """
+
+    target: Target
+    inverse: Array
+
+    @classmethod
+    def of(cls, scene: Scene, target: Target) -> BoardLayer:
+        """Place a target before the scene's camera.
+
+        Raises
+        ------
+        DegenerateGeometryError
+            The camera's centre lies in the target's plane.
+        """
+        matrix = scene.plane_to_camera(target)
+        square = target.plane.square
+        if abs(np.linalg.det(matrix)) < 1e-9 * square**2 * np.linalg.norm(matrix[:, 2]):
+            raise DegenerateGeometryError(
+                f"the camera lies in the plane {target.plane.name!r}; move one of them"
+            )
+        return cls(target, np.asarray(np.linalg.inv(matrix), dtype=float))
+
+    def grid(self, rays: Rays) -> tuple[Array, Array, Array]:
+        """Grid coordinates a, b [squares] and w = 1 / depth where rays meet the target's plane."""
+        N, x, y = self.inverse, rays.x, rays.y
+        w = N[2, 0] * x + N[2, 1] * y + N[2, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a = (N[0, 0] * x + N[0, 1] * y + N[0, 2]) / w
+            b = (N[1, 0] * x + N[1, 1] * y + N[1, 2]) / w
+        return a, b, w
+
+    def slopes(self, rays: Rays, a: Array, b: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+        """Derivatives au, av, bu, bv of the grid coordinates by the pixel [squares / px]."""
+        N = self.inverse
+        ax, ay = (N[0, 0] - a * N[2, 0]) / w, (N[0, 1] - a * N[2, 1]) / w
+        bx, by = (N[1, 0] - b * N[2, 0]) / w, (N[1, 1] - b * N[2, 1]) / w
+        return (
+            ax * rays.xu + ay * rays.yu,
+            ax * rays.xv + ay * rays.yv,
+            bx * rays.xu + by * rays.yu,
+            bx * rays.xv + by * rays.yv,
+        )
+
+    def cover(self, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
+        """What the target covers of cells around rays given as flat arrays.
+
+        Parameters
+        ----------
+        rays : Rays of (N,) arrays
+        cell : float [px]
+            Side of the cells.
+        slack : float [px]
+            See `half_plane`.
+        """
+        a, b, w = self.grid(rays)
+        n = len(a)
+        alpha, light, depth = np.zeros(n), np.zeros(n), np.full(n, np.inf)
+        edges = np.zeros(n, dtype=np.int8)
+        x_low, x_high, y_low, y_high = self.target.paper_box
+        near = (w > 0) & (a > x_low - _NEARBY) & (a < x_high + _NEARBY)
+        near &= (b > y_low - _NEARBY) & (b < y_high + _NEARBY)
+        at = np.flatnonzero(near)
+        if not at.size:
+            return Cover(alpha, light, depth, edges)
+        part = Rays(*(getattr(rays, name)[at] for name in ("u", "v", "x", "y", "xu", "xv", "yu", "yv")))
+        a, b, w = a[at], b[at], w[at]
+        au, av, bu, bv = self.slopes(part, a, b, w)
+        paper, pattern = self.target.paper_box, self.target.pattern_box
+        along_x = _axis(a, au, av, pattern[:2], paper[:2], cell, slack)
+        along_y = _axis(b, bu, bv, pattern[2:], paper[2:], cell, slack)
+        alpha[at] = along_x.paper * along_y.paper
+        sign = 1.0 if self.target.first_black else -1.0
+        ink = 0.5 * (along_x.pattern * along_y.pattern + sign * along_x.signed * along_y.signed)
+        light[at] = self.target.white * alpha[at] - (self.target.white - self.target.black) * ink
+        depth[at] = np.where(alpha[at] > 0, 1 / w, np.inf)
+        edges[at] = along_x.edges + along_y.edges
+        return Cover(alpha, light, depth, edges)
+
+
+class _Axis(NamedTuple):
+    """Averages over cells along one axis of a board."""
+
+    paper: Array  # inside the paper
+    pattern: Array  # inside the pattern
+    signed: Array  # +1 in even, -1 in odd squares of the pattern, 0 outside
+    edges: NDArray[np.int8]
+
+
+def _axis(
+    a: Array,
+    au: Array,
+    av: Array,
+    pattern: tuple[float, float],
+    paper: tuple[float, float],
+    cell: float,
+    slack: float,
+) -> _Axis:
+    steepness = np.hypot(au, av)
+    to_pixels = 1 / steepness
+    nu, nv = au * to_pixels, av * to_pixels
+    # Lines at the pattern's ends are borders; only those strictly between change the colour.
+    line = np.clip(np.rint(a), np.floor(pattern[0]) + 1, np.ceil(pattern[1]) - 1)
+    beyond, crossed = half_plane((a - line) * to_pixels, nu, nv, cell, slack)
+    sign = 1 - 2 * (line - 2 * np.floor(0.5 * line))
+    inside, at_end = half_plane(_inward(a, pattern) * to_pixels, nu, nv, cell, slack)
+    edges = crossed.astype(np.int8) + at_end
+    if paper == pattern:
+        return _Axis(inside, inside, inside * sign * (2 * beyond - 1), edges)
+    covered, at_border = half_plane(_inward(a, paper) * to_pixels, nu, nv, cell, slack)
+    return _Axis(covered, inside, inside * sign * (2 * beyond - 1), edges + at_border)
+
+
+def _inward(a: Array, ends: tuple[float, float]) -> Array:
+    """Distance from the nearer end, positive between the ends."""
+    return np.minimum(a - ends[0], ends[1] - a)
+
+
+def occluder_cover(occluder: Occluder, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
+    """What an occluder covers of cells around rays; see `BoardLayer.cover`."""
+    du, dv = rays.u - occluder.centre[0], rays.v - occluder.centre[1]
+    if isinstance(occluder, Disc):
+        radius = np.maximum(np.hypot(du, dv), 1e-9)
+        alpha, touched = half_plane(occluder.radius - radius, du / radius, dv / radius, cell, slack)
+        edges = touched.astype(np.int8)
+    else:
+        alpha, edges = _rectangle(occluder, du, dv, cell, slack)
+    depth = np.where(alpha > 0, 0.0, np.inf)
+    return Cover(alpha, occluder.level * alpha, depth, edges)
+
+
+def _rectangle(
+    rectangle: Rectangle, du: Array, dv: Array, cell: float, slack: float
+) -> tuple[Array, NDArray[np.int8]]:
+    c, s = np.cos(rectangle.angle), np.sin(rectangle.angle)
+    alpha, edges = np.ones_like(du), np.zeros(len(du), dtype=np.int8)
+    for length, nu, nv in ((rectangle.size[0], c, s), (rectangle.size[1], -s, c)):
+        inward = 0.5 * length - np.abs(nu * du + nv * dv)
+        share, touched = half_plane(inward, np.full_like(du, nu), np.full_like(du, nv), cell, slack)
+        alpha *= share
+        edges += touched
+    return alpha, edges

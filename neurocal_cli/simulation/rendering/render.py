@@ -1,0 +1,46 @@
+"""Pictures of chessboards with everything known about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.simulation.rendering.light import image_light
+from neurocal_cli.simulation.rendering.scene import Scene
+from neurocal_cli.simulation.rendering.sensor import Image, digitised, response, signal
+from neurocal_cli.simulation.rendering.truth import Truth, ground_truth
+
+__all__ = ["Rendered", "noise_free", "render"]
+
+
+@dataclass(frozen=True, eq=False)
+class Rendered:
+    """A picture.
+
+    Attributes
+    ----------
+    image : (height, width) uint8 or uint16 array [DN]
+    truth : Truth
+    """
+
+    image: Image
+    truth: Truth
+
+
+def render(scene: Scene, rng: np.random.Generator) -> Rendered:
+    """Take a picture of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    rng : numpy Generator
+        Of the noise; everything else is in the scene.
+    """
+    return Rendered(digitised(scene.sensor, image_light(scene), rng), ground_truth(scene))
+
+
+def noise_free(scene: Scene) -> Array:
+    """Picture without noise, rounding and clipping by the converter; (height, width) array [DN]."""
+    return response(scene.sensor, signal(scene.sensor, image_light(scene))) * scene.sensor.white_dn

@@ -1,0 +1,293 @@
+"""What a picture is made of: camera, chessboards, light, what stands in the way, and the sensor.
+
+Radiances are linear and 1 is the sensor's full scale at gain 1. All image coordinates follow the
+package's convention: the centre of the top-left pixel is (0, 0).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from neurocal_cli.board import Board, Plane
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = [
+    "Background",
+    "Camera",
+    "Disc",
+    "Illumination",
+    "Occluder",
+    "Rectangle",
+    "Scene",
+    "Sensor",
+    "Sides",
+    "Target",
+]
+
+ClutterKind = Literal["blocks", "lines", "gradients", "discs", "decoys"]
+CLUTTER_KINDS: tuple[ClutterKind, ...] = ("blocks", "lines", "gradients", "discs", "decoys")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera with a lens.
+
+    Parameters
+    ----------
+    intrinsics : Intrinsics
+        Skew included.
+    size : (width, height) [px]
+    distortion : tuple of up to 5 floats
+        k1, k2, p1, p2, k3 in OpenCV's order; acts on normalised coordinates, then A is applied.
+    """
+
+    intrinsics: Intrinsics
+    size: tuple[int, int]
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        width, height = (int(s) for s in self.size)
+        coefficients = tuple(float(k) for k in self.distortion)
+        if width <= 0 or height <= 0:
+            raise InputError(f"size must be two positive whole numbers, found {self.size}")
+        if len(coefficients) > 5 or not np.isfinite(coefficients).all():
+            raise InputError("distortion takes up to five finite numbers: k1, k2, p1, p2, k3")
+        object.__setattr__(self, "size", (width, height))
+        object.__setattr__(self, "distortion", (*coefficients, *(0.0,) * (5 - len(coefficients))))
+
+
+@dataclass(frozen=True)
+class Sides:
+    """A length on each side of a board, in squares; low and high along x_axis and y_axis."""
+
+    x_low: float = 1.0
+    x_high: float = 1.0
+    y_low: float = 1.0
+    y_high: float = 1.0
+
+    @classmethod
+    def all(cls, length: float) -> Sides:
+        """The same length on all sides."""
+        return cls(length, length, length, length)
+
+
+@dataclass(frozen=True)
+class Target:
+    """A printed chessboard.
+
+    Parameters
+    ----------
+    plane : Plane
+        Its inner vertices.
+    black, white : float
+        Reflectances of the ink and of the paper.
+    first_black : bool
+        Whether the square beyond vertex (0, 0), towards growing x and y, is black.
+    reach : Sides [squares]
+        How far the pattern goes on beyond the outer vertices; 1 is one whole square, and 1/2 on both
+        planes of a fold makes squares that run across it.
+    margin : Sides [squares]
+        White paper beyond the pattern; 0 where the pattern ends at the paper's edge or at a fold.
+    """
+
+    plane: Plane
+    black: float = 30 / 255
+    white: float = 226 / 255
+    first_black: bool = True
+    reach: Sides = field(default_factory=Sides)
+    margin: Sides = field(default_factory=lambda: Sides.all(0.5))
+
+    def __post_init__(self) -> None:
+        for sides in (self.reach, self.margin):
+            if min(sides.x_low, sides.x_high, sides.y_low, sides.y_high) < 0:
+                raise InputError("reach and margin must not be negative")
+
+    @property
+    def pattern_box(self) -> tuple[float, float, float, float]:
+        """Ends of the pattern: x_low, x_high, y_low, y_high in grid coordinates [squares]."""
+        reach, plane = self.reach, self.plane
+        return -reach.x_low, plane.cols - 1 + reach.x_high, -reach.y_low, plane.rows - 1 + reach.y_high
+
+    @property
+    def paper_box(self) -> tuple[float, float, float, float]:
+        """Ends of the paper, as `pattern_box`."""
+        x_low, x_high, y_low, y_high = self.pattern_box
+        margin = self.margin
+        return x_low - margin.x_low, x_high + margin.x_high, y_low - margin.y_low, y_high + margin.y_high
+
+
+@dataclass(frozen=True)
+class Rectangle:
+    """Something rectangular in front of everything, in image coordinates.
+
+    Parameters
+    ----------
+    centre : (u, v) [px]
+    size : (width, height) [px]
+    angle : float [rad]
+        From u towards v.
+    level : float
+        Reflectance.
+    """
+
+    centre: tuple[float, float]
+    size: tuple[float, float]
+    angle: float = 0.0
+    level: float = 0.35
+
+
+@dataclass(frozen=True)
+class Disc:
+    """Something round in front of everything, in image coordinates [px]."""
+
+    centre: tuple[float, float]
+    radius: float
+    level: float = 0.35
+
+
+Occluder = Rectangle | Disc
+
+
+@dataclass(frozen=True)
+class Background:
+    """What stands behind the boards, constant within each pixel before the blur.
+
+    Parameters
+    ----------
+    level : float
+        Reflectance of the empty background.
+    clutter : tuple of str
+        Kinds of things to strew over it, from ``CLUTTER_KINDS``; none leaves it plain.
+    amount : int
+        Things of each kind in 640 x 480 pixels at a scale of 40 px; they cover the same share of
+        any image at any scale.
+    scale : float [px]
+        Typical size of a thing; 0 takes 1/12 of the image's height.
+    seed : int
+    """
+
+    level: float = 0.45
+    clutter: tuple[ClutterKind, ...] = ()
+    amount: int = 25
+    scale: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        unknown = set(self.clutter) - set(CLUTTER_KINDS)
+        if unknown:
+            raise InputError(f"there is no clutter {sorted(unknown)}; there are {list(CLUTTER_KINDS)}")
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """Light that falls on the whole scene, ``level (1 + gradient . ((u - uc) / W, (v - vc) / H))``.
+
+    It multiplies the radiance before the blur; vignetting multiplies the blurred image by
+    ``1 - vignetting rho^2``, rho = 1 in the image's corners.
+    """
+
+    level: float = 1.0
+    gradient: tuple[float, float] = (0.0, 0.0)
+    vignetting: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.level <= 0 or abs(self.gradient[0]) + abs(self.gradient[1]) >= 2:
+            raise InputError("illumination must stay positive: level > 0 and |gx| + |gy| < 2")
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """From light to numbers.
+
+    Parameters
+    ----------
+    response : float or "srgb"
+        The image is signal^(1 / response), 1 being linear, or the sRGB curve.
+    gain, offset : float
+        signal = gain radiance + offset, before the response.
+    read_noise : float [DN of 8 bits, 1/255 of full scale]
+        Standard deviation of Gaussian noise, after the response.
+    full_well : float, optional [electrons]
+        Electrons at full scale; given, the signal has Poisson noise.
+    bits : 8 or 16
+    """
+
+    response: float | Literal["srgb"] = 1.0
+    gain: float = 1.0
+    offset: float = 0.0
+    read_noise: float = 2.0
+    full_well: float | None = None
+    bits: Literal[8, 16] = 8
+
+    def __post_init__(self) -> None:
+        if self.bits not in (8, 16):
+            raise InputError(f"bits must be 8 or 16, found {self.bits}")
+        if self.response != "srgb" and not float(self.response) > 0:
+            raise InputError("response must be positive or 'srgb'")
+        if self.read_noise < 0 or (self.full_well is not None and self.full_well <= 0):
+            raise InputError("noise must not be negative, full_well must be positive")
+
+    @property
+    def white_dn(self) -> int:
+        """Largest value of a pixel."""
+        return (1 << self.bits) - 1
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that decides a picture but its noise.
+
+    Parameters
+    ----------
+    camera : Camera
+    pose : Pose
+        World to camera.
+    targets : tuple of Target
+        Where they overlap in the image, the nearer one hides the other.
+    background : Background
+    occluders : tuple of Rectangle or Disc
+        In front of everything; the first is foremost.
+    illumination : Illumination
+    psf : float [px]
+        Standard deviation of the Gaussian blur, to which the pixel's box is added.
+    sensor : Sensor
+    unit : str
+        Of the world.
+    """
+
+    camera: Camera
+    pose: Pose
+    targets: tuple[Target, ...] = ()
+    background: Background = field(default_factory=Background)
+    occluders: tuple[Occluder, ...] = ()
+    illumination: Illumination = field(default_factory=Illumination)
+    psf: float = 0.8
+    sensor: Sensor = field(default_factory=Sensor)
+    unit: str = "mm"
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.psf <= 50:
+            raise InputError(f"psf must lie between 0 and 50 px, found {self.psf:g}")
+
+    @property
+    def board(self) -> Board:
+        """The board that the targets make up."""
+        return Board(tuple(target.plane for target in self.targets), self.unit)
+
+    @property
+    def sigma_t(self) -> float:
+        """Blur and pixel together, ``sqrt(psf^2 + 1/12)`` [px]."""
+        return float(np.sqrt(self.psf**2 + 1 / 12))
+
+    def plane_to_camera(self, target: Target) -> Array:
+        """(3, 3) matrix that takes grid coordinates (a, b, 1) [squares] into the camera's frame."""
+        plane = target.plane
+        axes = np.array([plane.x_axis, plane.y_axis, plane.origin]).T
+        columns = self.pose.R @ (axes * [plane.square, plane.square, 1.0])
+        columns[:, 2] += self.pose.t
+        return np.asarray(columns)

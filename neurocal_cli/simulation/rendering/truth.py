@@ -1,0 +1,199 @@
+"""Where everything is in a rendered picture, and what of it can be seen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.board import Plane
+from neurocal_cli.geometry import Array
+from neurocal_cli.simulation.rendering.layers import BoardLayer, occluder_cover
+from neurocal_cli.simulation.rendering.rays import Lens
+from neurocal_cli.simulation.rendering.scene import Scene, Target
+
+__all__ = ["PlaneTruth", "Truth", "ground_truth"]
+
+Mask = NDArray[np.bool_]
+
+_TINY_CELL = 1e-6  # px; a point
+_STEP = 1e-4  # squares; for directions in the image
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneTruth:
+    """A plane's points in the picture.
+
+    Attributes
+    ----------
+    plane : Plane
+    vertices : (rows, cols, 2) array [px]
+        Exact positions; NaN where the camera cannot project.
+    vertices_world : (rows, cols, 3) array [world unit]
+    vertex_ids : tuple of rows x cols str
+        Row by row.
+    vertices_visible : (rows, cols) bool array
+        In front of the camera, in the frame, and nothing in front, all with a clearance.
+    midpoints : (N, 2) array [px]
+        Projections of the mid-points in space, in the order of `Plane.midpoint_grid`.
+    midpoints_world : (N, 3) array [world unit]
+    midpoint_ids : tuple of N str
+    midpoints_visible : (N,) bool array
+    edges_visible : (N,) bool array
+        The mid-point, both ends and the quarters between them are visible.
+    ends : (N, 2) int array
+        Positions of the edge's ends among the vertices, row by row.
+    normals : (N, 2) array
+        Unit normals of the edges in the image, towards growing y_axis for ``h``, x_axis for ``v``.
+    lengths : (N,) array [px]
+        Of the edges, end to end.
+    polarity : (N,) int array
+        +1 where the square on the normal's side is white, -1 where it is black.
+    """
+
+    plane: Plane
+    vertices: Array
+    vertices_world: Array
+    vertex_ids: tuple[str, ...]
+    vertices_visible: Mask
+    midpoints: Array
+    midpoints_world: Array
+    midpoint_ids: tuple[str, ...]
+    midpoints_visible: Mask
+    edges_visible: Mask
+    ends: NDArray[np.intp]
+    normals: Array
+    lengths: Array
+    polarity: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a detector should find.
+
+    Attributes
+    ----------
+    planes : tuple of PlaneTruth
+        In the order of the scene's targets.
+    clearance : float [px]
+        Distance from a visible point within which nothing hides its plane.
+    """
+
+    planes: tuple[PlaneTruth, ...]
+    clearance: float
+
+    @cached_property
+    def by_name(self) -> dict[str, PlaneTruth]:
+        """The planes by their names."""
+        return {truth.plane.name: truth for truth in self.planes}
+
+
+def ground_truth(scene: Scene, clearance: float | None = None) -> Truth:
+    """Find the exact positions of all points and which of them can be seen.
+
+    Parameters
+    ----------
+    scene : Scene
+    clearance : float, optional [px]
+        See `Truth`; three times the blur (pixel included) by default.
+    """
+    distance = 3 * scene.sigma_t if clearance is None else float(clearance)
+    sight = _Sight(scene, distance)
+    planes = tuple(_plane_truth(scene, sight, k) for k in range(len(scene.targets)))
+    return Truth(planes, distance)
+
+
+def _plane_truth(scene: Scene, sight: _Sight, index: int) -> PlaneTruth:
+    target = scene.targets[index]
+    plane = target.plane
+    columns, rows = np.meshgrid(np.arange(plane.cols), np.arange(plane.rows))
+    vertex_grid = np.stack([columns, rows], axis=-1).astype(float)
+    grid = plane.midpoint_grid()
+    half = np.where(grid % 1 > 0, 0.5, 0.0)  # along the edge
+    vertices, vertices_visible = sight.look(index, vertex_grid)
+    midpoints, midpoints_visible = sight.look(index, grid)
+    quarters = [sight.look(index, grid + s * half)[1] for s in (-0.5, 0.5)]
+    first, second = (np.rint(grid + s * half).astype(np.intp) @ [1, plane.cols] for s in (-1, 1))
+    visible = vertices_visible.reshape(-1)
+    edges_visible = midpoints_visible & visible[first] & visible[second] & quarters[0] & quarters[1]
+    chord = vertices.reshape(-1, 2)[second] - vertices.reshape(-1, 2)[first]
+    return PlaneTruth(
+        plane=plane,
+        vertices=vertices,
+        vertices_world=plane.vertices(),
+        vertex_ids=plane.vertex_ids(),
+        vertices_visible=vertices_visible,
+        midpoints=midpoints,
+        midpoints_world=plane.at(grid),
+        midpoint_ids=plane.midpoint_ids(),
+        midpoints_visible=midpoints_visible,
+        edges_visible=edges_visible,
+        ends=np.stack([first, second], axis=-1),
+        normals=_normals(sight, index, grid, half),
+        lengths=np.hypot(*chord.T),
+        polarity=_polarity(target, grid, half),
+    )
+
+
+def _normals(sight: _Sight, index: int, grid: Array, half: Array) -> Array:
+    """Normals of the projected edges, on the side of the other axis."""
+    along, across = _STEP * 2 * half, _STEP * (1 - 2 * half)
+    tangent = sight.project(index, grid + along)[0] - sight.project(index, grid - along)[0]
+    side = sight.project(index, grid + across)[0] - sight.project(index, grid - across)[0]
+    normal = np.stack([-tangent[:, 1], tangent[:, 0]], axis=-1)
+    normal /= np.hypot(*normal.T)[:, None]
+    return np.asarray(normal * np.sign((normal * side).sum(axis=1))[:, None])
+
+
+def _polarity(target: Target, grid: Array, half: Array) -> NDArray[np.int64]:
+    square = np.floor(grid + 0.5 * (1 - 2 * half)).astype(np.int64)
+    even = square.sum(axis=1) % 2 == 0
+    return np.where(even == target.first_black, -1, 1)
+
+
+class _Sight:
+    """Lines of sight from a camera to the points of its scene."""
+
+    def __init__(self, scene: Scene, clearance: float) -> None:
+        self.scene = scene
+        self.clearance = clearance
+        self.lens = Lens(scene.camera)
+        self.layers = [BoardLayer.of(scene, target) for target in scene.targets]
+
+    def project(self, index: int, grid: Array) -> tuple[Array, Mask]:
+        """Pixels of a target's grid coordinates, NaN where not seen, and which are seen."""
+        matrix = self.scene.plane_to_camera(self.scene.targets[index])
+        pixels, seen = self.lens.project(grid @ matrix[:, :2].T + matrix[:, 2])
+        return np.where(seen[..., None], pixels, np.nan), seen
+
+    def look(self, index: int, grid: Array) -> tuple[Array, Mask]:
+        """Pixels of a target's grid coordinates, and which are visible with clearance."""
+        pixels, seen = self.project(index, grid)
+        flat = pixels.reshape(-1, 2)
+        width, height = self.scene.camera.size
+        room = np.array([width - 1, height - 1]) - self.clearance
+        with np.errstate(invalid="ignore"):
+            framed = ((flat >= self.clearance) & (flat <= room)).all(axis=1)
+        visible = framed & seen.reshape(-1)
+        at = np.flatnonzero(visible)
+        visible[at] = self._open(index, flat[at])
+        return pixels, visible.reshape(seen.shape)
+
+    def _open(self, index: int, pixels: Array) -> Mask:
+        """Whether nothing is in front of a plane at image points and on a circle around each."""
+        angle = np.arange(12) * (np.pi / 6)
+        ring = self.clearance * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        around = pixels[:, None] + np.concatenate([np.zeros((1, 2)), ring])
+        rays = self.lens.rays(around[..., 0].ravel(), around[..., 1].ravel())
+        _, _, w = self.layers[index].grid(rays)
+        with np.errstate(divide="ignore"):
+            depth = np.where(w > 0, 1 / w, np.inf)
+        hidden = np.zeros(len(depth), dtype=bool)
+        for occluder in self.scene.occluders:
+            hidden |= occluder_cover(occluder, rays, _TINY_CELL).alpha > 0
+        for k, layer in enumerate(self.layers):
+            if k != index:
+                hidden |= layer.cover(rays, _TINY_CELL).depth < depth * (1 - 1e-9)
+        return np.asarray(~hidden.reshape(around.shape[:2]).any(axis=1))

@@ -1,0 +1,92 @@
+"""`calibrate_stereo`: points of two cameras in, a calibrated rig out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.errors import UsageError
+from neurocal_cli.methods import calibrate
+from neurocal_cli.points import Correspondences
+from neurocal_cli.stereo.fit_rig import fit_rig
+from neurocal_cli.stereo.pairing import pair_points, pair_views
+from neurocal_cli.stereo.rig import Rig
+
+__all__ = ["calibrate_stereo"]
+
+Progress = Callable[[str, float], None]
+
+_SIDES = ("left", "right")
+_OF_LEAST_SQUARES = ("neuro", "nonlinear")  # other methods' cameras stay as they are: that is their result
+
+
+def calibrate_stereo(
+    left: Correspondences,
+    right: Correspondences,
+    left_options: Mapping[str, Any] | None = None,
+    right_options: Mapping[str, Any] | None = None,
+    *,
+    progress: Progress | None = None,
+    **options: Any,
+) -> Rig:
+    """Calibrate two cameras and the rig that holds them, from random weights.
+
+    Each camera's network learns by itself, as in `calibrate`. The views that both saw, paired by name, then
+    agree on a rig, and both cameras, the rig and all poses are adjusted together. Views of one camera alone
+    help that camera.
+
+    Parameters
+    ----------
+    left, right : Correspondences
+        In one world unit; views pair by name, points by id, else by X, Y, Z (see `stereo.pairing`).
+    left_options, right_options : dict, optional
+        Arguments of `calibrate` for one camera, such as ``type=3, intrinsics=camera`` for one that is known.
+    progress : callable, optional
+        Called with a stage's name and the share of it that is done.
+    **options
+        Arguments of `calibrate` for both cameras; `outliers` also says what to do with pairs of views that
+        contradict the others.
+
+    Returns
+    -------
+    Rig
+        ``X_right = R X_left + t``.
+
+    Raises
+    ------
+    UsageError
+        As `calibrate`; type 4, as there is no rig to find when all poses are known.
+    InputError, DegenerateGeometryError
+        Points that cannot give an answer, with the reason.
+    """
+    sides = [dict(options) | dict(extra or {}) for extra in (left_options, right_options)]
+    if any(side.get("type", 1) == 4 for side in sides):
+        raise UsageError(
+            "type 4 knows the poses of all views, so there is no rig to find; calibrate each camera by itself"
+        )
+    # What does not fit together is told before anything is trained.
+    pair_points(left, right, pair_views(left.view_names, right.view_names))
+    cameras: list[Calibration] = []
+    for name, points, side in zip(_SIDES, (left, right), sides, strict=True):
+        side = {"camera_name": name} | side
+        cameras.append(calibrate(points, **side, progress=_named(progress, name)))
+    best = all(camera.method in _OF_LEAST_SQUARES for camera in cameras)
+    rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, **_agreement(options))
+    warnings = [
+        f"{name}: {text}"
+        for name, camera in zip(_SIDES, (rig.left, rig.right), strict=True)
+        for text in camera.warnings
+    ]
+    return replace(rig, warnings=(*rig.warnings, *warnings))
+
+
+def _agreement(options: Mapping[str, Any]) -> dict[str, Any]:
+    return {"outliers": options["outliers"]} if "outliers" in options else {}
+
+
+def _named(progress: Progress | None, name: str) -> Progress | None:
+    if progress is None:
+        return None
+    return lambda stage, share: progress(f"{name} camera: {stage}", share)

@@ -1,0 +1,157 @@
+"""A verdict on a calibration: what the data says of it beyond the error it was trained on.
+
+Everything follows from the calibration and its points, so a file can be judged as well as a result:
+
+* the error on data left out (`leave_out`);
+* the precision of the points themselves: what every view leaves when it has a camera of its own, a
+  free network (`outlier_views.free_networks`); a common camera that leaves more contradicts the data;
+* how far two halves of the data disagree, in units of their reported uncertainty;
+* whether residuals of neighbours are alike (`whiteness`);
+* how much of the image and how many directions the points cover (`coverage`);
+* how far projected pixels would move with other noise (`projection_uncertainty`).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.cross_validation import disagreement, held_out
+from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
+from neurocal_cli.bundle_adjustment.problem import Known
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
+from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
+from neurocal_cli.bundle_adjustment.reweighting import weighed
+from neurocal_cli.bundle_adjustment.units import Seen, normalised
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.distortion_models import Lens, coefficient_names
+from neurocal_cli.verdict.coverage import cover
+from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.projection_uncertainty import (
+    ProjectionUncertainty,
+    image_grid,
+    projection_uncertainty,
+)
+from neurocal_cli.verdict.repeated_views import repeated_views, scaled_views
+from neurocal_cli.verdict.rules import Verdict, reach_verdict
+
+__all__ = ["judge", "judged"]
+
+_STEPS = 5  # a file's digits, and poses that were given, may lie off the minimum
+_DISTANT = 10.0  # times the distance of the farthest point
+_ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
+
+
+def judge(calibration: Calibration) -> Evidence:
+    """Measure how good a calibration is.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With its points.
+    """
+    return _Court(calibration).evidence()
+
+
+def judged(calibration: Calibration) -> Verdict | None:
+    """Good, usable or poor, with the reasons; None for a calibration that holds no points of its own."""
+    if not calibration.views or set(calibration.points.view_names) != set(calibration.views):
+        return None
+    return reach_verdict(calibration, judge(calibration))
+
+
+class _Court:
+    """A calibration taken back into normalised units, at its minimum."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        self.calibration, self.points = calibration, calibration.points
+        views = [calibration.views[name] for name in self.points.view_names]
+        self.seen = Seen(
+            calibration.K,
+            Lens(calibration.distortion_model, calibration.distortion),
+            np.stack([view.pose.R for view in views]),
+            np.stack([view.pose.t for view in views]),
+        )
+        predicted, _ = self.seen.predict(self.points.world, self.points.view_index)
+        self.views = weighed(self.points, self.points.pixels - predicted)
+        self.known = _known(calibration)
+        self.free = self.known.free_camera
+        self.free_poses = not all(view.fixed for view in views)
+        state = normalised(self.seen, self.views)
+        adjusted = adjust(self.views.batches, state, self.free, self.free_poses, _STEPS)
+        self.state, self.normal = adjusted.state, adjusted.normal
+        self.cost = float(self.normal[:, -1, -1].sum())
+        self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
+        self.spare = max(self.views.n_equations - self.unknowns, 1)
+
+    def evidence(self) -> Evidence:
+        views, free, poses = self.views, self.free, self.free_poses
+        errors = point_residuals(views, self.state)
+        cov = covariance(self.normal, free, poses, views.n_equations)
+        precision, contradiction = self._precision()
+        return Evidence(
+            rmse_px=self.calibration.rmse_px,
+            held_out_px=self._held_out(),
+            precision_px=precision,
+            contradiction=contradiction,
+            disagreement=self._disagreement(),
+            correlation=correlation(views, errors),
+            condition=1.0 / cov.smallest if cov.smallest > 0 else np.inf,
+            coverage=cover(self.points, views, self.state),
+            projection=self._projection(),
+            repeated=repeated_views(self.points),
+            scaled=scaled_views(self.points),
+            mirrored=tuple(seen_from_behind(views, self.state)),
+        )
+
+    def _held_out(self) -> float:
+        lost = held_out(self.views, self.state, self.normal, self.free, self.free_poses)
+        return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
+
+    def _precision(self) -> tuple[float, float]:
+        freedom = np.where(self.views.nearly_flat, 8, 11)
+        own_spare = self.views.n_equations - int(freedom.sum())
+        if own_spare <= 0 or freedom.sum() <= self.unknowns:
+            return np.nan, np.nan
+        own = float(free_networks(self.views, self.state).sum()) / own_spare
+        px = self.views.pixel_scale
+        floor = (1e-9 * px) ** 2
+        ratio = np.sqrt((self.cost / self.spare + floor) / (own + floor))
+        of_point = self.views.n_equations / len(self.points)
+        return float(np.sqrt(of_point * own)) * px, float(ratio)
+
+    def _disagreement(self) -> float:
+        if not self.free.any() or self.calibration.straight_lines is not None:
+            return np.nan
+        difference, cov = disagreement(self.views, self.state, self.normal, self.free, self.free_poses)
+        if not np.isfinite(cov).all():
+            return np.nan
+        scale = np.sqrt(np.diagonal(cov))
+        z = difference / scale
+        chi = z @ np.linalg.pinv(cov / np.outer(scale, scale), hermitian=True) @ z
+        return float(chi * self.spare / max(self.cost, 1e-300) / len(z))
+
+    def _projection(self) -> ProjectionUncertainty | None:
+        if self.points.image_size is None:
+            return None
+        view = self.points.view_index
+        depth = (self.seen.R[view, 2] * self.points.world).sum(axis=1) + self.seen.t[view, 2]
+        depths = np.append(np.quantile(depth, [0.0, 0.5, 1.0]), _DISTANT * depth.max())
+        return projection_uncertainty(
+            self.views, self.state, self.seen, self.normal, self.free, self.free_poses,
+            self.cost / self.spare, image_grid(self.points.image_size), depths,
+        )  # fmt: skip
+
+
+def _known(calibration: Calibration) -> Known:
+    """What was estimated: the rest is fixed."""
+    fixed = set(calibration.fixed)
+    if calibration.straight_lines is not None:
+        fixed |= set(coefficient_names(calibration.distortion_model))
+    free = np.array([name not in fixed for name in _ORDER])
+    lens = Lens(calibration.distortion_model, calibration.distortion)
+    free_lens = calibration.distortion_model != "none"
+    return Known(
+        calibration.type, calibration.K[ENTRIES], free, None, frozenset(fixed), None, lens, free_lens
+    )

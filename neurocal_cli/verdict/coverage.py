@@ -1,0 +1,69 @@
+"""How much of the image and of the directions in space the points cover."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+
+__all__ = ["Coverage", "cover"]
+
+_CELLS = 6  # across and down
+_THIRDS = (
+    ("upper left", "upper", "upper right"),
+    ("left", "middle", "right"),
+    ("lower left", "lower", "lower right"),
+)
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """What the points cover.
+
+    Attributes
+    ----------
+    image : float
+        Share of the image's cells, 6 x 6, that hold a point; nan where the image's size is unknown.
+    empty : str
+        The emptiest part of the image, as "upper left"; "" where none is.
+    outside : int
+        Points that lie outside the image.
+    tilt : float
+        Largest angle between two planes of targets [degrees]; 90 for targets that are not flat.
+    """
+
+    image: float
+    empty: str
+    outside: int
+    tilt: float
+
+
+def cover(points: Correspondences, views: Views, state: CameraState) -> Coverage:
+    """See what the points of a calibration cover."""
+    tilt = 90.0
+    if views.nearly_flat.all():
+        normals = (state.R @ views.basis)[:, :, 2]
+        smallest = np.abs(normals @ normals.T).min()
+        tilt = float(np.degrees(np.arccos(np.clip(smallest, 0, 1))))
+    if points.image_size is None:
+        return Coverage(np.nan, "", 0, tilt)
+    size = np.array(points.image_size, dtype=float)
+    inside = ((points.pixels >= -0.5) & (points.pixels <= size - 0.5)).all(axis=1)
+    held = _held(points.pixels[inside], size)
+    thirds = held.reshape(3, _CELLS // 3, 3, _CELLS // 3).mean(axis=(1, 3))
+    row, column = np.unravel_index(int(np.argmin(thirds)), thirds.shape)
+    empty = _THIRDS[row][column] if thirds[row, column] < 0.5 else ""
+    return Coverage(float(held.mean()), empty, int((~inside).sum()), tilt)
+
+
+def _held(pixels: Array, size: Array) -> Array:
+    """(6, 6) whether each cell of the image, row by row, holds a point."""
+    held = np.zeros((_CELLS, _CELLS))
+    column, row = np.clip(((pixels + 0.5) / size * _CELLS).astype(int), 0, _CELLS - 1).T
+    held[row, column] = 1.0
+    return held

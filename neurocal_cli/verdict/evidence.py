@@ -1,0 +1,55 @@
+"""What is measured of a calibration before it is judged."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from neurocal_cli.verdict.coverage import Coverage
+from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
+
+__all__ = ["Evidence"]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What was measured.
+
+    Attributes
+    ----------
+    rmse_px : float [px]
+        Of the calibration.
+    held_out_px : float [px]
+        Rms error on data left out in five folds; nan where nothing can be left out.
+    precision_px : float [px]
+        Rms error that free networks leave, one for each view, freedom accounted for; nan where they
+        are no freer than the camera.
+    contradiction : float
+        The camera's rms error, freedom accounted for, over `precision_px`; 1 for noise alone.
+    disagreement : float
+        Squared difference of two halves of the data over its covariance, for each parameter; 1 when
+        the reported standard deviations hold.
+    correlation : float
+        Of neighbours' residuals; 0 for noise.
+    condition : float
+        Of the normal matrix scaled to a unit diagonal.
+    coverage : Coverage
+    projection : ProjectionUncertainty or None
+        At the nearest, the middle and the farthest point's distance, and at ten times that; None
+        where the image's size is unknown.
+    repeated, scaled, mirrored : tuple of str
+        Views that are copies of others; whose points lie farther apart than the others'; that show the
+        target from its other side.
+    """
+
+    rmse_px: float
+    held_out_px: float
+    precision_px: float
+    contradiction: float
+    disagreement: float
+    correlation: float
+    condition: float
+    coverage: Coverage
+    projection: ProjectionUncertainty | None
+    repeated: tuple[str, ...]
+    scaled: tuple[str, ...]
+    mirrored: tuple[str, ...]

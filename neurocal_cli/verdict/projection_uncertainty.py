@@ -1,0 +1,138 @@
+"""How far the pixel of a point in space would move if the calibration were done again with other noise.
+
+A point is held in the frames of the target's views, as in mrcal: what the camera sees at a pixel and
+a depth is taken through every view's pose to the target and, with the perturbed poses, back; the mean
+of that is where the perturbed camera sees it. So a change of the camera that its poses follow costs
+nothing, as it costs nothing to who uses the camera.
+
+To first order the mean over views of the perturbed poses is a motion (omega, T) of the camera's frame,
+p -> p + omega x p + T, and all follows from the normal matrices: with the shared parameters' covariance
+S^-1 and each view's pose, given them, B^-1, the motion is G d + e with the means G of -M B^-1 C^T and
+cov(e) of M B^-1 M^T, M turning a view's pose steps into motions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.cross_validation import inverse
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, POSE, CameraState, camera_columns
+from neurocal_cli.bundle_adjustment.units import Seen
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.distortion_models import bend
+from neurocal_cli.camera.monotonic import undistort
+from neurocal_cli.geometry import Array, cross_matrix
+
+__all__ = ["ProjectionUncertainty", "image_grid", "projection_uncertainty"]
+
+_ACROSS = 21  # points across the image
+
+
+@dataclass(frozen=True, eq=False)
+class ProjectionUncertainty:
+    """Standard deviation of projected pixels over the image.
+
+    Attributes
+    ----------
+    pixels : (G, 2) array [px]
+        Places in the image; those that the lens cannot see are nan below.
+    depths : (D,) array
+        Distances along the optical axis [world unit].
+    std : (D, G) array [px]
+        Of the pixel's length of error, ``sqrt(var u + var v)``.
+    """
+
+    pixels: Array
+    depths: Array
+    std: Array
+
+
+def image_grid(size: tuple[int, int]) -> Array:
+    """Places all over an image, its corners among them; (G, 2)."""
+    width, height = size
+    down = max(2, round(_ACROSS * height / width))
+    u, v = np.meshgrid(np.linspace(0, width - 1, _ACROSS), np.linspace(0, height - 1, down))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def projection_uncertainty(
+    views: Views,
+    state: CameraState,
+    seen: Seen,
+    normal: Array,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    variance: float,
+    pixels: Array,
+    depths: Array,
+) -> ProjectionUncertainty:
+    """Propagate the covariance of a calibration.
+
+    Parameters
+    ----------
+    views, state, normal
+        At the minimum, normalised.
+    seen : Seen
+        The same in pixels and world units.
+    free : (5 + K,) bool array
+    free_poses : bool
+    variance : float
+        Of the residuals, normalised.
+    pixels : (G, 2) array [px]
+    depths : (D,) array
+    """
+    shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
+    gain, motion, camera = _covariances(views, state, normal, shared, free_poses)
+    by_camera, by_point, rays = _derivatives(seen, pixels, views.pixel_scale)
+    by_camera = by_camera[:, :, np.flatnonzero(free)]
+    std = np.empty((len(depths), len(pixels)))
+    for k, depth in enumerate(depths):
+        p = depth * rays
+        moved = np.concatenate([-cross_matrix(p), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2)
+        by_motion = by_point / depth @ moved  # (G, 2, 6)
+        J = by_camera + by_motion @ gain
+        covariance = J @ camera @ np.swapaxes(J, 1, 2) + by_motion @ motion @ np.swapaxes(by_motion, 1, 2)
+        std[k] = np.sqrt(variance * np.trace(covariance, axis1=1, axis2=2))
+    return ProjectionUncertainty(pixels, depths, std)
+
+
+def _covariances(
+    views: Views, state: CameraState, normal: Array, shared: NDArray[np.intp], free_poses: bool
+) -> tuple[Array, Array, Array]:
+    """Gain G (6, f), cov(e) (6, 6), S^-1 (f, f); world units, residuals of unit variance."""
+    S = normal[:, shared[:, None], shared].sum(axis=0)
+    if not free_poses:
+        return np.zeros((6, len(shared))), np.zeros((6, 6)), inverse(S)
+    V = views.n_views
+    B_inverse = inverse(normal[:, POSE, POSE])
+    C = normal[:, shared, POSE]
+    S = S - (C @ B_inverse @ np.swapaxes(C, 1, 2)).sum(axis=0)
+    M = np.zeros((V, 6, 6))
+    M[:, :3, :3] = np.eye(3)
+    M[:, 3:, :3] = views.scale[:, None, None] * cross_matrix(state.t)
+    M[:, 3:, 3:] = views.scale[:, None, None] * np.eye(3)
+    gain = -(M @ B_inverse @ np.swapaxes(C, 1, 2)).mean(axis=0)
+    motion = (M @ B_inverse @ np.swapaxes(M, 1, 2)).sum(axis=0) / V**2
+    return gain, motion, inverse(S)
+
+
+def _derivatives(seen: Seen, pixels: Array, scale: float) -> tuple[Array, Array, Array]:
+    """Of the pixels (G, 2) by the normalised camera (5 + K) and by points at depth 1; rays (G, 3)."""
+    a, s, b, u0, v0 = seen.A[ENTRIES]
+    y = (pixels[:, 1] - v0) / b
+    x = (pixels[:, 0] - u0 - s * y) / a
+    x, y = undistort(seen.lens.model, seen.lens.coefficients, x, y) if seen.lens.bends else (x, y)
+    (bx, by), (xx, xy, yx, yy), by_k = bend(seen.lens.model, seen.lens.coefficients, x, y)
+    by_camera = np.zeros((len(pixels), 2, 5 + len(by_k)))
+    by_camera[:, 0, 0], by_camera[:, 0, 1], by_camera[:, 0, 3] = scale * bx, scale * by, scale
+    by_camera[:, 1, 2], by_camera[:, 1, 4] = scale * by, scale
+    for k, (dx, dy) in enumerate(by_k):
+        by_camera[:, 0, 5 + k], by_camera[:, 1, 5 + k] = a * dx + s * dy, b * dy
+    by_image = np.stack([np.stack([xx, xy], -1), np.stack([yx, yy], -1)], 1)  # bent by straight
+    by_straight = np.array([[a, s], [0.0, b]]) @ by_image
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    by_ray = np.stack([np.stack([one, zero, -x], -1), np.stack([zero, one, -y], -1)], 1)
+    return by_camera, by_straight @ by_ray, np.column_stack([x, y, one])

@@ -1,0 +1,208 @@
+"""One word on a calibration, good, usable or poor, with the reasons and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.verdict.evidence import Evidence
+
+__all__ = ["Verdict", "reach_verdict"]
+
+
+@dataclass(frozen=True)
+class _Limit:
+    """From where on a quantity is no longer good, and from where on it is poor."""
+
+    good: float
+    poor: float
+
+    def grade(self, value: float) -> int:
+        """0 good, 1 usable, 2 poor; what is unknown is good."""
+        return int(value > self.good) + int(value > self.poor)
+
+
+_ERROR = _Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
+_CONTRADICTION = _Limit(1.6, 2.3)
+_HELD_OUT = _Limit(1.3, 2.0)  # over the rms error
+_DISAGREEMENT = _Limit(6.0, 40.0)
+_CORRELATION = _Limit(0.5, 0.85)
+_UNCOVERED = _Limit(0.6, 0.9)  # share of the image
+_FLAT = _Limit(-20.0, -5.0)  # degrees of tilt, negative
+_ALPHA = _Limit(0.01, 0.05)  # std over the value
+_CENTRE = _Limit(0.01, 0.05)  # std over alpha
+_PROJECTION = _Limit(0.0025, 0.02)  # worst std in the image over its diagonal
+_REJECTED = _Limit(0.02, 0.2)  # share of the points
+_OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
+_TOLD = 3.0  # standard deviations
+
+_Finding = tuple[int, str, str]  # grade, reason, advice
+
+
+def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
+    """Weigh the evidence.
+
+    Returns
+    -------
+    Verdict
+    """
+    findings = [f for f in _findings(calibration, evidence) if f[0] > 0]
+    findings.sort(key=lambda f: -f[0])
+    word = ("good", "usable", "poor")[max((f[0] for f in findings), default=0)]
+    advice = tuple(dict.fromkeys(f[2] for f in findings if f[2]))
+    projection = evidence.projection
+    worst = float(np.nanmax(projection.std[1])) if projection is not None else float("nan")
+    measures = {
+        "held_out_px": evidence.held_out_px,
+        "precision_px": evidence.precision_px,
+        "contradiction": evidence.contradiction,
+        "disagreement": evidence.disagreement,
+        "correlation": evidence.correlation,
+        "coverage": evidence.coverage.image,
+        "tilt_deg": evidence.coverage.tilt,
+        "projection_px": worst,
+        "condition": evidence.condition,
+    }
+    return Verdict(word, tuple(f[1] for f in findings), advice, measures)
+
+
+def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[_Finding]:
+    if not calibration.converged:
+        yield 2, f"training did not converge: {calibration.stop_reason}", "give more --starts"
+    yield from _errors(calibration, evidence)
+    yield from _data(calibration, evidence)
+    yield from _coverage(calibration, evidence)
+    yield from _parameters(calibration, evidence)
+
+
+def _errors(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
+    points = calibration.points
+    spread = float(np.sqrt(points.pixels.var(axis=0).sum()))
+    size = points.image_size or np.ptp(points.pixels, axis=0)
+    pairing = "check that each pixel belongs to its point, and that the target is as its points say"
+    yield (
+        _ERROR.grade(e.rmse_px / float(np.hypot(*size))),
+        f"an rms error of {e.rmse_px:.3g} px is large",
+        pairing,
+    )
+    if e.rmse_px > 1e-4 * spread:
+        yield (
+            _CONTRADICTION.grade(e.contradiction),
+            f"views with a camera each would leave {e.precision_px:.3g} px, the common camera leaves "
+            f"{e.contradiction:.2g} times that",
+            "check that all views are of one camera at one zoom and focus, that the target is flat and its "
+            "squares are square, and what is given",
+        )
+    if e.rmse_px > 1e-6 * spread:
+        yield (
+            _HELD_OUT.grade(e.held_out_px / e.rmse_px),
+            f"the error on data left out is {e.held_out_px:.3g} px, that on all {e.rmse_px:.3g} px",
+            "give more points and views",
+        )
+        yield (
+            _DISAGREEMENT.grade(e.disagreement),
+            f"two halves of the data disagree: {np.sqrt(e.disagreement):.1f} times the standard deviations",
+            "the true errors are as many times larger; look for a wrong view or a board that is not flat",
+        )
+        yield (
+            _CORRELATION.grade(e.correlation) if e.rmse_px > 1e-4 * spread else 0,
+            f"neighbouring points err alike (correlation {e.correlation:.2f}): the lens or the target is not "
+            "as modelled",
+            "try another --distortion, or measure the target",
+        )
+
+
+def _data(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
+    rejected = calibration.rejected
+    total = len(calibration.points) + len(rejected)
+    share = len(rejected) / total
+    yield (
+        max(_REJECTED.grade(share), int(bool(rejected.views))),
+        f"{len(rejected)} of {total} points contradict the others and were left out",
+        "look at the points and views that are named",
+    )
+    if e.repeated:
+        yield 1, f"{_names(e.repeated)}: rows given before, fewer data than it seems", "give each view once"
+    if e.scaled:
+        yield (
+            1,
+            f"{_names(e.scaled)}: points at other distances than in most views",
+            "check the unit of X,Y,Z and the size of the squares",
+        )
+    if e.mirrored:
+        yield 1, f"{_names(e.mirrored)}: the target is mirrored", "check the order of their points"
+    if e.coverage.outside:
+        yield 2, f"{e.coverage.outside} points lie outside the image", "correct image_size, or the points"
+
+
+def _coverage(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
+    if calibration.type in (3,):
+        return
+    cover = e.coverage
+    if np.isfinite(cover.image):
+        where = f", most of all {cover.empty}" if cover.empty else ""
+        yield (
+            _UNCOVERED.grade(1 - cover.image),
+            f"points cover {100 * cover.image:.0f} % of the image",
+            f"add views with the target elsewhere in the image{where}",
+        )
+    if calibration.type in (1, 2) and len(calibration.views) > 1:
+        yield (
+            _FLAT.grade(-cover.tilt),
+            f"the boards differ by {cover.tilt:.0f} degrees of tilt at most",
+            "add views with the board tilted by 30 to 45 degrees, to several sides",
+        )
+
+
+def _parameters(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
+    A, std, fixed = calibration.intrinsics, calibration.std, calibration.fixed
+    more = "add views that fill the image, near and tilted"
+    if "alpha_u" not in fixed:
+        share = max(std["alpha_u"] / A.alpha_u, std["alpha_v"] / A.alpha_v)
+        yield _ALPHA.grade(share), f"the focal length is known to {100 * share:.2g} %", more
+    if "u0" not in fixed:
+        centre = max(std["u0"], std["v0"])
+        yield _CENTRE.grade(centre / A.alpha_u), f"the image centre is known to {centre:.2g} px", more
+    if e.projection is not None and calibration.type != 3:
+        worst = float(np.nanmax(e.projection.std[1]))
+        diagonal = float(np.hypot(*(calibration.image_size or (np.nan, np.nan))))
+        yield _PROJECTION.grade(worst / diagonal), f"pixels are predicted to {worst:.2g} px at worst", more
+    if calibration.type == 3:
+        return
+    ratio = A.alpha_u / A.alpha_v
+    told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
+    if abs(ratio - 1) > _OBLONG + told:
+        yield (
+            1,
+            f"the pixels are not square, alpha_u / alpha_v = {ratio:.3f}",
+            "right for a few cameras; else check the size of the squares along X and Y",
+        )
+    if "theta" not in fixed and abs(A.theta - np.pi / 2) > _SKEW + _TOLD * std["theta"]:
+        yield (
+            1,
+            f"the image axes are not at right angles, theta = {np.degrees(A.theta):.1f} degrees",
+            "hardly any camera is so: check the target, or give --no-skew",
+        )
+    yield from _off_centre(calibration)
+
+
+def _off_centre(calibration: Calibration) -> Iterator[_Finding]:
+    A, size = calibration.intrinsics, calibration.image_size
+    if size is None or ("u0" in calibration.fixed and calibration.type != 2):
+        return
+    off = np.abs(np.array([A.u0, A.v0]) - (np.array(size) - 1) / 2)
+    uncertain = _TOLD * np.array([calibration.std["u0"], calibration.std["v0"]])
+    if (off > _OFF_CENTRE * np.array(size) + uncertain).any():
+        yield (
+            1,
+            f"the image centre ({A.u0:.0f}, {A.v0:.0f}) is far from the middle of the image",
+            "right for a cropped image; else check image_size and the order of u and v",
+        )
+
+
+def _names(names: tuple[str, ...]) -> str:
+    shown = ", ".join(names[:3])
+    return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")

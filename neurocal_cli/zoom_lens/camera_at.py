@@ -1,0 +1,89 @@
+"""The camera that a lens is at one setting."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration, ViewResult
+from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.geometry import Array, euler_jacobian
+from neurocal_cli.points import Correspondences
+from neurocal_cli.zoom_lens.settings import describe
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+
+__all__ = ["camera_at"]
+
+_VIEW = "view"  # the name of points that name none, so that they are judged with this pose
+
+
+def camera_at(
+    lens: ZoomLens, setting: Array, camera_name: str = "camera", warnings: tuple[str, ...] = ()
+) -> Calibration:
+    """Calibration at a setting, with standard deviations; it holds no points.
+
+    Parameters
+    ----------
+    lens : ZoomLens
+    setting : (D,) array
+        In the order of the lens's controls.
+    camera_name : str
+    warnings : tuple of str
+        To be kept with it.
+
+    Raises
+    ------
+    InputError
+        No camera there.
+    """
+    prediction = lens.predict(np.asarray(setting, dtype=float)[None])
+    values, std = prediction.local[0], prediction.std[0]
+    model = coefficient_names(lens.model)
+    L, K = len(lens.names), len(model)
+    has_theta = prediction.covariance.shape[1] > L and lens.free_theta
+    free = ["alpha_u", "alpha_v", "u0", "v0", *(["theta"] if has_theta else []), *model]
+    place = {name: k for k, name in enumerate(lens.names)} | {"theta": L}
+    order = [place[name] for name in free]
+    spread = {name: float(std[place[name]]) for name in free}
+    if not has_theta:
+        spread["theta"] = 0.0
+    theta = prediction.constants.theta if lens.free_theta else np.pi / 2
+    return Calibration(
+        intrinsics=Intrinsics(values[0], values[1], values[2], values[3], theta),
+        std=spread,
+        fixed=frozenset() if has_theta else frozenset({"theta"}),
+        views=_pose(
+            lens,
+            prediction.local[0],
+            prediction.constants.R,
+            prediction.constants.t,
+            prediction.covariance[0],
+        ),
+        points=Correspondences.none(lens.image_size, lens.unit),
+        type=1,
+        method="lens",
+        trainer=lens.training,
+        seed=lens.seed,
+        converged=lens.converged,
+        stop_reason=f"given by a lens at {describe(lens.controls, np.asarray(setting, dtype=float))}",
+        rmse_px=float("nan"),
+        max_px=float("nan"),
+        distortion_model=lens.model,
+        distortion=values[L - K :].copy() if K else np.zeros(0),
+        covariance=prediction.covariance[0][np.ix_(order, order)],
+        covariance_names=tuple(free),
+        camera_name=camera_name,
+        warnings=warnings,
+    )
+
+
+def _pose(lens: ZoomLens, local: Array, R: Array, t: Array, covariance: Array) -> dict[str, ViewResult]:
+    """The pose of a camera that stood still."""
+    if not lens.still:
+        return {}
+    L = len(lens.names)
+    angles = euler_jacobian(R) @ covariance[L + 1 : L + 4, L + 1 : L + 4] @ euler_jacobian(R).T
+    variances = [*np.diagonal(angles), *np.diagonal(covariance)[L + 4 : L + 6], covariance[4, 4]]
+    std = dict(zip(POSE_NAMES, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))
+    pose = Pose(R, np.array([t[0], t[1], local[4]]))
+    return {_VIEW: ViewResult(pose, std, 0, float("nan"))}

@@ -1,0 +1,208 @@
+"""How well a lens predicts points at any settings, and how well its rivals do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from neurocal_cli.camera.distortion_models import Lens, coefficient_names, distort
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.errors import InputError, NeurocalError
+from neurocal_cli.geometry import Array
+from neurocal_cli.methods import calibrate
+from neurocal_cli.zoom_lens.baseline_models import rivals_of
+from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData
+from neurocal_cli.zoom_lens.settings import LensPoints, describe
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+
+__all__ = ["LensEvaluation", "SettingError", "evaluate_lens"]
+
+
+@dataclass(frozen=True)
+class SettingError:
+    """Error at one setting.
+
+    Attributes
+    ----------
+    values : dict of float by control
+    n_points : int
+    rmse_px, max_px : float [px]
+    """
+
+    values: Mapping[str, float]
+    n_points: int
+    rmse_px: float
+    max_px: float
+
+
+@dataclass(frozen=True)
+class LensEvaluation:
+    """Error of a lens at the settings of some points.
+
+    Attributes
+    ----------
+    n_points : int
+    rmse_px, max_px : float [px]
+        Over all points.
+    settings : tuple of SettingError
+        In ascending order.
+    rivals : dict of float by name [px]
+        Rms error of the usual models of the same calibration data; nan where one has no camera.
+    warnings : tuple of str
+    """
+
+    n_points: int
+    rmse_px: float
+    max_px: float
+    settings: tuple[SettingError, ...]
+    rivals: Mapping[str, float]
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """A camera with a lens, for fitting a pose."""
+
+    intrinsics: Intrinsics
+    distortion_model: str
+    distortion: Array
+
+
+def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
+    """Reprojection error at the settings of points.
+
+    A still camera is judged with its own pose. For a moving one, and for known cameras, the pose of
+    each view is fitted with the intrinsic parameters held, for each rival as well.
+
+    Raises
+    ------
+    InputError
+        Points without the controls of the lens, or of another image size.
+    """
+    points, warnings = _matched(lens, points)
+    x = lens.scaled(points.settings)
+    prediction = lens.predict(points.settings)
+    local, constants = prediction.local, prediction.constants
+    if not lens.still:
+        constants = _poses(lens, points, local, constants.theta)
+    squares = _squares(lens, points, local, constants)
+    setting = points.point_setting
+    behind = int(np.isnan(squares).sum())
+    if behind:
+        warnings.append(f"{behind} of {len(squares)} points lie behind the camera and are in no average")
+    rivals = {}
+    for name, rival in rivals_of(lens).items():
+        rivals[name] = _rival_error(lens, points, *rival(x), constants)
+    return LensEvaluation(
+        n_points=len(squares),
+        rmse_px=_rms(squares),
+        max_px=float(np.sqrt(np.nanmax(squares))) if behind < len(squares) else np.nan,
+        settings=tuple(_setting(points, s, squares[setting == s]) for s in range(points.n_settings)),
+        rivals=rivals,
+        warnings=tuple(warnings),
+    )
+
+
+def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]:
+    """The points with the controls of the lens, in its order, and what to warn of."""
+    source = points.points.source
+    missing = [name for name in lens.controls if name not in points.controls]
+    if missing:
+        raise InputError(
+            f"{source}: there is no column {missing[0]}, which this lens was calibrated over; name the "
+            "setting of "
+            "each point"
+        )
+    here, there = points.points.image_size, lens.image_size
+    if here is not None and there is not None and here != there:
+        raise InputError(
+            f"{source}: the points' image_size {here[0]} x {here[1]} differs from the lens's "
+            f"{there[0]} x {there[1]}"
+        )
+    columns = dict(zip(points.controls, points.settings[points.point_setting].T, strict=True))
+    # Every point counts the same, as in any reprojection error.
+    plain = replace(points.points, covariance=None, across=None)
+    matched = LensPoints.grouped(plain, {name: columns[name] for name in lens.controls})
+    outside = np.asarray(((matched.settings < lens.low) | (matched.settings > lens.high)).any(axis=1))
+    warnings = []
+    if outside.any():
+        first = describe(lens.controls, matched.settings[int(np.argmax(outside))])
+        warnings.append(
+            f"{int(outside.sum())} of {len(outside)} settings lie outside the calibrated range, the "
+            f"first at {first}: "
+            "what the networks say there is a guess"
+        )
+    return matched, warnings
+
+
+def _poses(lens: ZoomLens, points: LensPoints, local: Array, theta: float) -> Constants:
+    """Pose of each view, the camera being known (type 3)."""
+    V = points.points.n_views
+    R, t = np.empty((V, 3, 3)), np.empty((V, 3))
+    number = {name: k for k, name in enumerate(points.points.view_names)}
+    n_k = len(coefficient_names(lens.model))
+    for s, values in enumerate(local):
+        camera = _Known(
+            Intrinsics(values[0], values[1], values[2], values[3], theta),
+            lens.model,
+            Lens(lens.model, values[len(values) - n_k :]).coefficients,
+        )
+        part = points.points.select(points.point_setting == s)
+        try:
+            fit = calibrate(part, type=3, intrinsics=camera, distortion="none", outliers="keep")
+        except NeurocalError as error:
+            where = describe(points.controls, points.settings[s])
+            raise InputError(f"at {where}: {error}") from error
+        for name, view in fit.views.items():
+            R[number[name]], t[number[name]] = view.pose.R, view.pose.t
+    return Constants(theta, R, t)
+
+
+def _squares(lens: ZoomLens, points: LensPoints, local: Array, constants: Constants) -> Array:
+    """(N,) squared pixel errors; nan for points that are not in front of the camera."""
+    p = local[points.point_setting]
+    world, pixels, view = points.points.world, points.points.pixels, points.points.view_index
+    if lens.still:
+        camera = world @ constants.R.T + np.column_stack([np.tile(constants.t, (len(p), 1)), p[:, 4]])
+    else:
+        camera = np.einsum("nij,nj->ni", constants.R[view], world) + constants.t[view]
+    depth = np.where(camera[:, 2] > 0, camera[:, 2], np.nan)
+    image_x, image_y = camera[:, 0] / depth, camera[:, 1] / depth
+    if lens.model != "none":
+        n_k = len(coefficient_names(lens.model))
+        image_x, image_y = distort(lens.model, p[:, p.shape[1] - n_k :].T, image_x, image_y)
+    sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
+    u = p[:, 0] * (image_x - cosine / sine * image_y) + p[:, 2]
+    v = p[:, 1] / sine * image_y + p[:, 3]
+    return np.asarray((u - pixels[:, 0]) ** 2 + (v - pixels[:, 1]) ** 2)
+
+
+def _rival_error(
+    lens: ZoomLens, points: LensPoints, local: Array, constants: Constants, fitted: Constants
+) -> float:
+    """Rms error of one rival; its views' poses start from those of the lens."""
+    if not (np.isfinite(local).all() and (local[:, :2] > 0).all()):
+        return np.nan
+    if not lens.still:
+        if not np.isfinite(fitted.R).all():
+            return np.nan
+        n_k = len(coefficient_names(lens.model))
+        # A table of known cameras may hold t_z, which poses replace.
+        intrinsic = np.column_stack([local[:, :4], local[:, local.shape[1] - n_k :]])
+        data = PixelData.of(points, False, lens.model, True)
+        _, constants = data.linearise(intrinsic, replace(fitted, theta=constants.theta))
+    return _rms(_squares(lens, points, local, constants))
+
+
+def _rms(squares: Array) -> float:
+    seen = squares[np.isfinite(squares)]
+    return float(np.sqrt(seen.mean())) if len(seen) else np.nan
+
+
+def _setting(points: LensPoints, s: int, squares: Array) -> SettingError:
+    seen = squares[np.isfinite(squares)]
+    largest = float(np.sqrt(seen.max())) if len(seen) else np.nan
+    values = dict(zip(points.controls, points.settings[s].tolist(), strict=True))
+    return SettingError(values, len(squares), _rms(squares), largest)

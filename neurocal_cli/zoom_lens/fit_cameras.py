@@ -1,0 +1,170 @@
+"""`fit_lens_cameras`: known cameras at many settings in, a lens out; only step 2 of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.zoom_lens.committee import Budget, fit_committee
+from neurocal_cli.zoom_lens.initialisation import check_settings
+from neurocal_cli.zoom_lens.parameter_networks import LensNets, local_to_outputs
+from neurocal_cli.zoom_lens.setting_normals import Constants, Normal
+from neurocal_cli.zoom_lens.settings import CONTROLS
+from neurocal_cli.zoom_lens.zoom_lens import Member, TableRecord, ZoomLens
+
+__all__ = ["LensCameras", "fit_lens_cameras"]
+
+_INTRINSIC = ("alpha_u", "alpha_v", "u0", "v0")
+_MEMBERS = 4
+_EXACT = 1e-6  # share of itself to which a parameter counts as given, if it does not scatter at all
+
+
+@dataclass(frozen=True, eq=False)
+class LensCameras:
+    """Cameras that are known at some settings, with errors that are not.
+
+    Attributes
+    ----------
+    controls : tuple of str
+    settings : (S, D) array
+    names : tuple of str
+        alpha_u, alpha_v, u0, v0, perhaps t_z, and the distortion coefficients.
+    local : (S, L) array
+    image_size : (width, height), optional
+    unit : str
+    source : str
+    model : str
+        Lens model.
+    theta : float [rad]
+        Of all of them.
+    """
+
+    controls: tuple[str, ...]
+    settings: Array
+    names: tuple[str, ...]
+    local: Array
+    image_size: tuple[int, int] | None = None
+    unit: str = "mm"
+    source: str = "cameras"
+    model: str = "none"
+    theta: float = np.pi / 2
+
+    @classmethod
+    def of(
+        cls,
+        columns: Mapping[str, Array],
+        image_size: tuple[int, int] | None = None,
+        unit: str = "mm",
+        source: str = "cameras",
+        model: str = "none",
+        theta: float = np.pi / 2,
+    ) -> LensCameras:
+        """Take columns zoom and/or focus, alpha_u, alpha_v, u0, v0, perhaps t_z, and coefficients, (S,) each.
+
+        Raises
+        ------
+        InputError
+            A column that is missing, values that no camera has, one setting only.
+        """
+        controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
+        coefficients = coefficient_names(model)
+        missing = [name for name in (*_INTRINSIC, *coefficients) if columns.get(name) is None]
+        if not controls or missing:
+            lacking = missing[0] if missing else "zoom or focus"
+            raise InputError(
+                f"{source}: there is no column {lacking}; known cameras need zoom and/or focus, "
+                "alpha_u, alpha_v, u0, v0"
+            )
+        t_z = ["t_z"] if columns.get("t_z") is not None else []
+        names = (*_INTRINSIC, *t_z, *coefficients)
+        settings = np.column_stack([np.asarray(columns[name], dtype=float) for name in controls])
+        local = np.column_stack([np.asarray(columns[name], dtype=float) for name in names])
+        if not (np.isfinite(settings).all() and np.isfinite(local).all()):
+            raise InputError(f"{source}: the settings and parameters must be finite numbers")
+        if not (local[:, :2] > 0).all():
+            row = int(np.argmin((local[:, :2] > 0).all(axis=1)))
+            raise InputError(f"{source}, row {row + 1}: alpha_u and alpha_v must be positive")
+        moves = np.ptp(settings, axis=0) > 0
+        if not moves.any():
+            raise InputError(f"{source}: all cameras are at one setting; a lens needs several")
+        controls = tuple(name for name, moving in zip(controls, moves, strict=True) if moving)
+        order = np.lexsort(settings[:, moves].T[::-1])
+        moving_settings = settings[order][:, moves]
+        return cls(controls, moving_settings, names, local[order], image_size, unit, source, model, theta)
+
+
+def fit_lens_cameras(
+    cameras: LensCameras,
+    seed: int = 0,
+    *,
+    topologies: tuple[tuple[int, int], ...] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> ZoomLens:
+    """Fit networks to known cameras; the noise of the parameters is told from their scatter.
+
+    Raises
+    ------
+    InputError
+        Too few settings.
+    """
+    report = progress or (lambda stage, share: None)
+    distinct = len(np.unique(cameras.settings, axis=0))
+    check_settings(distinct, len(cameras.controls), cameras.source)
+    low, high = cameras.settings.min(axis=0), cameras.settings.max(axis=0)
+    x = 2 * (cameras.settings - low) / (high - low) - 1
+    L, S = len(cameras.names), len(x)
+    budget = Budget(topologies=topologies)
+    empty = Normal(np.zeros((0, L, L)), np.zeros((0, L)), np.zeros(0), True)
+    members = fit_committee(
+        x,
+        cameras.names,
+        cameras.local,
+        empty,
+        1.0,
+        np.random.default_rng(seed),
+        replace(budget, members=_MEMBERS),
+        lambda share: report("fitting a network to each parameter", share),
+    )
+    constants = Constants(cameras.theta, np.eye(3), np.zeros(2))
+    table = TableRecord(cameras.local, constants, _scatter_normal(members, cameras.local))
+    return ZoomLens(
+        controls=cameras.controls,
+        settings=cameras.settings,
+        names=cameras.names,
+        model=cameras.model,
+        still=False,
+        known=True,
+        members=tuple(Member(nets, constants) for nets in members),
+        tables=table,
+        static=table,
+        variance=1.0,
+        scatter=np.zeros(L),
+        free_theta=cameras.theta != np.pi / 2,
+        counts=np.zeros(S, dtype=np.int64),
+        rmse=np.full(S, np.nan),
+        rejected=(),
+        left_out_px=np.nan,
+        training="one at a time",
+        seed=seed,
+        converged=True,
+        image_size=cameras.image_size,
+        unit=cameras.unit,
+    )
+
+
+def _scatter_normal(members: tuple[LensNets, ...], local: Array) -> Normal:
+    """Inverse covariances of the given parameters, from the scatter about the networks."""
+    scatter = np.median([[net.scatter for net in nets.nets] for nets in members], axis=0)
+    outputs, by_local = local_to_outputs(members[0].scale, local)
+    size = np.abs(np.median(outputs, axis=0))
+    size[1] = 1.0  # log(alpha_v / alpha_u): a ratio of 1 is 0
+    scatter = np.maximum(scatter, (_EXACT * size) ** 2)
+    H = np.swapaxes(by_local, 1, 2) @ (by_local / scatter[:, None])
+    H = np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2)  # exactly symmetric, as a file of it will be
+    S, L = local.shape
+    return Normal(H, np.zeros((S, L)), np.zeros(S), True)

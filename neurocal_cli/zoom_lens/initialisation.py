@@ -1,0 +1,122 @@
+"""Step 1 of a lens: the calibrating net at each setting, without settings whose pixels do not fit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.zoom_lens.committee import Budget
+from neurocal_cli.zoom_lens.outlier_settings import bad_pixels
+from neurocal_cli.zoom_lens.setting_normals import PixelData
+from neurocal_cli.zoom_lens.settings import LensPoints, scaled_controls
+from neurocal_cli.zoom_lens.static_calibration import (
+    StaticFit,
+    Tables,
+    calibrate_each,
+    common_tables,
+    first_constants,
+)
+from neurocal_cli.zoom_lens.zoom_lens import Rejected
+
+__all__ = ["Options", "Progress", "Start", "begin", "check_settings", "without"]
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Options:
+    """What the user asked for; see `fit_lens`."""
+
+    training: str
+    still: bool
+    free_theta: bool
+    budget: Budget
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """What step 1 found."""
+
+    lens: LensPoints
+    data: PixelData
+    static: StaticFit
+    tables: Tables
+    rejected: tuple[Rejected, ...]
+
+    @property
+    def controls(self) -> Array:
+        """(S, C) settings on the scale of the networks' inputs."""
+        settings = self.lens.settings
+        return scaled_controls(settings, settings.min(axis=0), settings.max(axis=0))
+
+    @property
+    def variance(self) -> float:
+        """Of the noise of one coordinate [px^2], from the residuals of the tables."""
+        n, S = self.data.views.n_equations, self.lens.n_settings
+        unknowns = S * len(self.data.names) + (6 if self.data.still else 1 + 6 * self.lens.points.n_views)
+        return float(max(self.tables.normal.cost.sum() / max(n - unknowns, 1), 1e-18))
+
+
+def check_settings(count: int, controls: int, source: str) -> None:
+    """Refuse too few settings to tell how anything changes.
+
+    Raises
+    ------
+    InputError
+    """
+    least = controls + 2
+    if count < least:
+        raise InputError(
+            f"{source}: there are {count} settings, too few to follow {controls} "
+            f"control{'s' * (controls > 1)}; "
+            f"give at least {least}, and better 5 of each"
+        )
+
+
+def begin(lens: LensPoints, model: str, options: Options, reject: bool, report: Progress) -> Start:
+    """Step 1, without the settings whose pixels do not fit."""
+    rejected: list[Rejected] = []
+    data = PixelData.of(lens, options.still, model, options.free_theta)
+    static = calibrate_each(lens, data, options.seed, options.free_theta, report)
+    while True:
+        tables = common_tables(data, static.local, first_constants(static, lens, options.still), report)
+        if not tables.normal.sensible or not np.isfinite(tables.normal.cost).all():
+            raise DegenerateGeometryError(
+                f"{lens.points.source}: no constants were found that all settings share; did the "
+                "camera or the "
+                "target move? Then give each setting several views of the board, --camera moving"
+            )
+        bad = bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if reject else None
+        if bad is None or len(rejected) >= max(1, lens.n_settings // 5):
+            return Start(lens, data, static, tables, tuple(rejected))
+        rejected.append(Rejected(tuple(lens.settings[bad.setting].tolist()), bad.reason))
+        keep = np.arange(lens.n_settings) != bad.setting
+        lens, data, static = without(lens, static, keep, model, options)
+
+
+def without(
+    lens: LensPoints, static: StaticFit, keep: NDArray[np.bool_], model: str, options: Options
+) -> tuple[LensPoints, PixelData, StaticFit]:
+    """The data without some settings; nothing is calibrated again."""
+    views = keep[lens.view_setting]
+    rest = lens.select(keep)
+    check_settings(rest.n_settings, len(rest.controls), lens.points.source)
+    number = {name: k for k, name in enumerate(lens.points.view_names)}
+    order = [number[name] for name in rest.points.view_names]
+    assert views[order].all()
+    part = replace(
+        static,
+        local=static.local[keep],
+        theta=static.theta[keep],
+        R=static.R[order],
+        t=static.t[order],
+        good=static.good[keep],
+        rmse=static.rmse[keep],
+    )
+    return rest, PixelData.of(rest, options.still, model, options.free_theta), part

@@ -1,0 +1,160 @@
+"""The networks of one lens: each gives one camera parameter at any setting.
+
+A network's output is preconditioned: it is centred and scaled, and stands for alpha_u on a logarithmic,
+plain or reciprocal scale, whichever its data are simplest on (`Scale`), and for log(alpha_v / alpha_u),
+as the shape of the pixels hardly changes with the lens. u0, v0, t_z and the distortion coefficients
+are taken as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.zoom_lens.mlfn import Topology, respond, respond_with_jacobian
+from neurocal_cli.zoom_lens.network_training import prior_precision
+
+__all__ = [
+    "SCALES",
+    "LensNets",
+    "ParameterNet",
+    "from_scale",
+    "local_to_outputs",
+    "outputs_to_local",
+    "split",
+    "to_scale",
+]
+
+SCALES = ("log", "linear", "inverse")
+
+
+def to_scale(scale: str, alpha: Array) -> tuple[Array, Array]:
+    """Values on a scale and their derivatives by the value."""
+    if scale == "log":
+        return np.log(alpha), 1 / alpha
+    if scale == "inverse":
+        return 1 / alpha, -1 / alpha**2
+    return np.asarray(alpha, dtype=float), np.ones_like(alpha)
+
+
+def from_scale(scale: str, y: Array) -> tuple[Array, Array]:
+    """Values from a scale and their derivatives by y."""
+    if scale == "log":
+        alpha = np.exp(y)
+        return alpha, alpha
+    if scale == "inverse":
+        return 1 / y, -1 / y**2
+    return np.asarray(y, dtype=float), np.ones_like(y)
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterNet:
+    """One network with its output's preconditioning.
+
+    Attributes
+    ----------
+    topology : Topology
+    weights : (P,) array
+    precision : (G,) array
+        Of the weights' priors.
+    centre, spread : float
+        Output = centre + spread y.
+    scatter : float
+        Variance of the output from setting to setting beyond what the network follows.
+    """
+
+    topology: Topology
+    weights: Array
+    precision: Array
+    centre: float
+    spread: float
+    scatter: float = 0.0
+
+    def output(self, x: Array) -> Array:
+        """(n,) outputs at scaled controls (n, D)."""
+        return self.centre + self.spread * respond(self.topology, self.weights[None], x)[0]
+
+    def output_with_jacobian(self, x: Array) -> tuple[Array, Array]:
+        """Outputs (n,) and their derivatives by the weights (n, P)."""
+        y, J = respond_with_jacobian(self.topology, self.weights[None], x)
+        return self.centre + self.spread * y[0], self.spread * J[0]
+
+    @property
+    def prior(self) -> Array:
+        """(P,) precision of each weight's prior."""
+        return prior_precision(self.topology, self.precision)
+
+
+@dataclass(frozen=True, eq=False)
+class LensNets:
+    """One network for each local parameter: alpha_u, alpha_v, u0, v0, and then t_z and distortion.
+
+    Attributes
+    ----------
+    scale : str
+        Of alpha_u's network, one of `SCALES`.
+    nets : tuple of ParameterNet
+    """
+
+    scale: str
+    nets: tuple[ParameterNet, ...]
+
+    @property
+    def weights(self) -> Array:
+        """(P,) weights of all networks, one after the other."""
+        return np.concatenate([net.weights for net in self.nets])
+
+    @property
+    def prior(self) -> Array:
+        """(P,) precisions of their priors."""
+        return np.concatenate([net.prior for net in self.nets])
+
+    def moved(self, step: Array) -> LensNets:
+        """After a step (P,) of all weights."""
+        parts = split(self.nets, step)
+        return replace(
+            self,
+            nets=tuple(
+                replace(net, weights=net.weights + part) for net, part in zip(self.nets, parts, strict=True)
+            ),
+        )
+
+    def local(self, x: Array) -> Array:
+        """(n, L) local parameters at scaled controls (n, D)."""
+        return outputs_to_local(self.scale, np.column_stack([net.output(x) for net in self.nets]))[0]
+
+    def local_with_jacobians(self, x: Array) -> tuple[Array, list[Array]]:
+        """Local parameters (n, L) and their derivatives by each network's weights (n, L, P)."""
+        pairs = [net.output_with_jacobian(x) for net in self.nets]
+        local, by_output = outputs_to_local(self.scale, np.column_stack([y for y, _ in pairs]))
+        return local, [by_output[:, :, j, None] * J[:, None] for j, (_, J) in enumerate(pairs)]
+
+
+def outputs_to_local(scale: str, outputs: Array) -> tuple[Array, Array]:
+    """Local parameters (n, L) from the networks' outputs (n, L), and derivatives (n, L, L)."""
+    local, n, L = outputs.copy(), *outputs.shape
+    by_output = np.tile(np.eye(L), (n, 1, 1))
+    local[:, 0], by_output[:, 0, 0] = from_scale(scale, outputs[:, 0])
+    ratio = np.exp(outputs[:, 1])
+    local[:, 1] = local[:, 0] * ratio
+    by_output[:, 1, 0], by_output[:, 1, 1] = by_output[:, 0, 0] * ratio, local[:, 1]
+    return local, by_output
+
+
+def local_to_outputs(scale: str, local: Array) -> tuple[Array, Array]:
+    """Outputs (n, L) that stand for local parameters (n, L), and derivatives (n, L, L)."""
+    outputs, n, L = local.copy(), *local.shape
+    by_local = np.tile(np.eye(L), (n, 1, 1))
+    outputs[:, 0], by_local[:, 0, 0] = to_scale(scale, local[:, 0])
+    outputs[:, 1] = np.log(local[:, 1] / local[:, 0])
+    by_local[:, 1, 0], by_local[:, 1, 1] = -1 / local[:, 0], 1 / local[:, 1]
+    return outputs, by_local
+
+
+def split(nets: Sequence[ParameterNet], weights: Array) -> list[Array]:
+    """Cut one vector of all weights into one for each network."""
+    ends = np.cumsum([net.topology.n_weights for net in nets])
+    return np.split(weights, ends[:-1])

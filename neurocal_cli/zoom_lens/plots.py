@@ -1,0 +1,200 @@
+"""Pictures of lenses: each parameter over the settings, and the errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.plots import check_available
+from neurocal_cli.zoom_lens.evaluation import LensEvaluation
+from neurocal_cli.zoom_lens.static_calibration import local_covariance
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_evaluation", "draw_lens"]
+
+_FINE = 121  # places along a curve
+_MOST_CURVES = 6  # of the second control; more cannot be told apart
+_COLUMNS = 3
+_INK, _ACCENT = "#1f4e79", "#c0392b"
+_PANEL = (4.4, 3.3)  # inches
+
+
+def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:
+    """Draw each parameter over the settings, with data, fit and band of two standard deviations.
+
+    Parameters
+    ----------
+    lens : ZoomLens
+    kind : {"png", "pdf", "svg"}
+
+    Returns
+    -------
+    picture : bytes
+        The same for the same lens, byte for byte.
+
+    Raises
+    ------
+    NeurocalError
+        matplotlib is not installed.
+    """
+    panels = len(lens.names) + (not lens.known)
+
+    def draw(figure: Figure) -> None:
+        axes = _panels(figure, panels)
+        for j, name in enumerate(lens.names):
+            _draw_parameter(axes[j], lens, j, name)
+        if not lens.known:
+            values = lens.rmse
+            _draw_errors(
+                figure, axes[len(lens.names)], lens.controls, lens.settings, values, "Error at the settings"
+            )
+        figure.suptitle(
+            f"{len(lens.settings)} settings, bands of two standard deviations"
+            + ("" if lens.known else f", rms {lens.rmse_px:.4g} px")
+        )
+
+    return _picture(draw, panels, kind)
+
+
+def draw_evaluation(evaluation: LensEvaluation, controls: tuple[str, ...], kind: str = "png") -> bytes:
+    """Draw the error over the settings, and the lens's error beside its rivals'."""
+
+    def draw(figure: Figure) -> None:
+        axes = _panels(figure, 2)
+        settings = np.array([[s.values[name] for name in controls] for s in evaluation.settings])
+        values = np.array([s.rmse_px for s in evaluation.settings])
+        _draw_errors(figure, axes[0], controls, settings, values, "Error of the networks")
+        _draw_rivals(axes[1], evaluation)
+
+    return _picture(draw, 2, kind)
+
+
+def _picture(draw: Any, panels: int, kind: str) -> bytes:
+    """A figure of its own, not pyplot's: no global state, no window, no choice of a backend."""
+    check_available()
+    from matplotlib import rc_context
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(_COLUMNS, panels)
+    rows = -(-panels // columns)
+    with rc_context({"font.size": 9, "axes.titlesize": 10, "svg.hashsalt": "neurocal"}):
+        figure = Figure(figsize=(_PANEL[0] * columns, _PANEL[1] * rows + 0.4))
+        figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.1)
+        FigureCanvasAgg(figure)
+        draw(figure)
+        buffer = BytesIO()
+        # A date would make each picture differ from the last.
+        undated = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
+        figure.savefig(buffer, format=kind, dpi=120, metadata=undated[kind])
+    return buffer.getvalue()
+
+
+def _panels(figure: Figure, count: int) -> Sequence[Axes]:
+    columns = min(_COLUMNS, count)
+    axes = figure.subplots(-(-count // columns), columns, squeeze=False).ravel()
+    for unused in axes[count:]:
+        unused.set_axis_off()
+    return list(axes[:count])
+
+
+def _style(axes: Axes, title: str) -> None:
+    axes.set_title(title)
+    axes.grid(True, color="0.9", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _slices(lens: ZoomLens) -> list[tuple[float | None, NDArray[np.intp]]]:
+    """Values of the second control with the settings nearest to each; all where there is none."""
+    if len(lens.controls) == 1:
+        return [(None, np.arange(len(lens.settings)))]
+    second = np.unique(lens.settings[:, 1])
+    if len(second) > _MOST_CURVES:
+        second = np.linspace(second[0], second[-1], _MOST_CURVES)
+    nearest = np.abs(lens.settings[:, 1, None] - second).argmin(axis=1)
+    return [(float(value), np.flatnonzero(nearest == k)) for k, value in enumerate(second)]
+
+
+def _draw_parameter(axes: Axes, lens: ZoomLens, j: int, name: str) -> None:
+    """A curve over the first control for each value of the second."""
+    from matplotlib import colormaps
+
+    slices = _slices(lens)
+    L = len(lens.names)
+    C, _ = local_covariance(lens.tables.normal, L, lens.variance)
+    error = 2 * np.sqrt(np.maximum(C[:, j, j], 0.0))
+    along = np.linspace(lens.low[0], lens.high[0], _FINE)
+    for k, (value, members) in enumerate(slices):
+        color = colormaps["viridis"](0.85 * k / max(len(slices) - 1, 1)) if value is not None else _INK
+        settings = along[:, None] if value is None else np.column_stack([along, np.full(_FINE, value)])
+        prediction = lens.predict(settings)
+        middle, half = prediction.local[:, j], 2 * prediction.std[:, j]
+        label = None if value is None else f"{lens.controls[1]} {value:.4g}"
+        axes.fill_between(along, middle - half, middle + half, color=color, alpha=0.25, linewidth=0)
+        axes.plot(along, middle, color=color, linewidth=1.2, label=label)
+        axes.errorbar(
+            lens.settings[members, 0],
+            lens.tables.local[members, j],
+            error[members],
+            fmt="o",
+            markersize=2.8,
+            elinewidth=0.7,
+            color=color,
+        )
+    unit = "px" if name in ("alpha_u", "alpha_v", "u0", "v0") else lens.unit if name == "t_z" else ""
+    _style(axes, name)
+    axes.set(xlabel=lens.controls[0], ylabel=unit.replace("$", r"\$"))
+    if j == 0 and len(slices) > 1:
+        axes.legend(frameon=False, fontsize=7)
+
+
+def _draw_errors(
+    figure: Figure, axes: Axes, controls: tuple[str, ...], settings: Array, values: Array, title: str
+) -> None:
+    """Error over one control as bars, over two as coloured squares."""
+    _style(axes, f"{title}, rms [px]")
+    if len(controls) == 1:
+        axes.plot(settings[:, 0], values, "o-", color=_INK, markersize=3, linewidth=0.8)
+        axes.set(xlabel=controls[0], ylabel="rms [px]", ylim=(0, 1.15 * float(np.nanmax(values))))
+        return
+    drawn = axes.scatter(
+        settings[:, 0],
+        settings[:, 1],
+        c=values,
+        s=90,
+        marker="s",
+        cmap="viridis",
+        edgecolors="0.4",
+        linewidths=0.4,
+    )
+    axes.set(xlabel=controls[0], ylabel=controls[1])
+    axes.margins(0.1)
+    figure.colorbar(drawn, ax=axes, shrink=0.9)
+
+
+def _draw_rivals(axes: Axes, evaluation: LensEvaluation) -> None:
+    """A bar for each model, the shortest on top."""
+    errors = {"networks": evaluation.rmse_px, **evaluation.rivals}
+    known = {name: value for name, value in errors.items() if np.isfinite(value) and value > 0}
+    order = sorted(known, key=lambda name: -known[name])
+    colors = [_ACCENT if name == "networks" else _INK for name in order]
+    axes.barh([name.replace("_", " ") for name in order], [known[name] for name in order], color=colors)
+    from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(ScalarFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    _style(axes, "The same points, other models")
+    axes.set_xlabel("rms [px]")
+    axes.tick_params(axis="y", labelsize=7)

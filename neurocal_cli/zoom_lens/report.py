@@ -1,0 +1,155 @@
+"""Lenses and their evaluations as text and as JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.report import align, rounded
+from neurocal_cli.zoom_lens.evaluation import LensEvaluation
+from neurocal_cli.zoom_lens.settings import CONTROLS
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+
+__all__ = ["camera_report", "evaluation_json", "evaluation_report", "lens_report"]
+
+_MOST_SETTINGS = 8
+_UNITS = {"alpha_u": "px", "alpha_v": "px", "u0": "px", "v0": "px"}
+
+
+def lens_report(lens: ZoomLens) -> str:
+    """Summary of a lens: what it was learnt from, its networks, how well it fits."""
+    kind = "known cameras" if lens.known else "camera still" if lens.still else "camera moving"
+    points = "" if lens.known else f", {int(lens.counts.sum())} points"
+    head = f"lens: {len(lens.settings)} settings of {' and '.join(lens.controls)}{points}, {kind}"
+    if lens.model != "none":
+        head += f", distortion {lens.model}"
+    blocks = [head, "\n".join(align(_network_rows(lens)))]
+    tail = []
+    if lens.known:
+        scatter = [net.scatter for net in lens.members[0].nets.nets]
+        tail.append(f"scatter of the cameras about the networks: {_scatter_text(lens, scatter)}")
+    else:
+        tail.append(
+            f"error: rms {lens.rmse_px:.3f} px; noise explains {np.sqrt(2 * lens.variance):.3f} px; "
+            f"each setting left out in turn: {lens.left_out_px:.3f} px"
+        )
+    tail.append(
+        f"committee of {len(lens.members)}, alpha on a {_scale_text(lens)} scale, trained {_training(lens)}"
+    )
+    tail.append("converged" if lens.converged else "training was stopped before it settled")
+    return "\n\n".join([*blocks, "\n".join(tail)])
+
+
+def _training(lens: ZoomLens) -> str:
+    return {"joint": "all together", "alternating": "in turns"}.get(lens.training, lens.training)
+
+
+def _scale_text(lens: ZoomLens) -> str:
+    return {"log": "logarithmic", "linear": "linear", "inverse": "reciprocal"}[lens.members[0].nets.scale]
+
+
+def _scatter_text(lens: ZoomLens, scatter: list[float]) -> str:
+    """The scatter of each network's output, that of alpha as a share."""
+    local = lens.tables.local
+    C = np.linalg.inv(lens.tables.normal.H)
+    std = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
+    share = 100 * float(np.median(std[:, 0] / local[:, 0]))
+    others = [
+        f"{name} {math.sqrt(value):.3g}" for name, value in zip(lens.names[2:], scatter[2:], strict=True)
+    ]
+    return f"alpha_u {share:.2g} %, {', '.join(others)}"
+
+
+def _network_rows(lens: ZoomLens) -> list[list[str]]:
+    prediction = lens.predict(lens.settings)
+    rows = [["network", "hidden units", "lowest", "highest", "typical std"]]
+    for j, name in enumerate(lens.names):
+        topologies = sorted(
+            {(m.nets.nets[j].topology.own, m.nets.nets[j].topology.hidden) for m in lens.members}
+        )
+        units = " ".join(f"{own}+{hidden}" for own, hidden in topologies)
+        std = float(np.median(prediction.std[:, j]))
+        low, high = (float(f(prediction.local[:, j])) for f in (np.min, np.max))
+        unit = _UNITS.get(name, lens.unit if name == "t_z" else "")
+        label = f"{name} [{unit}]" if unit else name
+        rows.append([label, units, rounded(low, std)[0], rounded(high, std)[0], rounded(low, std)[1]])
+    return rows
+
+
+def camera_report(calibration: Calibration) -> str:
+    """Parameters of the camera at a setting."""
+    names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
+    values = [*calibration.intrinsics.values(), *calibration.distortion]
+    rows = [["parameter", "value", "std"]]
+    for name, value in zip(names, values, strict=True):
+        unit = "px" if name in _UNITS else "rad" if name == "theta" else ""
+        label = f"{name} [{unit}]" if unit else name
+        if name in calibration.fixed:
+            rows.append([label, f"{value:.7g}", "given"])
+        else:
+            rows.append([label, *rounded(float(value), calibration.std[name])])
+    return f"{calibration.camera_name}: {calibration.stop_reason}\n\n" + "\n".join(align(rows))
+
+
+def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...]) -> str:
+    """Error of a lens as aligned text: overall, its rivals, the worst settings."""
+    shown = sorted(evaluation.settings, key=lambda setting: -_or_zero(setting.rmse_px))[:_MOST_SETTINGS]
+    settings = [[*controls, "points", "rms [px]", "max [px]"]]
+    for setting in shown:
+        numbers = [f"{setting.values[name]:.10g}" for name in controls]
+        settings.append([*numbers, str(setting.n_points), _pixels(setting.rmse_px), _pixels(setting.max_px)])
+    head = (
+        f"{evaluation.n_points} points at {len(evaluation.settings)} settings: rms "
+        f"{_pixels(evaluation.rmse_px)} px, "
+        f"maximum {_pixels(evaluation.max_px)} px"
+    )
+    title = "the worst settings:" if len(evaluation.settings) > len(shown) else "settings:"
+    return "\n\n".join(
+        [head, "\n".join(align(_rival_rows(evaluation))), "\n".join([title, *align(settings)])]
+    )
+
+
+def _rival_rows(evaluation: LensEvaluation) -> list[list[str]]:
+    """A row for each way of interpolation: one at a time, and jointly."""
+    rows = [["rms error [px]", "one at a time", "joint"], ["networks", "", _pixels(evaluation.rmse_px)]]
+    rivals = evaluation.rivals
+    for name in [name for name in rivals if not name.endswith("_joint")]:
+        joint = rivals.get(f"{name}_joint")
+        rows.append([name.replace("_", " "), _pixels(rivals[name]), "" if joint is None else _pixels(joint)])
+    return rows
+
+
+def evaluation_json(evaluation: LensEvaluation) -> dict[str, Any]:
+    """Turn an evaluation into values that JSON can hold; a number that does not exist is None."""
+    return {
+        "n_points": evaluation.n_points,
+        "rmse_px": _number(evaluation.rmse_px),
+        "max_px": _number(evaluation.max_px),
+        "settings": [
+            {
+                **{name: setting.values.get(name) for name in CONTROLS},
+                "n_points": setting.n_points,
+                "rmse_px": _number(setting.rmse_px),
+                "max_px": _number(setting.max_px),
+            }
+            for setting in evaluation.settings
+        ],
+        "rivals": {name: _number(value) for name, value in evaluation.rivals.items()},
+    }
+
+
+def _number(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _or_zero(value: float) -> float:
+    return value if math.isfinite(value) else 0.0
+
+
+def _pixels(value: float) -> str:
+    return f"{value:.3f}" if math.isfinite(value) else "-"

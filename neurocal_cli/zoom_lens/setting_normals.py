@@ -1,0 +1,213 @@
+"""The pixel error of all settings through their normal matrices.
+
+At each setting the camera has local parameters, which change with the lens: alpha_u, alpha_v, u0, v0,
+t_z and the distortion coefficients; and all settings share the constants (zero-order terms), theta
+and, for a camera that stands still, R, t_x, t_y. Where the target moves from image to image each view
+has a pose of its own instead, which is eliminated (variable projection), and t_z is no parameter.
+
+A setting's points enter only through H = J^T J, g = J^T r and the sum of squares, over its local and
+the shared parameters; residuals are in pixels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.bundle_adjustment.views import Views, arrange
+from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
+from neurocal_cli.zoom_lens.settings import LensPoints
+
+__all__ = ["Constants", "Normal", "PixelData"]
+
+_POSE_STEPS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class Constants:
+    """What all settings share.
+
+    Attributes
+    ----------
+    theta : float [rad]
+    R : (3, 3) array or (V, 3, 3) array
+        Of the camera that stands still, or of each view.
+    t : (2,) array or (V, 3) array
+        t_x and t_y, or each view's translation.
+    """
+
+    theta: float
+    R: Array
+    t: Array
+
+    def moved(self, step: Array) -> Constants:
+        """After a step of the shared parameters: theta alone, or theta, omega, t_x, t_y."""
+        theta = self.theta + float(step[0])
+        if len(step) == 1:
+            return replace(self, theta=theta)
+        return Constants(theta, orthonormalised(rotation_step(step[1:4]) @ self.R), self.t + step[4:6])
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Second-order model of the pixel error of each setting.
+
+    Attributes
+    ----------
+    H : (S, L + Q, L + Q) array
+        Over the local parameters, then the shared ones.
+    g : (S, L + Q) array
+        J^T r with r = observed - predicted: downhill.
+    cost : (S,) array [px^2]
+        Sum of squared residuals.
+    sensible : bool
+        Whether all points lie in front of the camera and no lens folds back.
+    """
+
+    H: Array
+    g: Array
+    cost: Array
+    sensible: bool
+
+
+@dataclass(frozen=True, eq=False)
+class PixelData:
+    """Points of all settings, ready for `linearise`.
+
+    Attributes
+    ----------
+    views : Views
+    setting : (V,) int array
+    n_settings : int
+    still : bool
+        Whether the camera and the target stand still.
+    model : str
+        Lens model.
+    free_theta : bool
+    """
+
+    views: Views
+    setting: NDArray[np.int64]
+    n_settings: int
+    still: bool
+    model: str = "none"
+    free_theta: bool = True
+
+    @classmethod
+    def of(cls, lens: LensPoints, still: bool, model: str, free_theta: bool) -> PixelData:
+        """Arrange points."""
+        return cls(arrange(lens.points), lens.view_setting, lens.n_settings, still, model, free_theta)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the local parameters."""
+        t_z = ("t_z",) if self.still else ()
+        return ("alpha_u", "alpha_v", "u0", "v0", *t_z, *coefficient_names(self.model))
+
+    @property
+    def n_shared(self) -> int:
+        """Q: theta, and omega, t_x, t_y of a camera that stands still."""
+        return 6 if self.still else 1
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """(S,) points of each setting."""
+        return np.bincount(self.setting, weights=self.views.counts, minlength=self.n_settings).astype(
+            np.int64
+        )
+
+    def linearise(self, local: Array, constants: Constants) -> tuple[Normal, Constants]:
+        """Model the pixel error around local parameters (S, L) and constants.
+
+        Returns
+        -------
+        normal : Normal
+        constants : Constants
+            The same; where views have poses, with those that fit best.
+        """
+        state = self._state(local, constants)
+        if not self.still:
+            free = np.zeros(5 + state.k.shape[1], dtype=bool)
+            state = adjust(self.views.batches, state, free, True, _POSE_STEPS).state
+            constants = self._with_poses(constants, state)
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            N, sensible = normal_blocks(self.views.batches, state)
+            reduced = self._chain(N, local, constants) if self.still else self._eliminate(N, local, constants)
+        summed = np.zeros((self.n_settings, *reduced.shape[1:]))
+        np.add.at(summed, self.setting, reduced)
+        L = summed.shape[1] - 1
+        if not self.free_theta:  # held: it moves nothing and costs nothing
+            theta = len(self.names)
+            summed[:, theta, :] = summed[:, :, theta] = 0.0
+            summed[:, theta, theta] = 1.0
+        upper = np.triu(summed)  # exactly symmetric, as a file of it will be
+        summed = upper + np.swapaxes(np.triu(summed, 1), 1, 2)
+        good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
+        return Normal(summed[:, :L, :L], summed[:, :L, -1], summed[:, -1, -1], good), constants
+
+    def _state(self, local: Array, constants: Constants) -> CameraState:
+        """Normalised cameras of all views."""
+        views, (a, b, u0, v0) = self.views, local[self.setting, :4].T
+        sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
+        A = np.column_stack([a, -a * cosine / sine, b / sine, u0, v0])
+        A[:, 3:] -= views.pixel_centre
+        if self.still:
+            R = np.broadcast_to(constants.R, (views.n_views, 3, 3))
+            t = np.column_stack([np.tile(constants.t, (views.n_views, 1)), local[self.setting, 4]])
+        else:
+            R, t = constants.R, constants.t
+        centred = ((R @ views.centre[..., None])[..., 0] + t) / views.scale[:, None]
+        k = local[self.setting, len(self.names) - len(coefficient_names(self.model)) :]
+        return CameraState(A / views.pixel_scale, R, centred, self.model, k)
+
+    def _with_poses(self, constants: Constants, state: CameraState) -> Constants:
+        t = state.t * self.views.scale[:, None] - (state.R @ self.views.centre[..., None])[..., 0]
+        return replace(constants, R=state.R, t=t)
+
+    def _entries_by_parameters(self, local: Array, constants: Constants) -> tuple[Array, Array]:
+        """Derivatives of A's normalised entries by alpha_u, alpha_v, u0, v0 (V, 5, 4) and by theta (V, 5)."""
+        a, b = local[self.setting, :2].T
+        sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
+        by_local, by_theta = np.zeros((len(a), 5, 4)), np.zeros((len(a), 5))
+        by_local[:, 0, 0], by_local[:, 1, 0], by_local[:, 2, 1] = 1.0, -cosine / sine, 1 / sine
+        by_local[:, 3, 2] = by_local[:, 4, 3] = 1.0
+        by_theta[:, 1], by_theta[:, 2] = a / sine**2, -b * cosine / sine**2
+        return by_local / self.views.pixel_scale, by_theta / self.views.pixel_scale
+
+    def _chain(self, N: Array, local: Array, constants: Constants) -> Array:
+        """Normal matrices over local and shared parameters and the residual, of a still camera's views."""
+        views, V, K = self.views, len(N), N.shape[1] - 12
+        by_local, by_theta = self._entries_by_parameters(local, constants)
+        C = np.zeros((V, 12 + K, 12 + K))
+        scale = views.scale[:, None, None]
+        C[:, :5, :4] = by_local
+        C[:, 10, 4] = 1 / views.scale
+        C[:, 11 : 11 + K, 5 : 5 + K] = np.eye(K)
+        C[:, :5, 5 + K] = by_theta
+        # The world turns about its origin, a view's points about their centre: t moves as well.
+        centre = (constants.R @ views.centre[..., None])[..., 0]
+        C[:, 5:8, 6 + K : 9 + K] = np.eye(3)
+        C[:, 8:11, 6 + K : 9 + K] = -cross_matrix(centre) / scale
+        C[:, 8:10, 9 + K : 11 + K] = np.eye(2) / scale
+        C[:, -1, -1] = 1.0
+        return self._in_pixels(np.swapaxes(C, 1, 2) @ N @ C)
+
+    def _eliminate(self, N: Array, local: Array, constants: Constants) -> Array:
+        """Normal matrices over local parameters, theta and the residual, each view's pose eliminated."""
+        V, K = len(N), N.shape[1] - 12
+        keep = np.concatenate([camera_columns(K), [11 + K]])
+        B, cross = N[:, POSE, POSE], N[:, POSE][:, :, keep]
+        U = N[:, keep[:, None], keep] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(B, cross)
+        by_local, by_theta = self._entries_by_parameters(local, constants)
+        C = np.zeros((V, 6 + K, 6 + K))
+        C[:, :5, :4], C[:, 5 : 5 + K, 4 : 4 + K], C[:, :5, 4 + K] = by_local, np.eye(K), by_theta
+        C[:, -1, -1] = 1.0
+        return self._in_pixels(np.swapaxes(C, 1, 2) @ U @ C)
+
+    def _in_pixels(self, normal: Array) -> Array:
+        return normal * self.views.pixel_scale**2

@@ -1,0 +1,269 @@
+"""A lens that has learnt: camera parameters at any setting, and how sure they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.zoom_lens.joint_training import posterior
+from neurocal_cli.zoom_lens.parameter_networks import LensNets
+from neurocal_cli.zoom_lens.setting_normals import Constants, Normal
+from neurocal_cli.zoom_lens.settings import describe, scaled_controls
+
+__all__ = ["Member", "Prediction", "Rejected", "TableRecord", "ZoomLens"]
+
+
+@dataclass(frozen=True, eq=False)
+class Member:
+    """One lens of the committee: its networks and its constants."""
+
+    nets: LensNets
+    constants: Constants
+
+
+@dataclass(frozen=True)
+class Rejected:
+    """A setting that was left out, and why."""
+
+    setting: tuple[float, ...]
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class TableRecord:
+    """Parameters at each setting: what the networks learnt from, and what their rivals need.
+
+    Attributes
+    ----------
+    local : (S, L) array
+    constants : Constants
+    normal : Normal
+        Of the pixel error there. For known cameras: of the squared errors over the networks' scatter.
+    """
+
+    local: Array
+    constants: Constants
+    normal: Normal
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Parameters at some settings.
+
+    Attributes
+    ----------
+    local : (n, L) array
+    constants : Constants
+    covariance : (n, L + Q, L + Q) array
+        Of the local parameters and of theta, and of omega, t_x, t_y where the camera stands still.
+    """
+
+    local: Array
+    constants: Constants
+    covariance: Array
+
+    @property
+    def std(self) -> Array:
+        """(n, L + Q) standard deviations."""
+        return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
+
+
+@dataclass(frozen=True, eq=False)
+class ZoomLens:
+    """A calibrated lens.
+
+    Attributes
+    ----------
+    controls : tuple of str
+        zoom, focus or both, in the user's units.
+    settings : (S, D) array
+        At which it was calibrated.
+    names : tuple of str
+        Local parameters, which follow the controls.
+    model : str
+        Lens model; its coefficients are the last of the local parameters.
+    still : bool
+        Whether camera and target stood still, so that there is a pose.
+    known : bool
+        Whether it was fitted to known cameras and not to points.
+    members : tuple of Member
+        The committee; the lens is their mean.
+    tables, static : TableRecord
+        The best tables with common constants, and the static calibrations with averaged ones.
+    variance : float [px^2]
+        Of the noise of one coordinate; 1 for known cameras.
+    scatter : (L,) array
+        Variance of the local parameters from setting to setting beyond it.
+    free_theta : bool
+    counts : (S,) array
+        Points of each setting.
+    rmse : (S,) array [px]
+        Error of the lens at each setting; nan for known cameras.
+    rejected : tuple of Rejected
+    left_out_px : float
+        Error at settings that are left out one by one, predicted from all others; nan if not known.
+    training : str
+    seed : int
+    converged : bool
+    image_size : (width, height) or None
+    unit : str
+    warnings : tuple of str
+    """
+
+    controls: tuple[str, ...]
+    settings: Array
+    names: tuple[str, ...]
+    model: str
+    still: bool
+    known: bool
+    members: tuple[Member, ...]
+    tables: TableRecord
+    static: TableRecord
+    variance: float
+    scatter: Array
+    free_theta: bool
+    counts: NDArray[np.int64]
+    rmse: Array
+    rejected: tuple[Rejected, ...]
+    left_out_px: float
+    training: str
+    seed: int
+    converged: bool
+    image_size: tuple[int, int] | None = None
+    unit: str = "mm"
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def low(self) -> Array:
+        """(D,) lower end of the calibrated range."""
+        return self.settings.min(axis=0)
+
+    @property
+    def high(self) -> Array:
+        """(D,) upper end."""
+        return self.settings.max(axis=0)
+
+    @property
+    def rmse_px(self) -> float:
+        """Error over all points [px]."""
+        return float(np.sqrt((self.rmse**2 * self.counts).sum() / max(self.counts.sum(), 1)))
+
+    def scaled(self, settings: Array) -> Array:
+        """Settings on the networks' scale, -1 to 1."""
+        return scaled_controls(settings, self.low, self.high)
+
+    @cached_property
+    def posteriors(self) -> tuple[Array, ...]:
+        """Covariance of each member's weights and constants."""
+        x = self.scaled(self.settings)
+        return tuple(
+            posterior(x, member.nets, self.tables.normal, self.variance, self.scatter)
+            for member in self.members
+        )
+
+    def setting_of(
+        self, values: dict[str, float | None], extrapolate: bool = False
+    ) -> tuple[Array, list[str]]:
+        """Put a setting in the order of the controls, (D,), and check it.
+
+        Parameters
+        ----------
+        values : dict
+            Value of each control; None for one that is not given.
+        extrapolate : bool
+            Whether it may lie outside the calibrated range; it is then warned of.
+
+        Returns
+        -------
+        setting : (D,) array
+        warnings : list of str
+
+        Raises
+        ------
+        UsageError
+            A control that is missing, or one that the lens does not have.
+        InputError
+            A setting outside the calibrated range, or not finite.
+        """
+        for name, value in values.items():
+            if (value is None) == (name in self.controls):
+                has = " and ".join(self.controls)
+                verb = "needs a value of" if value is None else "does not change with"
+                raise UsageError(f"this lens {verb} {name}; it was calibrated over {has}")
+        setting = np.array([values[name] for name in self.controls], dtype=float)
+        if not np.isfinite(setting).all():
+            raise InputError("the setting must be of finite numbers")
+        outside = [
+            f"{name} {value:.10g} is outside the calibrated range, {low:.10g} to {high:.10g}"
+            for name, value, low, high in zip(self.controls, setting, self.low, self.high, strict=True)
+            if not low <= value <= high
+        ]
+        if outside and not extrapolate:
+            raise InputError(f"{'; '.join(outside)}; choose a setting inside, or ask for --extrapolate")
+        return setting, [f"{text}: what the networks say there is a guess" for text in outside]
+
+    def predict(self, settings: Array) -> Prediction:
+        """Parameters at settings (n, D), with covariances.
+
+        Raises
+        ------
+        InputError
+            No camera there: a scale factor that is not positive (only far outside the range).
+        """
+        x = self.scaled(np.asarray(settings, dtype=float))
+        pairs = [member.nets.local_with_jacobians(x) for member in self.members]
+        locals_ = np.array([local for local, _ in pairs])
+        if not (np.isfinite(locals_).all() and (locals_[:, :, :2] > 0).all()):
+            bad = int(
+                np.argmin(
+                    (np.isfinite(locals_).all(axis=2) & (locals_[:, :, :2] > 0).all(axis=2)).all(axis=0)
+                )
+            )
+            raise InputError(
+                f"the networks know no camera at {describe(self.controls, np.atleast_2d(settings)[bad])}; "
+                "choose a setting in the calibrated range"
+            )
+        constants, offsets = _mean_constants([member.constants for member in self.members], self.still)
+        Q = self.tables.normal.H.shape[1] - len(self.names)
+        within = np.mean([_spread(J, C, Q) for (_, J), C in zip(pairs, self.posteriors, strict=True)], axis=0)
+        offsets = offsets[:, :Q]
+        both = np.concatenate([locals_, np.broadcast_to(offsets[:, None], (*locals_.shape[:2], Q))], axis=2)
+        deviation = both - both.mean(axis=0)
+        between = np.einsum("mni,mnj->nij", deviation, deviation) / max(len(both) - 1, 1)
+        covariance = within + between
+        L = len(self.names)
+        if not self.known:  # what the camera itself does from setting to setting
+            covariance[:, range(L), range(L)] += self.scatter
+        return Prediction(locals_.mean(axis=0), constants, covariance)
+
+
+def _spread(jacobians: list[Array], covariance: Array, Q: int) -> Array:
+    """Covariance of local parameters and constants (n, L + Q, L + Q) from that of the weights."""
+    J = np.concatenate(jacobians, axis=2)
+    n, L, P = J.shape
+    full = np.zeros((n, L + Q, P + Q))
+    full[:, :L, :P] = J
+    full[:, L:, P:] = np.eye(Q)
+    return full @ covariance @ np.swapaxes(full, 1, 2)
+
+
+def _mean_constants(constants: list[Constants], still: bool) -> tuple[Constants, Array]:
+    """Mean of the members' constants, and each one's offset from it (m, 6): theta, omega, t_x, t_y."""
+    theta = np.array([c.theta for c in constants])
+    if not still:
+        zero = np.zeros((len(theta), 5))
+        mean = Constants(float(theta.mean()), np.eye(3), np.zeros(2))
+        return mean, np.column_stack([theta - theta.mean(), zero])
+    t = np.array([c.t for c in constants])
+    R = nearest_rotation(np.mean([c.R for c in constants], axis=0))
+    turn = np.array([c.R for c in constants]) @ R.T
+    omega = 0.5 * np.column_stack(
+        [turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]]
+    )
+    mean = Constants(float(theta.mean()), R, t.mean(axis=0))
+    return mean, np.column_stack([theta - theta.mean(), omega, t - mean.t])
