@@ -10,7 +10,7 @@ import numpy as np
 from neurocal_cli import calibrate
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.bundle_adjustment.problem import Known, known_for
+from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.pinhole import Intrinsics, Pose, project
@@ -49,11 +49,11 @@ class Scene:
             4: {"type": 4, "extrinsics": self.poses},
         }[type]
 
-    def known(self, points: Correspondences, type: int, skew: bool = True) -> Known:
+    def problem(self, points: Correspondences, type: int, skew: bool = True) -> Problem:
         given = dict(self.given(type))
         given.pop("type")
         full = {"image_center": None, "intrinsics": None, "extrinsics": None} | given
-        return known_for(points, type, skew=skew, **full)  # type: ignore[arg-type]
+        return problem_for(points, type, skew=skew, **full)  # type: ignore[arg-type]
 
     def true_state(self, views: Views) -> CameraState:
         """The truth in normalised units, where a reference optimiser starts."""
@@ -75,16 +75,16 @@ class Reference:
 
 def reference(scene: Scene, points: Correspondences, type: int, skew: bool, sigma: float) -> Reference:
     views = arrange(points)
-    known = scene.known(points, type, skew)
+    problem = scene.problem(points, type, skew)
     start = scene.true_state(views)
-    fit = adjust(views.batches, start, known.free, known.free_poses, 300)
+    fit = adjust(views.batches, start, problem.free, problem.free_poses, 300)
     normal, _ = normal_blocks(views.batches, start)
-    unknowns = int(known.free.sum()) + (6 * views.n_views if known.free_poses else 0)
+    unknowns = int(problem.free.sum()) + (6 * views.n_views if problem.free_poses else 0)
     normal[:, -1, -1] = 0.0
     normal[0, -1, -1] = (sigma / views.pixel_scale) ** 2 * max(2 * len(points) - unknowns, 1)
     share = 0.0
-    if known.free[0]:
-        bound = covariance(normal, known.free, known.free_poses, 2 * len(points)).entries[0, 0]
+    if problem.free[0]:
+        bound = covariance(normal, problem.free, problem.free_poses, 2 * len(points)).entries[0, 0]
         share = float(np.sqrt(bound) / start.entries[0, 0])
     rmse = float(np.sqrt(fit.cost.sum() / len(points))) * views.pixel_scale
     return Reference(rmse, share)

@@ -30,7 +30,7 @@ from neurocal_cli.distortion.collinear_points import find_lines
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.verdict.assessment import judge
+from neurocal_cli.verdict.assessment import gather_evidence
 
 NAMES = ("alpha_u", "alpha_v", "u0", "v0")
 
@@ -52,7 +52,7 @@ def test_standard_deviations_of_midpoints_hold() -> None:
         found = pinhole(points, skew=False)
         one_way.append(sigmas(found, camera))
         both_ways.append(sigmas(pinhole(replace(points, across=None), skew=False), camera))
-        disagreement.append(judge(found).disagreement)
+        disagreement.append(gather_evidence(found).disagreement)
     assert 0.85 < rms(one_way) < 1.15
     assert rms(both_ways) > 2.0
     assert np.mean(disagreement) == pytest.approx(1.0, abs=0.25)
@@ -87,7 +87,7 @@ def test_standard_deviations_of_a_rig_hold() -> None:
 
 
 def test_the_level_of_the_noise_is_that_of_the_measurement() -> None:
-    levels = [judge(pinhole(edge_set(seed)[1], skew=False)).contradiction for seed in range(20)]
+    levels = [gather_evidence(pinhole(edge_set(seed)[1], skew=False)).contradiction for seed in range(20)]
     assert np.mean(levels) == pytest.approx(1.0, abs=0.05)
 
 

@@ -16,7 +16,7 @@ from neurocal_cli.bundle_adjustment.units import see
 from neurocal_cli.camera.distortion_models import Lens
 from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
-from neurocal_cli.verdict.assessment import judge, judged
+from neurocal_cli.verdict.assessment import assess, gather_evidence
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
@@ -42,7 +42,9 @@ def moved_pixels(true: Calibration, other: Calibration, pixels: np.ndarray, dept
 def test_the_projection_uncertainty_is_that_of_200_calibrations(lens: str) -> None:
     scene, _ = bent_set(lens, 12)
     truth = calibrate(scene.points(), distortion=lens, skew=False, outliers="keep")
-    told = judge(calibrate(noisy(scene, 0), distortion=lens, skew=False, outliers="keep")).projection
+    told = gather_evidence(
+        calibrate(noisy(scene, 0), distortion=lens, skew=False, outliers="keep")
+    ).projection
     assert told is not None
     squared = np.zeros((len(told.depths), len(told.pixels)))
     for trial in range(200):
@@ -61,7 +63,7 @@ def noisy(scene: Scene, trial: int):
 
 def test_halves_of_good_data_agree_as_their_deviations_say() -> None:
     scene = random_flat_set(np.random.default_rng(4), 8, False)
-    values = [judge(pinhole(noisy(scene, trial), skew=False)).disagreement for trial in range(60)]
+    values = [gather_evidence(pinhole(noisy(scene, trial), skew=False)).disagreement for trial in range(60)]
     assert np.mean(values) == pytest.approx(1.0, abs=0.4)
 
 
@@ -74,19 +76,18 @@ def test_the_error_on_data_left_out_is_that_on_new_data() -> None:
         scene = random_flat_set(np.random.default_rng([seed, 1]), 12, False, cols=8, rows=6)
         points = noisy(scene, seed)
         camera = pinhole(points.select(points.view_index < 6), skew=False)
-        told.append(judge(camera).held_out_px)
+        told.append(gather_evidence(camera).held_out_px)
         found.append(evaluate_camera(camera, points.select(points.view_index >= 6)).rmse_px)
     assert np.mean(told) == pytest.approx(np.mean(found), rel=0.03)
 
 
 def test_a_file_is_judged_as_the_result_was(tmp_path: Path) -> None:
     found = calibrate(flat(3))
-    found = replace(found, verdict=judged(found))
     write_calibration(found, tmp_path / "camera.yaml")
     back = read_calibration(tmp_path / "camera.yaml")
     assert back.verdict == found.verdict
-    assert judged(back).word == found.verdict.word == "good"
-    for name, value in judged(back).measures.items():
+    assert assess(back).word == found.verdict.word == "good"
+    for name, value in assess(back).measures.items():
         assert value == pytest.approx(found.verdict.measures[name], rel=1e-6, nan_ok=True)
     assert format_calibration(back) == format_calibration(found)
 
@@ -95,28 +96,28 @@ def test_a_file_is_judged_as_the_result_was(tmp_path: Path) -> None:
 def test_every_problem_type_is_judged(type: int) -> None:
     scene = table_1()
     found = calibrate(scene.points(0.1, np.random.default_rng(1)), **scene.given(type))
-    assert judged(found).word == "good", judged(found).reasons
+    assert assess(found).word == "good", assess(found).reasons
 
 
 def test_few_views_on_one_side_of_the_image_are_told_where_to_add_some() -> None:
     points = flat(5)
     corner = (points.pixels > [330, 200]).all(axis=1)
-    verdict = judged(calibrate(points.select(corner), skew=False))
+    verdict = assess(calibrate(points.select(corner), skew=False))
     assert verdict.word != "good"
     assert any("left" in advice for advice in verdict.advice)
 
 
 def test_a_calibration_without_an_image_size_is_judged_without_the_image() -> None:
     found = calibrate(replace(flat(6), image_size=None))
-    evidence = judge(found)
+    evidence = gather_evidence(found)
     assert evidence.projection is None
     assert np.isnan(evidence.coverage.image)
-    assert judged(found).word == "good"
+    assert assess(found).word == "good"
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the data is not beside the project")
 def test_zhangs_views_are_good_with_their_lens_and_not_without() -> None:
     from test_lens_calibration import zhang
 
-    assert judged(calibrate(zhang())).word == "good"
-    assert judged(calibrate(zhang(), distortion="none")).word == "usable"
+    assert assess(calibrate(zhang())).word == "good"
+    assert assess(calibrate(zhang(), distortion="none")).word == "usable"

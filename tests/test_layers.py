@@ -30,7 +30,7 @@ LEVELS = (
     {"calibration", "training"},
     {"bundle_adjustment"},
     {"verdict", "distortion", "initialisation"},
-    {"calibrating"},
+    {"pipeline"},
     {"methods"},
     {"evaluation"},
     {"report"},

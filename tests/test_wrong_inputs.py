@@ -9,7 +9,7 @@ import pytest
 from wrong_inputs import FLAT, FOLDED, flat, folded, outcome
 
 from neurocal_cli import calibrate
-from neurocal_cli.verdict.assessment import judged
+from neurocal_cli.verdict.assessment import assess
 
 README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
 ROWS = dict(re.findall(r"^\| ([^|]+?) \| (refused|poor|usable) \|", README, flags=re.MULTILINE))
@@ -19,7 +19,7 @@ ROWS = dict(re.findall(r"^\| ([^|]+?) \| (refused|poor|usable) \|", README, flag
 @pytest.mark.parametrize("scene", [flat, folded])
 def test_the_points_that_are_spoilt_are_good(scene, seed: int) -> None:
     found = calibrate(scene(10 + seed))
-    assert judged(found).word == "good", judged(found).reasons
+    assert assess(found).word == "good", assess(found).reasons
     assert found.n_rejected == 0
 
 

@@ -17,7 +17,7 @@ from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibra
 from neurocal_cli.camera.distortion_models import distort
 from neurocal_cli.camera.pinhole import project
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.verdict.assessment import judged
+from neurocal_cli.verdict.assessment import assess
 
 SIZE = (640, 480)
 CAMERA = Intrinsics(600.0, 600.0, 318.0, 243.0, np.pi / 2)
@@ -269,5 +269,5 @@ def outcome(name: str) -> tuple[str, str]:
         found: Calibration = calibrate(given.points, **given.options)
     except NeurocalError as error:
         return "refused", str(error)
-    verdict = judged(found)
+    verdict = assess(found)
     return verdict.word, (verdict.reasons or ("",))[0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -91,11 +90,9 @@ def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) 
     points, arguments = estimation.prepare(points)
 
     from neurocal_cli.methods import calibrate as learn
-    from neurocal_cli.verdict.assessment import judged
 
     with ProgressBar() as progress:
-        calibration = learn(points, **arguments, camera_name=camera_name, progress=progress)
-    return replace(calibration, verdict=judged(calibration))
+        return learn(points, **arguments, camera_name=camera_name, progress=progress)
 
 
 def _write(calibration: Calibration, output: str, plot: str | None) -> None:

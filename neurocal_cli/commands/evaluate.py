@@ -99,11 +99,11 @@ def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluati
     """Evaluate a calibration or, given points, any camera file: then all poses are fitted."""
     from neurocal_cli.evaluation import evaluate_camera
     from neurocal_cli.io.calibration_yaml import read_calibration
-    from neurocal_cli.verdict.assessment import judged
+    from neurocal_cli.verdict.assessment import assess
 
     try:
         calibration = read_calibration(name)
-        return evaluate_camera(calibration, points), judged(calibration)
+        return evaluate_camera(calibration, points), assess(calibration)
     except FormatError as error:
         if points is None or name == "-":
             raise

@@ -188,6 +188,7 @@ class _RigAssembly:
             converged=reason == StopReason.CONVERGED.value,
             stop_reason=reason,
             network=_network(given.network, intrinsics, views, rmse, self.adjusted.iterations),
+            judgement=None,
             **changes,
         )
 

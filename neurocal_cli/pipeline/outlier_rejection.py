@@ -1,4 +1,4 @@
-"""Wrong points and wrong views: found, set aside and named, so that they change nothing.
+"""Outliers, points and whole views: found, left out and named, so that they change nothing.
 
 Points that fit their camera as normal noise would are left alone, to the last bit: a calibration of
 good data is the same with and without this. Otherwise
@@ -23,12 +23,15 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.common_noise import with_common_share
 from neurocal_cli.bundle_adjustment.measured_directions import single, unit, variance_across
 from neurocal_cli.bundle_adjustment.outlier_views import find_outlier_view
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import arrange
-from neurocal_cli.calibrating.fitting import Fit, Fitter
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.consensus import find_consensus
+from neurocal_cli.initialisation.options import Options
+from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.points import Correspondences
 
 __all__ = ["fit_robustly"]
@@ -44,13 +47,8 @@ _MAJORITY = 0.5  # share of the points that must be left
 _LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 
 
-def fit_robustly(points: Correspondences, fitter: Fitter) -> tuple[Fit, Rejected]:
-    """Calibrate, with wrong points set aside.
-
-    Parameters
-    ----------
-    points : Correspondences
-    fitter : Fitter
+def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected]:
+    """Fit a camera, with outliers left out.
 
     Raises
     ------
@@ -58,34 +56,37 @@ def fit_robustly(points: Correspondences, fitter: Fitter) -> tuple[Fit, Rejected
         Points that cannot give an answer, with the reason; more than half of them contradict the rest.
     """
     failure: DegenerateGeometryError | None = None
-    first: Fit | None = None
+    first: Solution | None = None
     try:
-        first = fitter.fit(points)
+        first = fit(problem, options)
         if not _suspicious(first):
             return first, Rejected()
     except DegenerateGeometryError as error:
         failure = error
-    search = _Search(points, fitter)
+    search = _Search(problem, options)
     search.agree(first, failure)
     search.without_outlier_views()
     search.judge_all_points()
-    return search.fit, search.rejected()
+    return search.solution, search.rejected()
 
 
 class _Search:
-    """What is kept so far, and the calibration of it."""
+    """What is kept so far, and the solution for it."""
 
-    fit: Fit
+    solution: Solution
 
-    def __init__(self, points: Correspondences, fitter: Fitter) -> None:
-        self.points, self.fitter = points, fitter
-        self.kept = np.ones(len(points), dtype=bool)
+    def __init__(self, problem: Problem, options: Options) -> None:
+        self.problem, self.options, self.points = problem, options, problem.points
+        self.kept = np.ones(len(self.points), dtype=bool)
         self.wrong_views: dict[str, str] = {}
 
-    def agree(self, first: Fit | None, failure: DegenerateGeometryError | None) -> None:
+    def _fit(self, kept: NDArray[np.bool_], options: Options) -> Solution:
+        return fit(self.problem.with_points(self.points.select(kept)), options)
+
+    def agree(self, first: Solution | None, failure: DegenerateGeometryError | None) -> None:
         """Points that each view's network agrees on."""
         views = arrange(self.points)
-        consensus = find_consensus(views, views.nearly_flat, np.random.default_rng(self.fitter.seed))
+        consensus = find_consensus(views, views.nearly_flat, np.random.default_rng(self.options.seed))
         order = slice(None) if views.order is None else views.order
         self.kept[order] = consensus.kept
         for view in np.flatnonzero(consensus.hopeless):
@@ -94,11 +95,11 @@ class _Search:
             if first is None:
                 assert failure is not None
                 raise failure
-            self.fit = first
+            self.solution = first
             return
         self._enough(failure)
         try:
-            self.fit = self.fitter.fit(self.points.select(self.kept))
+            self.solution = self._fit(self.kept, self.options)
         except DegenerateGeometryError:
             if failure is not None:
                 raise failure from None
@@ -130,37 +131,37 @@ class _Search:
 
         A lens that is chosen for wrong views with the others hides them: a pinhole looks for them first.
         """
-        if self.fitter.lens == "auto":
-            pinhole = replace(self.fitter, lens="")
+        if self.options.distortion == "auto":
+            pinhole = replace(self.options, distortion="")
             before = len(self.wrong_views)
-            # A lens may bend so strongly that there is no pinhole: then nothing is learnt from it.
+            # The distortion may be so strong that there is no pinhole: then nothing is learnt from it.
             with suppress(DegenerateGeometryError):
-                self._drop_outlier_views(pinhole, pinhole.fit(self.points.select(self.kept)))
+                self._drop_outlier_views(pinhole, self._fit(self.kept, pinhole))
             if len(self.wrong_views) > before:
-                self.fit = self.fitter.fit(self.points.select(self.kept))
+                self.solution = self._fit(self.kept, self.options)
                 self._readmit(list(self.wrong_views)[before:])
-        self.fit = self._drop_outlier_views(self.fitter, self.fit)
+        self.solution = self._drop_outlier_views(self.options, self.solution)
 
     def _readmit(self, names: list[str]) -> None:
         """Take back views that only a pinhole could not explain."""
         for name in names:
             kept = self.kept | (self.points.view_index == self.points.view_names.index(name))
             with suppress(DegenerateGeometryError):
-                fit = self.fitter.fit(self.points.select(kept))
-                if not fit.refusal and _rms(fit) <= _NO_WORSE * _rms(self.fit):
-                    self.fit, self.kept = fit, kept
+                solution = self._fit(kept, self.options)
+                if not solution.refusal and _rms(solution) <= _NO_WORSE * _rms(self.solution):
+                    self.solution, self.kept = solution, kept
                     del self.wrong_views[name]
 
-    def _drop_outlier_views(self, fitter: Fitter, fit: Fit) -> Fit:
-        """Set odd views aside one by one; the calibration without them."""
+    def _drop_outlier_views(self, options: Options, solution: Solution) -> Solution:
+        """Leave outlier views out one by one; the fit without them."""
         most = (self.points.n_views - 1) // 3
         while len(self.wrong_views) < most:
-            odd = find_outlier_view(fit.job, fit.solution)
-            if odd is None:
+            outlier = find_outlier_view(solution)
+            if outlier is None:
                 break
-            self._drop(odd, "it contradicts the camera of the other views")
-            fit = fitter.fit(self.points.select(self.kept))
-        return fit
+            self._drop(outlier, "it contradicts the camera of the other views")
+            solution = self._fit(self.kept, options)
+        return solution
 
     def judge_all_points(self) -> None:
         """Keep what the camera explains, of all points of the views that are kept."""
@@ -172,13 +173,13 @@ class _Search:
             self.kept = kept
             self._enough()
             state = tuple(np.packbits(kept))
-            self.fit = self.fitter.again(self.fit, self.points.select(kept))
+            self.solution = fit_again(self.solution, self.points.select(kept), self.options)
             if state in known:  # a point on the border that comes and goes
                 return
             known.add(state)
 
     def _explained(self) -> NDArray[np.bool_]:
-        errors, index = _errors(self.fit, self.points), self.points.view_index
+        errors, index = _errors(self.solution, self.points), self.points.view_index
         near = errors.length < _limits(errors, self.kept, self.points)[index]
         share = np.bincount(index, near, self.points.n_views) / np.bincount(index)
         for view in np.flatnonzero(share <= _MAJORITY):
@@ -188,7 +189,7 @@ class _Search:
 
     def rejected(self) -> Rejected:
         """What was set aside."""
-        error = _errors(self.fit, self.points).length
+        error = _errors(self.solution, self.points).length
         rows = np.flatnonzero(~self.kept)
         if not rows.size:
             return Rejected(views=dict(self.wrong_views))
@@ -218,15 +219,15 @@ class _Errors:
         return float(np.median(self.parts[rows], axis=0).max()) / _ONE
 
 
-def _errors(fit: Fit, points: Correspondences) -> _Errors:
-    seen = fit.seen
-    place = {name: k for k, name in enumerate(fit.job.views.names)}
+def _errors(solution: Solution, points: Correspondences) -> _Errors:
+    camera = solution.in_pixels
+    place = {name: k for k, name in enumerate(solution.problem.views.names)}
     view = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
-    predicted, in_front = seen.predict(points.world, np.maximum(view, 0))
+    predicted, in_front = camera.predict(points.world, np.maximum(view, 0))
     residuals = predicted - points.pixels
     stated = None
     if points.covariance is not None:
-        stated = with_common_share(points.covariance, fit.share, points.across)
+        stated = with_common_share(points.covariance, solution.common_noise, points.across)
         residuals = _eased(residuals, points.covariance, stated, points.across)
     length = _lengths(residuals, stated, points.across)
     length = np.where(in_front & (view >= 0) & np.isfinite(length), length, np.inf)
@@ -298,17 +299,17 @@ def _limits(errors: _Errors, kept: NDArray[np.bool_], points: Correspondences) -
     return np.asarray(sigma * np.sqrt(2 * np.log(len(errors.length) / _CHANCE)))
 
 
-def _rms(fit: Fit) -> float:
+def _rms(solution: Solution) -> float:
     """Error [px], weighted."""
-    return float(np.sqrt((_errors(fit, fit.points).length ** 2).mean()))
+    return float(np.sqrt((_errors(solution, solution.problem.points).length ** 2).mean()))
 
 
-def _suspicious(fit: Fit) -> bool:
-    """Whether anything in a calibration is not as normal noise would have it."""
-    if fit.refusal:
+def _suspicious(solution: Solution) -> bool:
+    """Whether anything in a fit is not as normal noise would have it."""
+    if solution.refusal:
         return True
-    points = fit.points
-    errors = _errors(fit, points)
+    points = solution.problem.points
+    errors = _errors(solution, points)
     error = errors.length
     if not np.isfinite(error).all():
         return True
@@ -318,4 +319,4 @@ def _suspicious(fit: Fit) -> bool:
     spread = np.sqrt(points.pixels.var(axis=0).sum())
     if np.sqrt((error**2).mean()) > _ROUGH * spread:
         return True
-    return find_outlier_view(fit.job, fit.solution) is not None
+    return find_outlier_view(solution) is not None
