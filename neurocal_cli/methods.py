@@ -103,20 +103,15 @@ def calibrate(
     """
     _check_options(method, trainer, distortion, outliers, starts, seed)
     camera, lens = _given_camera(intrinsics)
-    if type == 3 and distortion not in ("auto", "none", lens.model):
+    type_3 = isinstance(type, (int, np.integer)) and type == 3
+    if not type_3:
+        lens = Lens() if distortion in _FOUND else Lens(distortion)
+    elif distortion not in ("auto", "none", lens.model):
         raise UsageError(
             f"type 3 takes the lens of the given camera ({lens.model}), not distortion {distortion}"
         )
-    if type != 3:
-        lens = Lens() if distortion in _FOUND else Lens(distortion)
-    options = options_for(
-        trainer,
-        starts,
-        seed,
-        distortion=distortion if type != 3 and distortion in _FOUND else "",
-        backprop=backprop,
-        progress=progress,
-    )
+    way = distortion if distortion in _FOUND and not type_3 else ""
+    options = options_for(trainer, starts, seed, distortion=way, backprop=backprop, progress=progress)
     try:
         problem = problem_for(points, type, image_center, camera, extrinsics, skew, lens)
         if outliers == "reject":

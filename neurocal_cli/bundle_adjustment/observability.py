@@ -14,6 +14,8 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["check_points", "refuse_undetermined"]
 
+# Repeated by tests/test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal
+# matrix.
 _COLLINEAR = 1e-6  # second extent as a share of the first
 _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which rounding rules
 # Std of a focal length over its value. Parallel boards under noise fit best with tilts of about one

@@ -16,6 +16,7 @@ from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
 
 __all__ = ["parameter_covariance", "parameter_warnings", "pose_std"]
 
+# What users are warned of; no result depends on it.
 # A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
 _POOR = 0.05
 _POOR_THETA = 0.02  # rad

@@ -23,6 +23,11 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Candidate", "falls_short", "fit_candidates", "supported", "worth"]
 
+# Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
+# tests/test_lens_starts.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
+# the tightest with which all of these end as they do; penalties and tests against 0 are chi-squared levels,
+# as said beside them.
+#
 # A fisheye's coefficients beyond the first few are of use only when the points reach far out.
 _FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
 # What each model has more than a simpler one.

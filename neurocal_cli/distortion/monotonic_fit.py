@@ -33,6 +33,8 @@ from neurocal_cli.points import Correspondences
 
 __all__ = ["MonotonicFit", "fit_monotonic", "normal_part", "where_not_monotonic"]
 
+# Repeated by tests/test_monotonic_fit.py and, for the tie, tests/test_model_selection.py: lenses that are
+# not monotonic in unseen corners predict new views 5 to 16 % better with these.
 _BORDER = 17  # points along each side of the image at which the lens is checked
 _FARTHEST = 100  # points looked at
 _SLACK = 0.005  # of a slope, that costs as much as one standard deviation of a residual

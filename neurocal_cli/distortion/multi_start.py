@@ -18,7 +18,9 @@ from neurocal_cli.distortion.candidate_models import fit_candidates
 
 __all__ = ["with_more_starts"]
 
-_ALIKE = 0.15  # correlation of neighbours' residuals
+# Repeated by tests/test_lens_starts.py (slow: 200 lenses of each of five models): every local minimum there
+# showed more.
+_CORRELATED = 0.15  # correlation of neighbours' residuals
 
 
 def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[CameraState]]) -> Solution:
@@ -35,7 +37,7 @@ def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[Came
     if not problem.free_lens:
         return solution
     views = problem.views
-    if best.converged and correlation(views, point_residuals(views, best.state)) < _ALIKE:
+    if best.converged and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
         return solution
     for start in (best.state, *more_starts()):
         found = fit_candidates(problem, start, by_views=False).get(problem.lens.model)

@@ -15,6 +15,8 @@ from neurocal_cli.initialisation.view_networks import Group
 
 __all__ = ["cameras_from_products", "candidate_intrinsics"]
 
+# Repeated by tests/test_convergence.py: the wrong minima of the conditions that its 1300 scenes show, and
+# depths that keep all their points in front of the first camera.
 _MOST_CANDIDATES = 4
 _NEAREST = 1.05  # depth of the nearest point's side, in units of what puts it into the focal plane
 

@@ -47,6 +47,8 @@ from neurocal_cli.initialisation.view_networks import (
 
 __all__ = ["solve"]
 
+# Repeated by tests/test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
+# starts.
 _FEW_POINT_STARTS = 100
 _MANY_EQUATIONS = 12  # with so many more equations than unknowns there is one good minimum
 

@@ -21,7 +21,7 @@ __all__ = ["Group", "begin_flat", "refuse_few_conditions", "train_networks"]
 
 # Eigenvalue of the product's normal matrix, as a share of the largest, that rounding leaves of 0.
 _NO_CONDITION = 1e-13
-_SMALL = 1500  # patterns in all up to which the starts may as well see every one
+_SMALL = 1500  # patterns in all up to which fewer of them save no time (tests/benchmarks/test_speed.py)
 
 
 @dataclass(frozen=True, eq=False)

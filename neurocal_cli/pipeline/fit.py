@@ -26,6 +26,7 @@ from neurocal_cli.points import Correspondences
 
 __all__ = ["fit", "fit_again"]
 
+# Repeated by tests/test_lens_starts.py (slow: 200 lenses of each of five models, no local minimum).
 _FIRST_MODEL = "k1k2"  # where no pinhole can be found, the distortion must be strong
 _FAR_WORSE = 4.0  # times the mean squared error of most views
 

@@ -25,6 +25,8 @@ class _Limit:
         return int(value > self.good) + int(value > self.poor)
 
 
+# Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and tests/test_verdict.py, in
+# which real and simulated good data are; the errors, angles and shares are what a user would call large.
 _ERROR = _Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
 _CONTRADICTION = _Limit(1.6, 2.3)
 _HELD_OUT = _Limit(1.3, 2.0)  # over the rms error
