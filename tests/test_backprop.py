@@ -502,7 +502,9 @@ def run(code: str) -> str:
 
 
 def test_numba_is_imported_only_by_the_compiled_kernel() -> None:
-    code = "import sys; from neurocal_cli.training import backprop, rule_in_blocks; print('numba' in sys.modules)"
+    code = (
+        "import sys; from neurocal_cli.training import backprop, rule_in_blocks; print('numba' in sys.modules)"
+    )
     assert run(code) == "False\n"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_calibration import made_calibration
+from support.made_calibration import made_calibration
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.calibration_yaml import write_calibration

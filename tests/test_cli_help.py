@@ -11,7 +11,7 @@ from pathlib import Path
 
 import click
 import pytest
-from command_line import run
+from support.command_line import run
 
 import neurocal_cli
 from neurocal_cli.commands import neurocal

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import Result
-from command_line import run
-from rigs import RigScene, random_rig
+from support.command_line import run
+from support.rigs import RigScene, random_rig
 
 from neurocal_cli import Board, Correspondences, calibrate, read_rig, write_calibration, write_points
 from neurocal_cli.board import Plane

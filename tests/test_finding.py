@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rendered import condition, picture
+from support.rendered import condition, picture
 
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.finding import levels as find_levels

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from measured import errors, found, places, take
+from support.measured import errors, found, places, take
 
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Grid
 from neurocal_cli.detection.measuring import measure

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid, table_1
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from support.scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid, table_1
 from test_uncertainty import noisy, whitener
 
 from neurocal_cli import Correspondences, Intrinsics, Pose

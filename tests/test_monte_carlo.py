@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes import Scene, pinhole, table_1
+from support.scenes import Scene, pinhole, table_1
 
 from neurocal_cli import Calibration
 from neurocal_cli.bundle_adjustment.covariance import covariance

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import Scene, board_midpoints, random_flat_set, random_rotation, table_1
-from test_lens_calibration import bent
+from support.command_line import run
+from support.scenes import Scene, board_midpoints, random_flat_set, random_rotation, table_1
+from test_distortion import bent
 from test_real_data import zhang
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration

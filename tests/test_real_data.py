@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import pinhole
+from support.scenes import pinhole
 
 from neurocal_cli import Correspondences
 

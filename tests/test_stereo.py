@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs import KINDS, RigScene, corner, random_rig
-from scenes import random_rotation
+from support.rigs import KINDS, RigScene, corner, random_rig
+from support.scenes import random_rotation
 
 from neurocal_cli import Correspondences, Rig, calibrate
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
@@ -207,7 +207,7 @@ def test_errors_are_at_the_bound_over_two_hundred_rigs() -> None:
 
 def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     """At the truth, from the residuals' own finite differences."""
-    from test_stereo_pixel_error import all_residuals
+    from test_stereo_reprojection import all_residuals
 
     from neurocal_cli.stereo.reprojection import Columns
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import Scene, pinhole, random_flat_set, random_solid
+from support.scenes import Scene, pinhole, random_flat_set, random_solid
 
 from neurocal_cli import Correspondences
 from neurocal_cli.bundle_adjustment.covariance import covariance

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import random_flat_set
-from test_lens import LENSES
-from test_lens_calibration import bent
+from support.scenes import random_flat_set
+from test_distortion import bent
+from test_distortion_models import LENSES
 
 from neurocal_cli import Correspondences, calibrate, undistort_image, undistort_points
 from neurocal_cli.camera.distortion_models import Lens

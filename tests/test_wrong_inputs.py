@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from wrong_inputs import FLAT, FOLDED, flat, folded, outcome
+from support.wrong_inputs import FLAT, FOLDED, flat, folded, outcome
 
 from neurocal_cli import calibrate
 from neurocal_cli.verdict.assessment import judged

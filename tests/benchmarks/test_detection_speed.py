@@ -3,16 +3,13 @@
 Run with ``pytest tests/benchmarks/test_detection_speed.py -n 0 --benchmark-enable``.
 """
 
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from rendered import picture
+from support.rendered import picture
 
 from neurocal_cli.board import Board
 from neurocal_cli.detection.batch import keep_memory

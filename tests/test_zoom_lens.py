@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.interpolate import RBFInterpolator, RectBivariateSpline, RegularGridInterpolator
-from zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, seen, truth
+from support.zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, seen, truth
 
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.evaluation import evaluate_camera

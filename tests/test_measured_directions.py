@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_points import as_measured, edge_set, edges
 from hypothesis import given
 from hypothesis import strategies as st
-from rigs import random_rig
-from scenes import pinhole
+from support.edge_points import as_measured, edge_set, edges
+from support.rigs import random_rig
+from support.scenes import pinhole
 
 from neurocal_cli import Correspondences, calibrate
 from neurocal_cli.bundle_adjustment.common_noise import Noise, noise_of

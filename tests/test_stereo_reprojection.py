@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from rigs import RigScene, random_rig
+from support.rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate
 from neurocal_cli.bundle_adjustment.reprojection import residuals

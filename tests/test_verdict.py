@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bent import bent_set
-from scenes import Scene, pinhole, random_flat_set, table_1
-from wrong_inputs import flat
+from support.distorted import bent_set
+from support.scenes import Scene, pinhole, random_flat_set, table_1
+from support.wrong_inputs import flat
 
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.bundle_adjustment.units import see
@@ -116,7 +116,7 @@ def test_a_calibration_without_an_image_size_is_judged_without_the_image() -> No
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="the data is not beside the project")
 def test_zhangs_views_are_good_with_their_lens_and_not_without() -> None:
-    from test_lens_calibration import zhang
+    from test_distortion import zhang
 
     assert judged(calibrate(zhang())).word == "good"
     assert judged(calibrate(zhang(), distortion="none")).word == "usable"

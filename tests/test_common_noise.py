@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import pinhole, table_1
+from support.scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences
 from neurocal_cli.bundle_adjustment.common_noise import common_share, with_common_share

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scenes import Scene, board_midpoints, random_flat_set, table_1
+from support.scenes import Scene, board_midpoints, random_flat_set, table_1
 from test_real_data import zhang
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration

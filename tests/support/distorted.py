@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scenes import Scene, random_flat_set
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.units import Seen, normalised
@@ -18,6 +17,7 @@ from neurocal_cli.camera.pinhole import Pose, project
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
+from support.scenes import Scene, random_flat_set
 
 BENT = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "fisheye")
 SIGMA = 0.2

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bent import BENT, SIGMA, bent_set
+from support.distorted import BENT, SIGMA, bent_set
 
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.errors import DegenerateGeometryError

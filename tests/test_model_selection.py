@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bent import BENT, SIGMA, bent_set, new_views, within_reach
-from scenes import Scene, random_solid, table_1
+from support.distorted import BENT, SIGMA, bent_set, new_views, within_reach
+from support.scenes import Scene, random_solid, table_1
 
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.camera.distortion_models import MODELS
