@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.scenes import Scene, pinhole, random_flat_set, random_solid
+from support.noise import noisy, whitener
+from support.scenes import pinhole, random_flat_set, random_solid
 
 from neurocal_cli import Correspondences
 from neurocal_cli.bundle_adjustment.covariance import covariance
@@ -15,15 +16,6 @@ from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
 from neurocal_cli.geometry import Array
-
-
-def whitener(points: Correspondences) -> Array:
-    """(N, 2, 2) factors U with U^T U the inverse covariance of each pixel."""
-    if points.covariance is None:
-        return np.tile(np.eye(2), (len(points), 1, 1))
-    suu, suv, svv = points.covariance.T
-    S = np.stack([np.stack([suu, suv], -1), np.stack([suv, svv], -1)], -2)
-    return np.swapaxes(np.linalg.cholesky(np.linalg.inv(S)), 1, 2)
 
 
 def parameters(cal: Calibration) -> Array:
@@ -75,23 +67,6 @@ def assert_std(cal: Calibration, type: int, relative: float = 1e-5) -> None:
     rows = [INTRINSIC_NAMES.index(name) for name in cal.covariance_names]
     limit = relative * std[rows][:, None] * std[rows]
     assert (np.abs(cal.covariance - dense[np.ix_(rows, rows)]) <= limit).all()
-
-
-def noisy(scene: Scene, weights: str, rng: np.random.Generator) -> Correspondences:
-    """Points with noise of the size that their covariances say."""
-    points = scene.points()
-    n = len(points)
-    if weights == "none":
-        return scene.points(0.3, rng)
-    su, sv = rng.uniform(0.1, 0.8, (2, n))
-    c = rng.uniform(-0.9, 0.9, n) if weights == "suu,suv,svv" else np.zeros(n)
-    sv = su if weights == "sigma" else sv
-    factor = np.zeros((n, 2, 2))
-    factor[:, 0, 0], factor[:, 1, 0], factor[:, 1, 1] = su, c * sv, sv * np.sqrt(1 - c * c)
-    noise = (factor @ rng.normal(size=(n, 2, 1)))[..., 0]
-    return replace(
-        points, pixels=points.pixels + noise, covariance=np.column_stack([su * su, c * su * sv, sv * sv])
-    )
 
 
 @pytest.mark.parametrize("weights", ["none", "sigma", "suu,suv,svv"])
