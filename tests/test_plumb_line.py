@@ -298,7 +298,7 @@ def check_statistics(k: list[float], centre: tuple[float, float], trials: int, e
 
 
 def test_std_is_true_and_nothing_biased() -> None:
-    check_statistics([-0.25, 0.1], (530.0, 370.0), 60, 0.0)
+    check_statistics([-0.25, 0.1], (530.0, 370.0), 40, 0.0)
 
 
 @pytest.mark.slow
