@@ -60,7 +60,7 @@ GOOD = (
 )
 
 
-@pytest.mark.parametrize("name", ["base", "tilt 65", "k1 -0.3"])
+@pytest.mark.parametrize("name", ["base", "tilt 65", pytest.param("k1 -0.3", marks=pytest.mark.slow)])
 def test_midpoints_reach_the_bound(name: str) -> None:
     found_errors = errors(name, range(2))
     assert found_errors.ratio < 1.2

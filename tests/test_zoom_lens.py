@@ -65,7 +65,7 @@ def test_the_error_by_setting_adds_up_to_the_whole() -> None:
 
 def test_the_same_seed_gives_the_same_lens() -> None:
     points = seen("c", grid(4, 3), seed=3, side=4)
-    one, two = (fit_lens(points, distortion="none", topologies=((0, 2),), seed=7) for _ in range(2))
+    one, two = (fit_lens(points, distortion="none", topologies=((0, 1),), seed=7) for _ in range(2))
     np.testing.assert_array_equal(one.predict(one.settings).covariance, two.predict(two.settings).covariance)
     np.testing.assert_array_equal(one.predict(one.settings).local, two.predict(two.settings).local)
 
