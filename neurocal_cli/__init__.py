@@ -13,7 +13,7 @@ distortion                            which distortion model the data support; u
 pipeline, methods                     `calibrate`: the fit, without outliers, as a result
 verdict, evaluation, report           what a result is worth
 stereo, zoom_lens, plots              two cameras; a camera whose zoom and focus move; pictures
-simulation                            synthetic images and zoom lenses with their exact truth
+simulation                            synthetic images and zoom lenses with their exact truth; not installed
 io, detection                         files; points from images
 commands                              the command line
 ====================================  ==================================================================

@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from command_line import run
-from made_calibration import CAMERA, made_calibration, made_points
+from support.command_line import run
+from support.made_calibration import CAMERA, made_calibration, made_points
 
 from neurocal_cli import read_calibration, read_points, write_calibration, write_points
 from neurocal_cli.commands.progress import ProgressBar

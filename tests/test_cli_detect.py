@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import run
+from support.command_line import run
 
 from neurocal_cli import Board, read_image, read_points
 from neurocal_cli.board import Plane

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import run
-from made_calibration import made_calibration, made_points, pose_of
+from support.command_line import run
+from support.made_calibration import made_calibration, made_points, pose_of
 
 from neurocal_cli import Correspondences, evaluate_camera, read_calibration, write_calibration, write_points
 

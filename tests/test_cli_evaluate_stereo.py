@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import run
-from rigs import RigScene, corner, random_rig
+from support.command_line import run
+from support.rigs import RigScene, corner, random_rig
 
 from neurocal_cli import Calibration, calibrate, read_calibration, write_calibration, write_points
 from neurocal_cli.io.rig_yaml import write_rig

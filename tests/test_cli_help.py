@@ -6,33 +6,17 @@ import inspect
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import click
 import pytest
-from command_line import run
+from support.command_line import commands, run
 
 import neurocal_cli
 from neurocal_cli.commands import neurocal
 from neurocal_cli.commands.man import man_pages
 
 MAN = Path(neurocal_cli.__file__).parents[1] / "man"
-
-
-def commands() -> Iterator[tuple[list[str], click.Command]]:
-    """Every command that a user sees, with the words that call it."""
-
-    def walk(words: list[str], command: click.Command) -> Iterator[tuple[list[str], click.Command]]:
-        yield words, command
-        if isinstance(command, click.Group):
-            context = click.Context(command)
-            for name in command.list_commands(context):
-                child = command.get_command(context, name)
-                if child is not None and not child.hidden:
-                    yield from walk([*words, name], child)
-
-    return walk([], neurocal)
 
 
 COMMANDS = [pytest.param(words, command, id=" ".join(["neurocal", *words])) for words, command in commands()]

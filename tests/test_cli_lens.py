@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
-from zoom_laws import FLOOR, between, grid, seen
+from support.command_line import run
+from support.zoom_laws import FLOOR, between, grid, seen
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration

@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import Result
-from command_line import run
-from rigs import RigScene, random_rig
+from support.command_line import run
+from support.real_data import RealFiles
+from support.rigs import RigScene, random_rig
 
 from neurocal_cli import Board, Correspondences, calibrate, read_rig, write_calibration, write_points
 from neurocal_cli.board import Plane
 from neurocal_cli.io.board_yaml import write_board
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def scene(n_views: int = 5) -> RigScene:
@@ -177,9 +176,10 @@ def test_a_flipped_pair_is_named_and_left_out_or_refused(files: tuple[Path, Path
     assert not (tmp_path / "rig").exists()
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the data is not beside the project")
 @pytest.mark.parametrize(("kind", "least"), [("vertices", 120), ("midpoints", 190)])
-def test_the_corner_rig_from_its_photographs(kind: str, least: int, tmp_path: Path) -> None:
+def test_the_corner_rig_from_its_photographs(
+    kind: str, least: int, tmp_path: Path, real_files: RealFiles
+) -> None:
     """The paper's section 5.2, from detection to reconstruction."""
     X, Y, Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
     planes = (
@@ -189,7 +189,7 @@ def test_the_corner_rig_from_its_photographs(kind: str, least: int, tmp_path: Pa
     )
     write_board(Board(planes), tmp_path / "board.yaml")
     for side in ("left", "right"):
-        image = DATA / "ortho3" / f"{side}_calib.jpg"
+        (image,) = real_files(f"ortho3/{side}_calib.jpg")
         words = ["--board", tmp_path / "board.yaml", "--points", kind, "-o", tmp_path / f"{side}.csv"]
         found = run("detect", image, *words)
         assert found.exit_code == 0, found.stderr
@@ -208,10 +208,11 @@ def test_the_corner_rig_from_its_photographs(kind: str, least: int, tmp_path: Pa
     assert values["nsce"] == pytest.approx(3.95, abs=0.2)
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the data is not beside the project")
-def test_thirteen_real_pairs_are_fitted_better_than_opencv_fits_its_corners(tmp_path: Path) -> None:
+def test_thirteen_real_pairs_are_fitted_better_than_opencv_fits_its_corners(
+    tmp_path: Path, real_files: RealFiles
+) -> None:
     for side in ("left", "right"):
-        images = sorted((DATA / "opencv_stereo").glob(f"{side}??.jpg"))
+        images = real_files(f"opencv_stereo/{side}??.jpg")
         words = ["--cols", "9", "--rows", "6", "--square", "25", "-o", tmp_path / f"{side}.csv"]
         assert run("detect", *images, *words).exit_code == 0
     words = ["--no-skew", "--distortion", "plumb_bob", "--outliers", "keep", "-o", tmp_path / "rig.yaml"]

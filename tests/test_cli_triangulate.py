@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import run
-from rigs import RigScene, random_rig
+from support.command_line import run
+from support.rigs import RigScene, random_rig
 
 from neurocal_cli import calibrate, write_calibration
 from neurocal_cli.geometry import Array

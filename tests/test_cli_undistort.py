@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import run
+from support.command_line import run
 
 from neurocal_cli import Correspondences, read_calibration, read_points, undistort_image, undistort_points
 from neurocal_cli.io.camera_files import read_intrinsics

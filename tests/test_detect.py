@@ -8,8 +8,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from rendered import Recipe, board_pose, condition, picture, single
-from seen_grids import labelled_vertices, seen_grid
+from support.rendered import Recipe, board_pose, condition, picture, single
+from support.seen_grids import labelled_vertices, seen_grid
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect

@@ -9,9 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from rendered import Recipe, board_pose, condition, folded, single
-from rendered import picture as rendered_picture
-from seen_grids import labelled_vertices, seen_grid, seen_grids, true_vertices, turned_by
+from support.rendered import Recipe, board_pose, condition, folded, single
+from support.rendered import picture as rendered_picture
+from support.seen_grids import labelled_vertices, seen_grid, seen_grids, true_vertices, turned_by
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import Grid

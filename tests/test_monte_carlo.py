@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes import Scene, pinhole, table_1
+from support.scenes import Scene, pinhole, table_1
 
 from neurocal_cli import Calibration
 from neurocal_cli.bundle_adjustment.covariance import covariance
@@ -63,7 +63,7 @@ def check(type: int, sigma: float, trials: int) -> None:
 
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
 def test_errors_are_at_the_cramer_rao_bound(type: int) -> None:
-    check(type, 1.0, 150)
+    check(type, 1.0, 60)
 
 
 @pytest.mark.slow

@@ -97,8 +97,10 @@ def test_one_board_parallel_to_the_image_does_not_tell_the_focal_length(sigma: f
 
 @pytest.mark.parametrize("kind", ["shifted", "turned in their plane", "parallel to the image"])
 @pytest.mark.parametrize("options", [{}, {"skew": False}, CENTRE], ids=["all", "no skew", "centre given"])
-@pytest.mark.parametrize("n_views", [3, 5, 20])
-@pytest.mark.parametrize("sigma", [0.0, 0.05, 0.3, 1.0])
+@pytest.mark.parametrize("n_views", [3, 5, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "sigma", [0.0, pytest.param(0.05, marks=pytest.mark.slow), 0.3, pytest.param(1.0, marks=pytest.mark.slow)]
+)
 def test_parallel_boards_are_refused_with_and_without_noise(
     kind: str, options: dict[str, Any], n_views: int, sigma: float
 ) -> None:
@@ -413,7 +415,7 @@ def anything_is_answered_or_refused(seed: int) -> None:
                 assert "\n" not in str(error)  # noqa: PT017
 
 
-@settings(max_examples=8, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 10**9))
 def test_any_numbers_are_answered_or_refused(seed: int) -> None:
     anything_is_answered_or_refused(seed)

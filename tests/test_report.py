@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_calibration import made_calibration, pose_of
+from support.made_calibration import made_calibration, pose_of
 
 from neurocal_cli import Correspondences, evaluate_camera
 from neurocal_cli.report import align, calibration_report, evaluation_json, evaluation_report, rounded

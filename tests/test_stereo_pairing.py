@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import random_rig
+from support.rigs import random_rig
 
 from neurocal_cli import Correspondences
 from neurocal_cli.errors import InputError

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scenes import board_midpoints
 
 from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.camera.distortion_models import distort
 from neurocal_cli.camera.pinhole import project
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.verdict.assessment import assess
+from support.scenes import board_midpoints
 
 SIZE = (640, 480)
 CAMERA = Intrinsics(600.0, 600.0, 318.0, 243.0, np.pi / 2)

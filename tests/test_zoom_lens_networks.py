@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from zoom_laws import grid, seen
+from support.zoom_laws import grid, seen
 
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.points import Correspondences
@@ -304,7 +304,7 @@ def test_tables_reach_the_truth_within_their_covariance() -> None:
     assert tables.converged
     variance = tables.normal.cost.sum() / (2 * len(lens.points) - 12 * 5 - 6)
     assert np.sqrt(variance) == pytest.approx(0.15, rel=0.1)
-    from zoom_laws import NAMES, truth
+    from support.zoom_laws import NAMES, truth
 
     true = np.column_stack([truth("c", lens.settings)[name] for name in NAMES])
     covariance, _ = local_covariance(tables.normal, 5, variance)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import RigScene, corner, random_rig
+from support.rigs import RigScene, corner, random_rig
 
 from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.errors import DegenerateGeometryError, InputError

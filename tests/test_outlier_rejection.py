@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import pinhole, random_flat_set, table_1
-from spoilt import MISMATCHES, farthest, good, mismatched, with_outliers
+from support.outliers import MISMATCHES, farthest, good, mismatched, with_outliers
+from support.scenes import pinhole, random_flat_set, table_1
 
 from neurocal_cli import calibrate
 from neurocal_cli.errors import DegenerateGeometryError

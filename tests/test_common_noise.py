@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import pinhole, table_1
+from support.scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences
 from neurocal_cli.bundle_adjustment.common_noise import common_share, with_common_share
@@ -74,7 +74,7 @@ def scene_points(share: float, seed: int) -> Correspondences:
     return replace(points, pixels=points.pixels + noise, covariance=C)
 
 
-def errors(share: float, weighed: bool, trials: int = 40) -> float:
+def errors(share: float, weighed: bool, trials: int) -> float:
     """Rms error of alpha_u over some trials."""
     found = []
     for seed in range(trials):
@@ -83,14 +83,15 @@ def errors(share: float, weighed: bool, trials: int = 40) -> float:
     return float(np.sqrt(np.mean((np.array(found) - 556.0) ** 2)))
 
 
-def test_true_covariances_help_and_wrong_ones_do_no_harm() -> None:
-    assert errors(0.0, True) < 0.75 * errors(0.0, False)
-    assert errors(1.0, True) == pytest.approx(errors(1.0, False), rel=0.02)
+@pytest.mark.parametrize("trials", [15, pytest.param(40, marks=pytest.mark.slow)])
+def test_true_covariances_help_and_wrong_ones_do_no_harm(trials: int) -> None:
+    assert errors(0.0, True, trials) < 0.75 * errors(0.0, False, trials)
+    assert errors(1.0, True, trials) == pytest.approx(errors(1.0, False, trials), rel=0.02)
 
 
 def test_the_reported_deviations_hold_in_a_mixture() -> None:
     ratios = []
-    for seed in range(60):
+    for seed in range(30):
         camera = pinhole(scene_points(0.5, seed))
         ratios.append((camera.intrinsics.alpha_u - 556.0) / camera.std["alpha_u"])
-    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.25)
+    assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.35)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Iterator
 
+import click
 from click.testing import CliRunner, Result
 
 from neurocal_cli.commands import neurocal
@@ -16,3 +18,18 @@ def run(*words: object, stdin: bytes | None = None, env: dict[str, str] | None =
     """Run ``neurocal WORDS``."""
     runner = CliRunner(**_APART)  # type: ignore[arg-type]
     return runner.invoke(neurocal, [str(word) for word in words], input=stdin, env=env, prog_name="neurocal")
+
+
+def commands() -> Iterator[tuple[list[str], click.Command]]:
+    """Every command that a user sees, with the words that call it."""
+
+    def walk(words: list[str], command: click.Command) -> Iterator[tuple[list[str], click.Command]]:
+        yield words, command
+        if isinstance(command, click.Group):
+            context = click.Context(command)
+            for name in command.list_commands(context):
+                child = command.get_command(context, name)
+                if child is not None and not child.hidden:
+                    yield from walk([*words, name], child)
+
+    return walk([], neurocal)

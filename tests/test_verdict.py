@@ -7,18 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bent import bent_set
-from scenes import Scene, pinhole, random_flat_set, table_1
-from wrong_inputs import flat
+from support.distorted import bent_set
+from support.scenes import Scene, pinhole, random_flat_set, table_1
+from support.wrong_inputs import flat
 
-from neurocal_cli import Calibration, calibrate
+from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.bundle_adjustment.units import see
 from neurocal_cli.camera.distortion_models import Lens
 from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
 from neurocal_cli.verdict.assessment import assess, gather_evidence
-
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def moved_pixels(true: Calibration, other: Calibration, pixels: np.ndarray, depth: float) -> np.ndarray:
@@ -115,9 +113,6 @@ def test_a_calibration_without_an_image_size_is_judged_without_the_image() -> No
     assert assess(found).word == "good"
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the data is not beside the project")
-def test_zhangs_views_are_good_with_their_lens_and_not_without() -> None:
-    from test_lens_calibration import zhang
-
-    assert assess(calibrate(zhang())).word == "good"
-    assert assess(calibrate(zhang(), distortion="none")).word == "usable"
+def test_zhangs_views_are_good_with_their_lens_and_not_without(zhang: Correspondences) -> None:
+    assert assess(calibrate(zhang)).word == "good"
+    assert assess(calibrate(zhang, distortion="none")).word == "usable"

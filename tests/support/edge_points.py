@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from bent import without_camera
-from scenes import board_midpoints, random_flat_set
 
 from neurocal_cli import Correspondences
 from neurocal_cli.camera.distortion_models import distort
 from neurocal_cli.camera.pinhole import Intrinsics, project
 from neurocal_cli.geometry import Array
+from support.distorted import without_camera
+from support.scenes import board_midpoints, random_flat_set
 
 
 def edges(square: float = 25.0) -> tuple[Array, Array]:

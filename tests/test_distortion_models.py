@@ -2,21 +2,12 @@
 
 import numpy as np
 import pytest
+from support.distorted import LENSES
 
 from neurocal_cli.camera.distortion_models import MODELS, bend, coefficient_names, distort
 from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.errors import InputError
 
-# Coefficients of real lenses' sizes.
-LENSES = {
-    "none": [],
-    "k1": [-0.28],
-    "k1k2": [-0.2286, 0.1904],
-    "k1k2p1p2": [-0.26, 0.06, 2e-3, -1e-3],
-    "plumb_bob": [-0.26, 0.06, 2e-3, -1e-3, 0.03],
-    "rational": [0.4, -0.2, 1e-3, 2e-3, 0.05, 0.7, -0.1, 0.02],
-    "fisheye": [0.08, -0.03, 0.02, -0.005],
-}
 STEP = 1e-6
 
 

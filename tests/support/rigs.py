@@ -7,9 +7,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from neurocal_cli import Correspondences, Intrinsics, Pose
+from neurocal_cli.bundle_adjustment.reprojection import residuals
 from neurocal_cli.camera.distortion_models import Lens, distort
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_files import CameraFile
+from neurocal_cli.stereo.problem import RigProblem
+from neurocal_cli.stereo.reprojection import RigState
 
 KINDS = ("parallel", "verging", "wide", "narrow", "unequal")
 
@@ -123,3 +126,21 @@ def random_rig(
             lean = lean @ Pose.from_euler(2.2, 0.5, 2.3, np.zeros(3)).R
         poses[f"{k + 1:02d}"] = Pose(lean, t - lean @ middle)
     return RigScene((cameras[0], cameras[1]), lenses, sizes, Pose(R, -R @ centre), target, poses)
+
+
+def sides(scene: RigScene, sigma: float, seed: int = 1) -> tuple[Correspondences, Correspondences]:
+    """What the left and the right camera see."""
+    rng = np.random.default_rng(seed)
+    return scene.points(0, sigma, rng), scene.points(1, sigma, rng)
+
+
+def all_residuals(problem: RigProblem, state: RigState) -> Array:
+    """Whitened residuals, computed through no more than the cameras' own projections."""
+    out = []
+    for side, seen in enumerate(problem.sightings):
+        camera = state.seen_by(side, problem.frames, seen)
+        error = residuals(seen.batches, camera)
+        if seen.batches.whitening is not None:
+            error = error * (seen.batches.whitening[:, :1] > 0)
+        out.append(np.sqrt(seen.weight) * error.ravel())
+    return np.concatenate(out)

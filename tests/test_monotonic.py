@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from test_lens import LENSES
+from support.distorted import LENSES
 
 from neurocal_cli.camera.distortion_models import Lens, bend, distort
 from neurocal_cli.camera.monotonic import first_fold, is_seen, straightened, undistort

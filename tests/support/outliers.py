@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scenes import Scene, pinhole, random_flat_set, random_solid
 
 from neurocal_cli import Calibration, Correspondences
 from neurocal_cli.camera.pinhole import project
 from neurocal_cli.errors import NeurocalError
+from support.scenes import Scene, pinhole, random_flat_set, random_solid
 
 SIGMA = 0.3
 MISMATCHES = (

@@ -2,10 +2,9 @@
 
 import numpy as np
 import pytest
-from rigs import RigScene, random_rig
+from support.rigs import RigScene, all_residuals, random_rig
 
 from neurocal_cli import calibrate
-from neurocal_cli.bundle_adjustment.reprojection import residuals
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.adjust import adjust_rig
 from neurocal_cli.stereo.consensus import find_consensus
@@ -25,18 +24,6 @@ def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigP
     calibrations = [calibrate(p, skew=False, distortion=lens) for p in (left, right)]
     problem = rig_problem(*calibrations, pair_views(left.view_names, right.view_names))
     return scene, problem, problem.start(find_consensus(problem).rig)
-
-
-def all_residuals(problem: RigProblem, state: RigState) -> Array:
-    """Whitened residuals, computed through no more than the cameras' own projections."""
-    out = []
-    for side, seen in enumerate(problem.sightings):
-        camera = state.seen_by(side, problem.frames, seen)
-        error = residuals(seen.batches, camera)
-        if seen.batches.whitening is not None:
-            error = error * (seen.batches.whitening[:, :1] > 0)
-        out.append(np.sqrt(seen.weight) * error.ravel())
-    return np.concatenate(out)
 
 
 @pytest.mark.parametrize("lens", ["none", "k1k2"])

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from edge_points import as_measured, edge_set, edges
 from hypothesis import given
 from hypothesis import strategies as st
-from rigs import random_rig
-from scenes import pinhole
+from support.edge_points import as_measured, edge_set, edges
+from support.rigs import random_rig
+from support.scenes import pinhole
 
 from neurocal_cli import Correspondences, calibrate
 from neurocal_cli.bundle_adjustment.common_noise import Noise, noise_of
@@ -69,10 +69,11 @@ def test_standard_deviations_of_a_lens_hold(distortion: str) -> None:
     assert 0.85 < rms(errors) < 1.2
 
 
-def test_standard_deviations_of_a_rig_hold() -> None:
+@pytest.mark.parametrize("rigs", [12, pytest.param(30, marks=pytest.mark.slow)])
+def test_standard_deviations_of_a_rig_hold(rigs: int) -> None:
     one_way, both_ways = [], []
     world, ends = edges()
-    for seed in range(30):
+    for seed in range(rigs):
         rng = np.random.default_rng(seed)
         scene = replace(random_rig(rng, "verging", 8), world=world)
         sides = [
@@ -82,7 +83,7 @@ def test_standard_deviations_of_a_rig_hold() -> None:
         for kept, points in ((one_way, sides), (both_ways, [replace(p, across=None) for p in sides])):
             rig = calibrate_stereo(*points, skew=False, distortion="none", outliers="keep")
             kept.append([(rig.t[k] - scene.rig.t[k]) / rig.std[f"t_{axis}"] for k, axis in enumerate("xyz")])
-    assert 0.8 < rms(one_way) < 1.2
+    assert 1 - 1.1 / np.sqrt(rigs) < rms(one_way) < 1 + 1.1 / np.sqrt(rigs)  # 0.2 for thirty
     assert rms(both_ways) > 2.0
 
 
@@ -91,9 +92,10 @@ def test_the_level_of_the_noise_is_that_of_the_measurement() -> None:
     assert np.mean(levels) == pytest.approx(1.0, abs=0.05)
 
 
-def test_no_lens_is_seen_where_there_is_none() -> None:
-    found = [calibrate(edge_set(seed)[1], skew=False) for seed in range(100, 140)]
-    assert sum(one.distortion_model == "none" for one in found) >= 37
+@pytest.mark.parametrize("sets", [12, pytest.param(40, marks=pytest.mark.slow)])
+def test_no_lens_is_seen_where_there_is_none(sets: int) -> None:
+    found = [calibrate(edge_set(seed)[1], skew=False) for seed in range(100, 100 + sets)]
+    assert sum(one.distortion_model == "none" for one in found) >= 0.92 * sets - 1
     assert not any(len(one.rejected) for one in found)
 
 

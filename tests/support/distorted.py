@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scenes import Scene, random_flat_set
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.units import Seen, normalised
@@ -18,9 +17,20 @@ from neurocal_cli.camera.pinhole import Pose, project
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
+from support.scenes import Scene, random_flat_set
 
 BENT = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "fisheye")
 SIGMA = 0.2
+# Coefficients of real lenses' sizes.
+LENSES = {
+    "none": [],
+    "k1": [-0.28],
+    "k1k2": [-0.2286, 0.1904],
+    "k1k2p1p2": [-0.26, 0.06, 2e-3, -1e-3],
+    "plumb_bob": [-0.26, 0.06, 2e-3, -1e-3, 0.03],
+    "rational": [0.4, -0.2, 1e-3, 2e-3, 0.05, 0.7, -0.1, 0.02],
+    "fisheye": [0.08, -0.03, 0.02, -0.005],
+}
 
 
 def bent_set(model: str, seed: int) -> tuple[Scene, list[float]]:

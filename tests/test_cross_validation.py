@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scenes import Scene, pinhole, random_flat_set, random_solid
+from support.scenes import Scene, pinhole, random_flat_set, random_solid
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
 from neurocal_cli.bundle_adjustment.cross_validation import (

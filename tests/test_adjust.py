@@ -248,7 +248,7 @@ def test_cameras_side_by_side_do_not_hold_each_other_up() -> None:
         assert together.each_settled[k] == one.each_settled[0]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(st.integers(0, 10**6))
 def test_no_step_raises_the_error_or_takes_a_point_behind_the_camera(seed: int) -> None:
     problem = Problem((12, 30), seed=seed)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from bent import SIGMA, bent_set, new_views, through
+from support.distorted import SIGMA, bent_set, new_views, through
 
 from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
