@@ -149,7 +149,7 @@ def _refuse_misfit(calibration: Calibration) -> None:
         return
     given = {3: ", and the intrinsics", 4: ", and the poses"}.get(calibration.type, "")
     raise DegenerateGeometryError(
-        f"no camera sees the points where they were seen: the best one errs by {calibration.rmse_px:.3g} px; "
+        f"no camera fits these points: the error of the best one is {calibration.rmse_px:.3g} px rms; "
         f"check that each pixel belongs to its point, the order and the signs of X,Y,Z and u,v{given}"
     )
 
@@ -172,7 +172,7 @@ def _with_lens(known: Known, distortion: str, given: Lens) -> tuple[Known, str]:
         return replace(known, lens=Lens(distortion), free_lens=distortion != "none"), ""
     if distortion not in ("auto", "none", given.model):
         raise UsageError(
-            f"type 3 takes the lens of the given camera ({given.model}), not distortion {distortion}"
+            f"type 3 uses the distortion of the given camera ({given.model}), not {distortion}; leave it out"
         )
     return replace(known, lens=given, fixed=known.fixed | set(coefficient_names(given.model))), ""
 
@@ -187,9 +187,9 @@ def _check_options(method: str, trainer: str, distortion: str, outliers: str, st
         if value not in choices:
             raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
     if not isinstance(starts, (int, np.integer)) or starts < 2:
-        raise UsageError("starts must be at least 2, a whole number: one start has nothing to agree with")
+        raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
     if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise UsageError("seed must be a whole number from 0 on")
+        raise UsageError("seed must be a whole number of at least 0")
 
 
 def _strategy(trainer: str, starts: int, backprop: BackpropOptions | None, report: Progress) -> Strategy:
@@ -215,6 +215,6 @@ def _strategy(trainer: str, starts: int, backprop: BackpropOptions | None, repor
     def constrained(task: Task, a: float) -> Trained:
         # Lower rates than from random weights, and every gamma where it belongs: it starts trained.
         gentle = replace(options, rate_weights=0.4 * options.rate_weights, beta=10.0, a=a, resting_gamma=True)
-        return train_backprop(task, gentle, lambda share: report("training with E_orth", share))
+        return train_backprop(task, gentle, lambda share: report("training with orthogonality", share))
 
     return Strategy(train, Agreement(0.02, 1e-4), (1024, 1024), None, 1024, starts, constrained)

@@ -47,7 +47,7 @@ def check_points(views: Views, known: Known) -> None:
         raise DegenerateGeometryError(
             f"{views.distinct.sum()} different points give {equations:.0f} equations for {unknowns} "
             f"unknowns; give at least {unknowns // of_point + 1} points"
-            + (f", or more of the camera ({_givable(known)})" if known.type == 1 else "")
+            + (f", or known parameters ({_givable(known)})" if known.type == 1 else "")
         )
 
 
@@ -91,7 +91,7 @@ def _check_planes(views: Views, known: Known) -> None:
         ways.append("--type 2 --no-skew" if known.free[1] else "--type 2")
     views_text = "one view" if len(flat) == 1 else f"{len(flat)} views"
     raise DegenerateGeometryError(
-        f"{views_text} of one plane cannot tell {names} apart; give {', '.join(ways[:-1])} or {ways[-1]}"
+        f"{views_text} of one plane cannot determine {names}; give {', '.join(ways[:-1])} or {ways[-1]}"
     )
 
 
@@ -108,7 +108,8 @@ def _check_helpers(views: Views, known: Known) -> None:
     which = int(np.argmin(able))
     raise DegenerateGeometryError(
         f"view {views.names[which]!r} has only {views.distinct[which]} different points, and the views of "
-        f"one plane cannot tell the camera without it; give it at least 6 points, or {needed} views of the "
+        f"one plane cannot determine the camera without it; give it at least 6 points, or {needed} views of "
+        "the "
         "board from different angles"
     )
 
@@ -166,10 +167,11 @@ def check_determined(
         return
     if boards:
         _check_tilts(views, normals, singular)
-    more = f", or give more of the camera ({ways})" if (ways := _givable(known)) else ""
+    more = f", or give known parameters ({ways})" if (ways := _givable(known)) else ""
     if singular and known.free_lens:
         raise DegenerateGeometryError(
-            f"the points do not determine all coefficients of the {known.lens.model} lens; choose a simpler "
+            f"the points do not determine all coefficients of the distortion model {known.lens.model}; "
+            "choose a simpler "
             "--distortion, or give points over more of the image"
         )
     if singular:
@@ -178,7 +180,7 @@ def check_determined(
             f"spread the points in depth{more}"
         )
     share = relative_std.max()
-    known_to = f"is known no better than to {100 * share:.0f} % of itself" if share < 1 else "cannot be told"
+    known_to = f"has a std of {100 * share:.0f} % of its value" if share < 1 else "cannot be determined"
     raise DegenerateGeometryError(
         f"the focal length {known_to}; bring the target nearer, tilt it more{more}, and check that each "
         "pixel belongs to its point"
@@ -189,18 +191,18 @@ def _check_tilts(views: Views, normals: Array, singular: bool) -> None:
     """Refuse flat boards that stand parallel, to the image or to each other."""
     if views.n_views == 1:
         raise DegenerateGeometryError(
-            "one view of a board that is (nearly) parallel to the image cannot tell the focal length; "
+            "one view of a board that is (nearly) parallel to the image cannot determine the focal length; "
             "tilt the board by 20 to 50 degrees"
         )
     angle = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T).min(), 0, 1)))
     if singular and angle >= _NEARLY_PARALLEL:
         return
     # Noise on parallel boards reads as a long lens and large tilts: the angle means nothing then.
-    found = "parallel as far as the noise lets one tell"
+    found = "parallel within the noise"
     if angle < _NEARLY_PARALLEL:
         found = f"all parallel (within {angle:.1f} degrees)"
     raise DegenerateGeometryError(
-        f"the {views.n_views} boards are {found}, so no focal length can be told from them; "
+        f"the {views.n_views} boards are {found}, so they cannot determine the focal length; "
         "tilt the board by 20 to 50 degrees in different directions"
     )
 

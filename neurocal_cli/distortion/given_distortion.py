@@ -38,7 +38,7 @@ def straighten(points: Correspondences, known: Known) -> Correspondences:
         row = int(np.argmax(lost))
         u, v = points.pixels[row]
         raise InputError(
-            f"{points.place(row)}: the given lens cannot have seen anything at the pixel ({u:g}, {v:g}); "
+            f"{points.place(row)}: the given distortion maps nothing to the pixel ({u:g}, {v:g}); "
             "check that the camera belongs to these images"
         )
     return replace(points, pixels=straight)
@@ -80,6 +80,6 @@ def check_lens(job: Job, solution: Solution, points: Correspondences) -> tuple[J
             job.tally.refinements += found[0].iterations
             return replace(job, restraint=found[1]), Solution(found[0], job.tally)
     raise DegenerateGeometryError(
-        f"the distortion {lens.model} folds back inside the {where}; choose another model, or "
-        "give points nearer to the image's corners"
+        f"the distortion model {lens.model} is not monotonic (maps two directions to one pixel) inside the "
+        f"{where}; choose another --distortion, or give points nearer to the image's corners"
     )

@@ -124,7 +124,7 @@ def _helped_by_others(job: Job, able: NDArray[np.bool_]) -> Adjusted:
     if not able.any():
         raise DegenerateGeometryError(
             f"no view has enough different points by itself (view {views.names[0]!r} has "
-            f"{views.distinct[0]}); at least one needs 6, or 4 on a flat board"
+            f"{views.distinct[0]}); give at least one view with 6, or 4 on a flat board"
         )
     helpers = np.flatnonzero(able)
     part = Job(views.subset(helpers), job.known, job.strategy, job.rng, job.progress)
