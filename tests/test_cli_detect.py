@@ -125,9 +125,9 @@ def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> N
         "d_empty.png": "is empty",
         "e_text.png": "is no image",
         "f_bomb.png": "60000 x 60000 px",
-        "g_tiny.png": "no board found",
-        "h_black.pgm": "no board found",
-        "i_white.bmp": "no board found",
+        "g_tiny.png": "no board detected",
+        "h_black.pgm": "no board detected",
+        "i_white.bmp": "no board detected",
         "absent.png": "no such file",
     }
     assert len(lines) == len(expected)
@@ -194,7 +194,7 @@ def test_overlays_never_replace_the_images(folder: Path, tmp_path: Path) -> None
     before = (folder / "board01.png").read_bytes()
     result = detect(folder, *BOARD, "--overlay", folder)
     assert result.exit_code == 2
-    assert "holds the images themselves" in result.stderr
+    assert "is the folder of the images" in result.stderr
     assert (folder / "board01.png").read_bytes() == before
     (tmp_path / "file").write_text("x")
     assert detect(folder, *BOARD, "--overlay", tmp_path / "file").exit_code == 2
@@ -235,8 +235,8 @@ def test_planes_that_are_missing_and_rejected_points_are_noted(
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ((), "the board is not described"),
-        (("--cols", 9, "--rows", 6), "the board is not described"),
+        ((), "the size of the board is missing"),
+        (("--cols", 9, "--rows", 6), "the size of the board is missing"),
         (("--board", "b.yaml", "--cols", 9), "leave out --cols"),
         (("--cols", 9, "--rows", 1, "--square", 25), "--rows"),
         (("--cols", 9, "--rows", 6, "--square", -1), "--square"),

@@ -130,7 +130,7 @@ def one_line_error(result: Result, *parts: str) -> None:
 
 
 def test_the_same_camera_twice_is_refused(cameras: tuple[Path, Path]) -> None:
-    one_line_error(evaluate(cameras[0], cameras[0]), "both cameras stand at one place")
+    one_line_error(evaluate(cameras[0], cameras[0]), "both cameras are at the same place")
 
 
 def test_swapped_files_are_refused_by_their_views_names(cameras: tuple[Path, Path]) -> None:

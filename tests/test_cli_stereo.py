@@ -151,14 +151,14 @@ def error(result: Result, *parts: str) -> None:
 
 def test_files_that_do_not_go_together_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
     error(run("stereo", *files[::-1]), "swapped", "give the left camera first")
-    error(run("stereo", files[0], files[0], "--no-skew"), "both cameras stand at one place")
+    error(run("stereo", files[0], files[0], "--no-skew"), "both cameras are at the same place")
     right = points()[1]
     write_points(replace(right, unit="cm"), tmp_path / "r.csv")
     error(run("stereo", files[0], tmp_path / "r.csv"), "is in mm", "in cm")
     write_points(replace(right, world=right.world / 10), tmp_path / "r.csv")
     error(run("stereo", files[0], tmp_path / "r.csv"), "in the same coordinates and unit")
     write_points(replace(right, view=[f"b{v}" for v in right.view]), tmp_path / "r.csv")
-    error(run("stereo", files[0], tmp_path / "r.csv"), "no view of the left camera has its pair")
+    error(run("stereo", files[0], tmp_path / "r.csv"), "no view of the left camera has a partner")
     (tmp_path / "r.csv").write_text("")
     error(run("stereo", files[0], tmp_path / "r.csv"), "is empty")
     error(run("stereo", files[0], tmp_path / "none.csv"), "there is no such file")

@@ -303,7 +303,7 @@ def test_all_kinds_of_lenses_do(
 @pytest.mark.parametrize(
     ("words", "exit_code", "message"),
     [
-        (["CAMERA", "IMAGES"], 2, "several files need a folder to go to; give -o DIR"),
+        (["CAMERA", "IMAGES"], 2, "several files cannot go to standard output; give a folder, -o DIR"),
         (["CAMERA", "IMAGE", "-o", "IMAGE"], 2, "is an input and would be overwritten"),
         (["CAMERA", "IMAGES", "-o", "IMAGES"], 2, "is an input and would be overwritten"),
         (["CAMERA", "POINTS", "-o", "POINTS"], 2, "is an input and would be overwritten"),

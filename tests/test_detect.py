@@ -110,9 +110,9 @@ def test_edges_turn_with_their_grid(matrix: tuple, offset: tuple) -> None:
 
 def test_an_image_without_a_board_says_so() -> None:
     for value in (0, 255):
-        with pytest.raises(NoBoardError, match="no board found"):
+        with pytest.raises(NoBoardError, match="no board detected"):
             detect_points(np.full((100, 120), value, dtype=np.uint8), BOARD)
-    with pytest.raises(NoBoardError, match="no board found"):
+    with pytest.raises(NoBoardError, match="no board detected"):
         detect_points(np.zeros((8, 8), dtype=np.uint8), BOARD)
 
 

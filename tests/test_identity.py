@@ -74,7 +74,7 @@ def test_a_part_of_the_board_is_placed_by_the_ends_that_are_seen_or_refused(name
         try:
             found = labelled_vertices(identify(scene.board, seen_grids(scene, seen), seen.image))
         except NoBoardError as error:
-            assert "nothing tells which" in str(error)  # noqa: PT017 - both are right, wrong points are not
+            assert "it is ambiguous which" in str(error)  # noqa: PT017 - both are right, wrong points are not
             continue
         placed += 1
         found = found if scene.targets[0].first_black else turned_by(found, 9, 6)
@@ -83,7 +83,7 @@ def test_a_part_of_the_board_is_placed_by_the_ends_that_are_seen_or_refused(name
 
 
 def test_a_part_that_could_be_anywhere_is_refused() -> None:
-    with pytest.raises(NoBoardError, match="found 5 x 4 of 9 x 6 inner vertices, and nothing tells which"):
+    with pytest.raises(NoBoardError, match="found 5 x 4 of 9 x 6 inner vertices, and it is ambiguous which"):
         identify(Board.single(9, 6, 25), [flat_grid(5, 4)], EMPTY)
 
 
@@ -167,7 +167,7 @@ def test_small_pieces_of_large_boards_are_refused_at_once() -> None:
     pieces = [flat_grid(3, 3), Grid(flat_grid(4, 3).pixels + 200.0, 0)]
     for board in (Board.single(40, 30, 5.0), Board(sheets)):
         start = time.monotonic()
-        with pytest.raises(NoBoardError, match="nothing tells which"):
+        with pytest.raises(NoBoardError, match="it is ambiguous which"):
             identify(board, pieces, EMPTY)
         assert time.monotonic() - start < 5
 
@@ -181,7 +181,7 @@ def test_a_piece_beside_a_bigger_board_is_not_taken_but_a_board_before_it_is() -
 
 
 def test_no_grid_is_no_board() -> None:
-    with pytest.raises(NoBoardError, match="no board found"):
+    with pytest.raises(NoBoardError, match="no board detected"):
         identify(Board.single(9, 6, 25), [], EMPTY)
 
 

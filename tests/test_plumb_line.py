@@ -454,8 +454,8 @@ def test_the_command_writes_a_lens_that_evaluates_as_reported(csv: Path) -> None
     camera = csv.with_name("camera.yaml")
     result = run("calibrate", csv, "--distortion", "plumb-line", "-o", camera)
     assert (result.exit_code, result.stdout) == (0, "")
-    assert "lens: " in result.stderr
-    assert "px beside them as seen" in result.stderr
+    assert "straight lines: " in result.stderr
+    assert "px before undistortion" in result.stderr
     found = read_calibration(camera)
     assert found.distortion_model == "k1k2p1p2"
     assert set(found.std) >= {"k1", "k2", "p1", "p2"}

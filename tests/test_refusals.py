@@ -178,7 +178,7 @@ def test_a_view_of_few_points_needs_others_that_tell_the_camera_without_it() -> 
     few = FOLDED[rng.permutation(len(FOLDED))[:5]]
     points = see([BOARD, few], [tilted(0), AHEAD])
     refused(points, "view 'v1' has only 5 different points", "at least 6 points", "3 views of the board")
-    refused(see([few, few], [tilted(0), AHEAD]), "no view has enough different points", "needs 6", skew=False)
+    refused(see([few, few], [tilted(0), AHEAD]), "no view has enough different points", "with 6", skew=False)
 
 
 # Mirrored and mismatched data
@@ -282,8 +282,8 @@ def test_one_point_of_thousands_behind_the_camera_is_noticed(seed: int) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"starts": 1}, "starts must be at least 2"),
-        ({"starts": 0}, "starts must be at least 2"),
+        ({"starts": 1}, "starts must be a whole number"),
+        ({"starts": 0}, "starts must be a whole number"),
         ({"method": "magic"}, "method must be one of neuro"),
         ({"trainer": "adam"}, "trainer must be one of lm, backprop, not 'adam'"),
         ({"distortion": "round"}, "distortion must be one of auto"),

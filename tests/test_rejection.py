@@ -101,7 +101,7 @@ def test_a_view_left_out_is_named_with_the_reason() -> None:
     scene, points, _ = good(77, flat=True, n_views=8)
     shuffled = mismatched(scene, points, 2, "shuffled", np.random.default_rng(0))
     found = reject(shuffled)
-    assert found.rejected.views == {"view0002": "its points and pixels do not belong together"}
+    assert found.rejected.views == {"view0002": "its pixels do not match its points"}
     assert any("view 'view0002' is left out" in text for text in found.warnings)
     assert "view0002" not in found.views
     mirrored = mismatched(scene, points, 2, "mirrored", np.random.default_rng(0))

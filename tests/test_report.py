@@ -75,7 +75,7 @@ def test_the_report_tells_how_the_training_went() -> None:
     text = calibration_report(made_calibration())
     assert "2 of 3 random starts agreed, 33 iterations, loss 0.4300 px" in text
     assert "0.4400 px after training, 0.4200 px after 4 more steps" in text
-    assert text.endswith("converged: the pixel error cannot be lowered further")
+    assert text.endswith("converged: the reprojection error is at a minimum")
 
 
 def test_a_calibration_without_a_network_is_reported() -> None:

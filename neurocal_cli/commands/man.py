@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import textwrap
 from collections.abc import Iterator
 
 import click
@@ -47,6 +48,7 @@ _FILES = (
     ),
 )
 
+_WIDTH = 78  # of lines of the source
 _ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, an unexpected error shows where in the program it arose."),)
 
 
@@ -124,7 +126,7 @@ def _split_help(text: str) -> tuple[str, list[str], list[str]]:
     paragraphs = [p for p in re.split(r"\n\s*\n", _dedent(text)) if p.strip()]
     examples = [p for p in paragraphs if p.startswith("\b\nExamples:")]
     others = [p for p in paragraphs[1:] if p not in examples]
-    lines = [line.strip() for p in examples for line in p.splitlines()[2:]]
+    lines = [line.removeprefix("  ") for p in examples for line in p.splitlines()[2:]]
     return " ".join(paragraphs[0].split()), others, lines
 
 
@@ -185,7 +187,7 @@ def _neighbours(name: str, names: list[str]) -> list[str]:
 
 
 def _section(title: str, body: list[str]) -> list[str]:
-    return [f".SH {title}", *body] if body else []
+    return [f".SH {title}", *(body[1:] if body[:1] == [".PP"] else body)] if body else []
 
 
 def _prose(paragraphs: list[str]) -> list[str]:
@@ -194,8 +196,8 @@ def _prose(paragraphs: list[str]) -> list[str]:
         if paragraph.startswith("\b\n"):
             lines += _verbatim(paragraph.splitlines()[1:])
         else:
-            lines += [".PP", _escape(" ".join(paragraph.split()))]
-    return lines[1:] if lines[:1] == [".PP"] else lines
+            lines += [".PP", *_fill(paragraph)]
+    return lines
 
 
 def _verbatim(text: list[str]) -> list[str]:
@@ -204,7 +206,13 @@ def _verbatim(text: list[str]) -> list[str]:
 
 
 def _terms(rows: tuple[tuple[str, str], ...] | list[tuple[str, str]]) -> list[str]:
-    return [line for term, text in rows for line in (".TP", rf"\fB{_escape(term)}\fR", _escape(text))]
+    return [line for term, text in rows for line in (".TP", rf"\fB{_escape(term)}\fR", *_fill(text))]
+
+
+def _fill(text: str) -> list[str]:
+    """Lines of running text, none of which troff would read as a request."""
+    lines = textwrap.wrap(_escape(text), _WIDTH, break_long_words=False, break_on_hyphens=False)
+    return [rf"\&{line}" if line.startswith((".", "'")) else line for line in lines]
 
 
 def _escape(text: str) -> str:
