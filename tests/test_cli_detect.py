@@ -64,7 +64,7 @@ def write(path: Path, picture: np.ndarray) -> None:
 def test_points_of_all_images_go_to_a_file(folder: Path, tmp_path: Path) -> None:
     result = detect(folder, *BOARD, "-o", tmp_path / "p.csv")
     assert (result.exit_code, result.stdout) == (0, "")
-    assert result.stderr == "found the board in 3 of 3 images: 279 points, 0 rejected\n"
+    assert result.stderr == "board detected in 3 of 3 images: 279 points, 0 rejected\n"
     text = (tmp_path / "p.csv").read_text()
     head = "# image_size: 400 300\n# unit: mm\nview,point,X,Y,Z,u,v,suu,suv,svv,nu,nv\n"
     assert text.startswith(head + "board01,h:0:0,12.5,0.0,0.0,")
@@ -134,7 +134,7 @@ def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> N
     for line, (name, words) in zip(lines, expected.items(), strict=True):
         assert line.startswith(f"{folder / name}: ")
         assert words in line
-    assert summary == "found the board in 3 of 11 images: 279 points, 0 rejected"
+    assert summary == "board detected in 3 of 11 images: 279 points, 0 rejected"
     assert {row.split(",")[0] for row in result.stdout.splitlines()[3:]} == {"board01", "board02", "board03"}
 
 
@@ -149,7 +149,7 @@ def test_the_decoders_are_not_heard(folder: Path) -> None:
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     first, last = done.stderr.splitlines()
     assert first.startswith(f"{folder / 'a.jpg'}: is damaged")
-    assert last.startswith("found the board in 3 of 4 images")
+    assert last.startswith("board detected in 3 of 4 images")
 
 
 def test_no_board_in_any_image_is_exit_1_without_a_file(folder: Path, tmp_path: Path) -> None:
@@ -169,8 +169,8 @@ def test_no_board_in_any_image_is_exit_1_without_a_file(folder: Path, tmp_path: 
     assert (result.exit_code, result.stdout) == (1, "")
     *lines, last = result.stderr.splitlines()
     assert len(lines) == 3
-    assert all("found 9 x 6 inner vertices, the board has 6 x 4" in line for line in lines)
-    assert last == "Error: none of the 3 images shows the board; the reason stands above"
+    assert all("detected 9 x 6 inner vertices, but the board has 6 x 4" in line for line in lines)
+    assert last == "Error: none of the 3 images shows the board; see the reason above"
     assert not (tmp_path / "p.csv").exists()
     assert not (tmp_path / "o").exists()
 
@@ -228,7 +228,7 @@ def test_planes_that_are_missing_and_rejected_points_are_noted(
     found = detect_points(read_image(folder / "board01.png").grey, Board.single(9, 6, 25.0))
     named = replace(found, located=(replace(found.located[0], plane=board.planes[0]),))
     assert list(batch._remarks(named, board)) == [
-        "without b: not found, or not to be told from something else"
+        "no points of b: not detected, or ambiguous"
     ]
 
 

@@ -185,7 +185,7 @@ def test_opencvs_cameras_are_judged_by_points_with_fitted_poses(tmp_path: Path) 
         words.append(tmp_path / f"{side}.yaml")
     result = evaluate(*words, "--points", tmp_path / "0.csv", tmp_path / "1.csv", "--json")
     assert result.exit_code == 0, result.stderr
-    assert result.stderr.count("note: only the intrinsic parameters and the lens are used") == 2
+    assert result.stderr.count("note: only the intrinsic parameters and the distortion are used") == 2
     values = json.loads(result.stdout)
     assert values["rig"]["epipolar_px"] == pytest.approx(0.2, rel=0.2)
     assert values["baseline"] == pytest.approx(np.linalg.norm(made.rig.t), rel=0.01)

@@ -56,8 +56,8 @@ def test_the_summary_says_what_was_found(files: tuple[Path, Path]) -> None:
     result = run("stereo", *files, "--no-skew")
     assert result.stdout.startswith("left:\n  camera_name: left\n")
     text = result.stderr
-    assert "rig: 4 views of both cameras, left 270 points in 5 views, right 216 points in 4 views" in text
-    assert "note: the left camera alone saw left02" in text
+    assert "rig: 4 pairs of views, left 270 points in 5 views, right 216 points in 4 views" in text
+    assert "note: only the left camera saw left02" in text
     for label in ("alpha_u [px]", "X_right = R X_left + t", "t_z [mm]", "baseline [mm]", "left03 / right03"):
         assert any(line.startswith(label) for line in text.splitlines()), label
     assert "converged" in text.splitlines()[-1]
@@ -116,11 +116,11 @@ def test_ros_files_come_beside_the_rig(files: tuple[Path, Path], tmp_path: Path)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--type", "4"], "no rig to find"),
+        (["--type", "4"], "no rig to estimate"),
         (["--type", "3"], "--left-intrinsics and --right-intrinsics"),
-        (["--image-center", "1", "2"], "--image-center belongs to --type 2"),
+        (["--image-center", "1", "2"], "--image-center needs --type 2"),
         (["--alpha", "2"], "--alpha"),
-        (["--epochs", "5"], "--epochs belongs to --trainer backprop"),
+        (["--epochs", "5"], "--epochs needs --trainer backprop"),
         (["-o", "a", "--ros", "a", "b"], "same file"),
     ],
 )

@@ -85,7 +85,7 @@ def test_the_points_are_the_librarys(folder: Path) -> None:
 
 def test_two_calibrations_make_the_rig_themselves(folder: Path) -> None:
     result = run("triangulate", folder / "left.yaml", folder / "right.yaml", folder / "matches.csv")
-    assert "note: the rig is fitted to 4 views that both cameras saw: baseline" in result.stderr
+    assert "note: the rig is fitted to 4 views of both cameras: baseline" in result.stderr
     one = run("triangulate", folder / "rig.yaml", folder / "matches.csv")
     assert result.stdout == one.stdout
     sigma = read_rig(folder / "rig.yaml").sigma
@@ -133,7 +133,7 @@ def test_wrong_matches_are_flagged_and_kept(folder: Path, tmp_path: Path) -> Non
     assert "ok" not in columns["flag"][3:5]
     assert "6 points" in result.stderr
     assert "behind a camera" in result.stderr
-    assert "5 pixels lie outside their images" in result.stderr
+    assert "5 pixels lie outside the images" in result.stderr
     assert "inf" not in result.stdout
 
 
@@ -142,7 +142,7 @@ def test_mostly_wrong_matches_are_warned_of(folder: Path, tmp_path: Path) -> Non
     write_matches(tmp_path / "m.csv", rows)
     result = run("triangulate", folder / "rig.yaml", tmp_path / "m.csv")
     assert result.exit_code == 0
-    assert "warning: most points are off or behind; check that uL,vL are the left camera's" in result.stderr
+    assert "warning: most points are flagged off or behind; check that uL,vL are pixels" in result.stderr
 
 
 def one_line_error(result: Result, *parts: str) -> None:

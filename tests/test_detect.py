@@ -117,7 +117,7 @@ def test_an_image_without_a_board_says_so() -> None:
 
 
 def test_a_board_of_another_size_is_not_taken() -> None:
-    with pytest.raises(NoBoardError, match="found 9 x 6 inner vertices, the board has 6 x 4"):
+    with pytest.raises(NoBoardError, match="detected 9 x 6 inner vertices, but the board has 6 x 4"):
         detect_points(picture("base", 0).image, Board.single(6, 4, 28.0))
 
 

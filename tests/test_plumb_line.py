@@ -482,7 +482,7 @@ def test_what_has_no_lines_is_one_line_and_exit_status_1(tmp_path: Path) -> None
     write_points(seen_once(world), tmp_path / "p.csv")
     result = run("calibrate", tmp_path / "p.csv", "--distortion", "plumb-line", "-o", tmp_path / "c.yaml")
     assert result.exit_code == 1
-    assert result.stderr.startswith(f"Error: {tmp_path}/p.csv: plumb-line needs straight lines of 4 known")
+    assert result.stderr.startswith(f"Error: {tmp_path}/p.csv: plumb-line finds too few straight lines")
     assert len(result.stderr.splitlines()) == 1
     assert not (tmp_path / "c.yaml").exists()
 

@@ -72,7 +72,7 @@ def test_one_view_of_one_plane_is_refused_with_what_would_help(
 ) -> None:
     world = BOARD @ euler_to_rotation(turn, turn, turn).T
     points = see([world], [Pose(tilted(0).R @ euler_to_rotation(turn, turn, turn).T, tilted(0).t)])
-    refused(points, "one view of one plane cannot tell", *ways, **options)
+    refused(points, "one view of one plane cannot determine", *ways, **options)
 
 
 def test_the_help_with_one_view_of_one_plane_is_true() -> None:
