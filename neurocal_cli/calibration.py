@@ -19,9 +19,9 @@ __all__ = ["Calibration", "NetworkRecord", "Rejected", "StopReason", "StraightLi
 class StopReason(str, Enum):
     """Why training stopped; the value is the sentence to show."""
 
-    CONVERGED = "converged: the pixel error cannot be lowered further"
-    MAX_ITERATIONS = "stopped at the limit of iterations before the pixel error settled"
-    NO_AGREEMENT = "the starts were spent before two of them agreed"
+    CONVERGED = "converged: the reprojection error is at a minimum"
+    MAX_ITERATIONS = "stopped at the maximum number of iterations before the reprojection error settled"
+    NO_AGREEMENT = "no two of the random starts agreed"
 
 
 @dataclass(frozen=True, eq=False)

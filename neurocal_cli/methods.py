@@ -108,7 +108,7 @@ def calibrate(
         lens = Lens() if distortion in _FOUND else Lens(distortion)
     elif distortion not in ("auto", "none", lens.model):
         raise UsageError(
-            f"type 3 takes the lens of the given camera ({lens.model}), not distortion {distortion}"
+            f"type 3 uses the distortion of the given camera ({lens.model}), not {distortion}; leave it out"
         )
     way = distortion if distortion in _FOUND and not type_3 else ""
     options = options_for(trainer, starts, seed, distortion=way, backprop=backprop, progress=progress)
@@ -153,7 +153,7 @@ def _refuse_misfit(calibration: Calibration) -> None:
         return
     given = {3: ", and the intrinsics", 4: ", and the poses"}.get(calibration.type, "")
     raise DegenerateGeometryError(
-        f"no camera sees the points where they were seen: the best one errs by {calibration.rmse_px:.3g} px; "
+        f"no camera fits these points: the error of the best one is {calibration.rmse_px:.3g} px rms; "
         f"check that each pixel belongs to its point, the order and the signs of X,Y,Z and u,v{given}"
     )
 
@@ -178,6 +178,6 @@ def _check_options(method: str, trainer: str, distortion: str, outliers: str, st
         if value not in choices:
             raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
     if not isinstance(starts, (int, np.integer)) or starts < 2:
-        raise UsageError("starts must be at least 2, a whole number: one start has nothing to agree with")
+        raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
     if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise UsageError("seed must be a whole number from 0 on")
+        raise UsageError("seed must be a whole number of at least 0")

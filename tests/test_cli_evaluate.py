@@ -149,7 +149,7 @@ def test_a_camera_file_of_ros_is_judged_by_points_with_fitted_poses(tmp_path: Pa
     values = json.loads(result.stdout)
     assert values["fitted_views"] == ["view00", "view01"]
     assert values["rmse_px"] < 0.5
-    assert "note: only the intrinsic parameters and the lens are used" in result.stderr
+    assert "note: only the intrinsic parameters and the distortion are used" in result.stderr
     assert evaluate(ros).exit_code == 1
 
 

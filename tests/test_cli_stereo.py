@@ -55,8 +55,8 @@ def test_the_summary_says_what_was_found(files: tuple[Path, Path]) -> None:
     result = run("stereo", *files, "--no-skew")
     assert result.stdout.startswith("left:\n  camera_name: left\n")
     text = result.stderr
-    assert "rig: 4 views of both cameras, left 270 points in 5 views, right 216 points in 4 views" in text
-    assert "note: the left camera alone saw left02" in text
+    assert "rig: 4 pairs of views, left 270 points in 5 views, right 216 points in 4 views" in text
+    assert "note: only the left camera saw left02" in text
     for label in ("alpha_u [px]", "X_right = R X_left + t", "t_z [mm]", "baseline [mm]", "left03 / right03"):
         assert any(line.startswith(label) for line in text.splitlines()), label
     assert "converged" in text.splitlines()[-1]
@@ -115,11 +115,11 @@ def test_ros_files_come_beside_the_rig(files: tuple[Path, Path], tmp_path: Path)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--type", "4"], "no rig to find"),
+        (["--type", "4"], "no rig to estimate"),
         (["--type", "3"], "--left-intrinsics and --right-intrinsics"),
-        (["--image-center", "1", "2"], "--image-center belongs to --type 2"),
+        (["--image-center", "1", "2"], "--image-center needs --type 2"),
         (["--alpha", "2"], "--alpha"),
-        (["--epochs", "5"], "--epochs belongs to --trainer backprop"),
+        (["--epochs", "5"], "--epochs needs --trainer backprop"),
         (["-o", "a", "--ros", "a", "b"], "same file"),
     ],
 )
@@ -150,14 +150,14 @@ def error(result: Result, *parts: str) -> None:
 
 def test_files_that_do_not_go_together_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
     error(run("stereo", *files[::-1]), "swapped", "give the left camera first")
-    error(run("stereo", files[0], files[0], "--no-skew"), "both cameras stand at one place")
+    error(run("stereo", files[0], files[0], "--no-skew"), "both cameras are at the same place")
     right = points()[1]
     write_points(replace(right, unit="cm"), tmp_path / "r.csv")
     error(run("stereo", files[0], tmp_path / "r.csv"), "is in mm", "in cm")
     write_points(replace(right, world=right.world / 10), tmp_path / "r.csv")
     error(run("stereo", files[0], tmp_path / "r.csv"), "in the same coordinates and unit")
     write_points(replace(right, view=[f"b{v}" for v in right.view]), tmp_path / "r.csv")
-    error(run("stereo", files[0], tmp_path / "r.csv"), "no view of the left camera has its pair")
+    error(run("stereo", files[0], tmp_path / "r.csv"), "no view of the left camera has a partner")
     (tmp_path / "r.csv").write_text("")
     error(run("stereo", files[0], tmp_path / "r.csv"), "is empty")
     error(run("stereo", files[0], tmp_path / "none.csv"), "there is no such file")

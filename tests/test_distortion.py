@@ -174,7 +174,7 @@ def test_a_lens_that_folds_inside_the_image_is_refused() -> None:
         pixels.append(through(centred, "k1", [-3.2]).pixels)
         names += [f"v{k}"] * len(near)
     points = Correspondences(np.concatenate(worlds), np.concatenate(pixels), names, (352, 240))
-    with pytest.raises(DegenerateGeometryError, match="folds back inside the image"):
+    with pytest.raises(DegenerateGeometryError, match="is not monotonic .* inside the image"):
         calibrate(points, distortion="k1")
 
 
@@ -187,7 +187,7 @@ def test_a_lens_of_type_3_cannot_be_chosen() -> None:
 def test_coefficients_that_are_noise_are_named() -> None:
     scene = random_flat_set(np.random.default_rng(7), 8, False, cols=11, rows=8, f=900, width=1000)
     calibration = calibrate(scene.points(0.3, np.random.default_rng(1)), distortion="plumb_bob")
-    assert any("not told from 0" in warning for warning in calibration.warnings)
+    assert any("not significantly different from 0" in warning for warning in calibration.warnings)
 
 
 def test_too_many_coefficients_are_refused() -> None:

@@ -60,4 +60,4 @@ def test_no_lens_of_many_ends_in_a_wrong_minimum(model: str) -> None:
             assert one.rmse_px < _EXPLAINED, (seed, distortion)
             assert not one.rejected.views
     assert len(messages) <= 1
-    assert all(f"the distortion {model} folds back inside the image" in one for one in messages)
+    assert all(f"the distortion model {model} is not monotonic" in one for one in messages)

@@ -101,19 +101,19 @@ def test_a_view_left_out_is_named_with_the_reason() -> None:
     scene, points, _ = good(77, flat=True, n_views=8)
     shuffled = mismatched(scene, points, 2, "shuffled", np.random.default_rng(0))
     found = reject(shuffled)
-    assert found.rejected.views == {"view0002": "its points and pixels do not belong together"}
+    assert found.rejected.views == {"view0002": "its pixels do not match its points"}
     assert any("view 'view0002' is left out" in text for text in found.warnings)
     assert "view0002" not in found.views
     mirrored = mismatched(scene, points, 2, "mirrored", np.random.default_rng(0))
     kept = reject(mirrored)  # its homography is as good as any, only the pose is wrong
     assert kept.n_rejected == 0
-    assert any("other side in 'view0002', as if mirrored" in text for text in kept.warnings)
+    assert any("mirrored in 'view0002'" in text for text in kept.warnings)
 
 
 def test_points_of_which_most_are_wrong_are_refused() -> None:
     scene = table_1()
     bad, _ = with_outliers(scene, scene.points(0.2, np.random.default_rng(1)), 0.7, np.random.default_rng(2))
-    words = r"contradict the others|no camera sees|belong together"
+    words = r"are outliers|no camera fits|do not match"
     with pytest.raises(DegenerateGeometryError, match=words):
         calibrate(bad, distortion="none")
 

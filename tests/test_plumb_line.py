@@ -456,8 +456,8 @@ def test_the_command_writes_a_lens_that_evaluates_as_reported(csv: Path) -> None
     camera = csv.with_name("camera.yaml")
     result = run("calibrate", csv, "--distortion", "plumb-line", "-o", camera)
     assert (result.exit_code, result.stdout) == (0, "")
-    assert "lens: " in result.stderr
-    assert "px beside them as seen" in result.stderr
+    assert "straight lines: " in result.stderr
+    assert "px before undistortion" in result.stderr
     found = read_calibration(camera)
     assert found.distortion_model == "k1k2p1p2"
     assert set(found.std) >= {"k1", "k2", "p1", "p2"}
@@ -484,7 +484,7 @@ def test_what_has_no_lines_is_one_line_and_exit_status_1(tmp_path: Path) -> None
     write_points(seen_once(world), tmp_path / "p.csv")
     result = run("calibrate", tmp_path / "p.csv", "--distortion", "plumb-line", "-o", tmp_path / "c.yaml")
     assert result.exit_code == 1
-    assert result.stderr.startswith(f"Error: {tmp_path}/p.csv: plumb-line needs straight lines of 4 known")
+    assert result.stderr.startswith(f"Error: {tmp_path}/p.csv: plumb-line finds too few straight lines")
     assert len(result.stderr.splitlines()) == 1
     assert not (tmp_path / "c.yaml").exists()
 

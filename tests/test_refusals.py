@@ -72,7 +72,7 @@ def test_one_view_of_one_plane_is_refused_with_what_would_help(
 ) -> None:
     world = BOARD @ euler_to_rotation(turn, turn, turn).T
     points = see([world], [Pose(tilted(0).R @ euler_to_rotation(turn, turn, turn).T, tilted(0).t)])
-    refused(points, "one view of one plane cannot tell", *ways, **options)
+    refused(points, "one view of one plane cannot determine", *ways, **options)
 
 
 def test_the_help_with_one_view_of_one_plane_is_true() -> None:
@@ -180,7 +180,7 @@ def test_a_view_of_few_points_needs_others_that_tell_the_camera_without_it() -> 
     few = FOLDED[rng.permutation(len(FOLDED))[:5]]
     points = see([BOARD, few], [tilted(0), AHEAD])
     refused(points, "view 'v1' has only 5 different points", "at least 6 points", "3 views of the board")
-    refused(see([few, few], [tilted(0), AHEAD]), "no view has enough different points", "needs 6", skew=False)
+    refused(see([few, few], [tilted(0), AHEAD]), "no view has enough different points", "with 6", skew=False)
 
 
 # Mirrored and mismatched data
@@ -284,8 +284,8 @@ def test_one_point_of_thousands_behind_the_camera_is_noticed(seed: int) -> None:
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"starts": 1}, "starts must be at least 2"),
-        ({"starts": 0}, "starts must be at least 2"),
+        ({"starts": 1}, "starts must be a whole number"),
+        ({"starts": 0}, "starts must be a whole number"),
         ({"method": "magic"}, "method must be one of neuro"),
         ({"trainer": "adam"}, "trainer must be one of lm, backprop, not 'adam'"),
         ({"distortion": "round"}, "distortion must be one of auto"),

@@ -242,7 +242,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         calibrate_stereo(*points, type=3)
     with pytest.raises(InputError, match="same coordinates and unit"):
         calibrate_stereo(points[0], replace(points[1], world=points[1].world / 25.4))
-    with pytest.raises(DegenerateGeometryError, match="both cameras stand at one place"):
+    with pytest.raises(DegenerateGeometryError, match="both cameras are at the same place"):
         calibrate_stereo(points[0], points[0], skew=False)
 
 

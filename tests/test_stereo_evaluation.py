@@ -219,7 +219,7 @@ def test_swapped_cameras_are_warned_of() -> None:
 
 def test_the_same_camera_twice_is_refused() -> None:
     left, _ = calibrated(replace(flat(4), names=("{}", "{}")))
-    with pytest.raises(DegenerateGeometryError, match="both cameras stand at one place"):
+    with pytest.raises(DegenerateGeometryError, match="both cameras are at the same place"):
         evaluate_stereo(left, left)
 
 

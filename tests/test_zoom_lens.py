@@ -287,7 +287,7 @@ def test_a_setting_with_few_points_rests_on_the_others() -> None:
     few = LensPoints.grouped(points.points.select(keep), {n: c[keep] for n, c in columns(points).items()})
     assert 3 <= (few.point_setting == 4).sum() <= 5
     lens = fit_lens(few, distortion="none", topologies=((0, 2),))
-    assert any("rest on the others" in warning for warning in lens.warnings)
+    assert any("depend on the others" in warning for warning in lens.warnings)
     assert lens.rmse[4] < 3 * FLOOR
 
 

@@ -45,7 +45,7 @@ def check_points(problem: Problem) -> None:
         raise DegenerateGeometryError(
             f"{views.distinct.sum()} different points give {equations:.0f} equations for {unknowns} "
             f"unknowns; give at least {unknowns // of_point + 1} points"
-            + (f", or more of the camera ({_givable(problem)})" if problem.type == 1 else "")
+            + (f", or known parameters ({_givable(problem)})" if problem.type == 1 else "")
         )
 
 
@@ -89,7 +89,7 @@ def _check_planes(problem: Problem) -> None:
         ways.append("--type 2 --no-skew" if problem.free[1] else "--type 2")
     views_text = "one view" if len(flat) == 1 else f"{len(flat)} views"
     raise DegenerateGeometryError(
-        f"{views_text} of one plane cannot tell {names} apart; give {', '.join(ways[:-1])} or {ways[-1]}"
+        f"{views_text} of one plane cannot determine {names}; give {', '.join(ways[:-1])} or {ways[-1]}"
     )
 
 
@@ -107,8 +107,8 @@ def _check_views_with_few_points(problem: Problem) -> None:
     which = int(np.argmin(able))
     raise DegenerateGeometryError(
         f"view {views.names[which]!r} has only {views.distinct[which]} different points, and the views of "
-        f"one plane cannot tell the camera without it; give it at least 6 points, or {needed} views of the "
-        "board from different angles"
+        f"one plane cannot determine the camera without it; give it at least 6 points, or {needed} views of "
+        "the board from different angles"
     )
 
 
@@ -141,22 +141,20 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
         return
     if boards:
         _check_tilts(views, (state.R @ views.basis)[:, :, 2], singular)
-    more = f", or give more of the camera ({ways})" if (ways := _givable(problem)) else ""
+    more = f", or give known parameters ({ways})" if (ways := _givable(problem)) else ""
     if singular and problem.free_lens:
         raise DegenerateGeometryError(
-            f"the points do not determine all coefficients of the {problem.lens.model} lens; choose a "
-            "simpler --distortion, or give points over more of the image"
+            f"the points do not determine all coefficients of the distortion model {problem.lens.model}; "
+            "choose a simpler --distortion, or give points over more of the image"
         )
     if singular:
         raise DegenerateGeometryError(
             "the points do not determine all unknowns (the normal matrix is singular); "
             f"spread the points in depth{more}"
         )
-    known_to = (
-        f"is known no better than to {100 * relative_std:.0f} % of itself"
-        if relative_std < 1
-        else "cannot be told"
-    )
+    known_to = "cannot be determined"
+    if relative_std < 1:
+        known_to = f"has a std of {100 * relative_std:.0f} % of its value"
     raise DegenerateGeometryError(
         f"the focal length {known_to}; bring the target nearer, tilt it more{more}, and check that each "
         "pixel belongs to its point"
@@ -167,18 +165,18 @@ def _check_tilts(views: Views, normals: Array, singular: bool) -> None:
     """Refuse flat boards that stand parallel, to the image or to each other."""
     if views.n_views == 1:
         raise DegenerateGeometryError(
-            "one view of a board that is (nearly) parallel to the image cannot tell the focal length; "
+            "one view of a board that is (nearly) parallel to the image cannot determine the focal length; "
             "tilt the board by 20 to 50 degrees"
         )
     angle = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T).min(), 0, 1)))
     if singular and angle >= _NEARLY_PARALLEL:
         return
     # Noise on parallel boards reads as a long lens and large tilts: the angle means nothing then.
-    found = "parallel as far as the noise lets one tell"
+    found = "parallel within the noise"
     if angle < _NEARLY_PARALLEL:
         found = f"all parallel (within {angle:.1f} degrees)"
     raise DegenerateGeometryError(
-        f"the {views.n_views} boards are {found}, so no focal length can be told from them; "
+        f"the {views.n_views} boards are {found}, so they cannot determine the focal length; "
         "tilt the board by 20 to 50 degrees in different directions"
     )
 

@@ -219,7 +219,7 @@ def problem_for(
         ("extrinsics", extrinsics, 4),
     ):
         if value is not None and type != wanted:
-            raise UsageError(f"{name} belongs to type {wanted}, not to type {type}; give type={wanted}")
+            raise UsageError(f"{name} needs type {wanted}, but the type is {type}; give type={wanted}")
     entries, free = np.zeros(5), np.ones(5, dtype=bool)
     fixed: set[str] = set()
     poses: dict[str, Pose] | None = None
@@ -232,11 +232,12 @@ def problem_for(
         fixed |= {"u0", "v0"}
     elif type == 3:
         if intrinsics is None:
-            raise UsageError("type 3 needs the intrinsics of the camera")
+            raise UsageError("type 3 needs the intrinsics of the camera; give them")
         entries = intrinsics.A[ENTRIES]
         if not np.abs(entries[[0, 2]]).min() > 1 / _LARGEST or np.abs(entries).max() > _LARGEST:
             raise InputError(
-                "the given intrinsics are no camera's: alpha and the centre must be of an image's size"
+                "the given intrinsics are out of range: alpha and the centre must be of the size of an "
+                "image; correct them"
             )
         free[:] = False
         fixed = set(INTRINSIC_NAMES)
@@ -266,7 +267,7 @@ def _undistorted(points: Correspondences, lens: Lens, entries: Array) -> Corresp
         row = int(np.argmax(lost))
         u, v = points.pixels[row]
         raise InputError(
-            f"{points.place(row)}: the given lens cannot have seen anything at the pixel ({u:g}, {v:g}); "
+            f"{points.place(row)}: the given distortion maps nothing to the pixel ({u:g}, {v:g}); "
             "check that the camera belongs to these images"
         )
     return replace(points, pixels=pixels)
@@ -284,13 +285,13 @@ def _centre(points: Correspondences, image_center: tuple[float, float] | None) -
     except (TypeError, ValueError):
         values = np.zeros(0)
     if values.shape != (2,) or not (np.abs(values) < _LARGEST).all():  # False for nan as well
-        raise InputError("the image centre must be two finite numbers of an image's size")
+        raise InputError("the image centre must be two finite numbers of the size of an image; correct it")
     return values
 
 
 def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
     if extrinsics is None:
-        raise UsageError("type 4 needs the extrinsics of each view")
+        raise UsageError("type 4 needs the extrinsics of each view; give them")
     missing = [name for name in points.view_names if name not in extrinsics]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""

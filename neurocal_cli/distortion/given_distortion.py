@@ -45,6 +45,6 @@ def check_distortion(solution: Solution) -> Solution:
         if found is not None:
             return replace(solution, problem=found[0], adjusted=found[1])
     raise DegenerateGeometryError(
-        f"the distortion {lens.model} folds back inside the {where}; choose another model, or "
-        "give points nearer to the image's corners"
+        f"the distortion model {lens.model} is not monotonic (maps two directions to one pixel) inside the "
+        f"{where}; choose another --distortion, or give points nearer to the image's corners"
     )

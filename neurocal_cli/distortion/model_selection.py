@@ -177,8 +177,8 @@ def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
         bad = candidate.not_monotonic is not None and not candidate.noise
         if bad and chosen.lost.sum() > _FAR_WORSE**2 * candidate.lost.sum():
             return (
-                f"the lens bends strongly, and the distortion {model} that fits the points folds back inside "
-                f"the {candidate.not_monotonic}; give points nearer to the image's corners, or choose a "
-                "--distortion"
+                f"the distortion is strong, and the model {model} that fits the points is not monotonic (maps "
+                f"two directions to one pixel) inside the {candidate.not_monotonic}; give points nearer to "
+                "the image's corners, or choose a --distortion"
             )
     return ""

@@ -252,7 +252,7 @@ def _through_fixed_lens(buffer: Array, entries: Array, Xc: Array) -> None:
 
 
 _UNTOLD = (
-    "straight lines and points do not determine lens and camera; give more views of the board from "
+    "the straight lines and points do not determine the camera; give more views of the board from "
     "different angles and over more of the image, or use another --distortion"
 )
 

@@ -151,7 +151,7 @@ class _Search:
         if not able.any():
             raise DegenerateGeometryError(
                 f"no view has enough different points by itself (view {views.names[0]!r} has "
-                f"{views.distinct[0]}); at least one needs 6, or 4 on a flat board"
+                f"{views.distinct[0]}); give at least one view with 6, or 4 on a flat board"
             )
         members = np.flatnonzero(able)
         part = _Search(replace(self.problem, views=views.subset(members)), self.options, self.rng)

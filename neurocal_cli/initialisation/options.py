@@ -99,7 +99,7 @@ def options_for(
     def constrained(task: Task, a: float) -> Trained:
         # Lower rates than from random weights, and every gamma where it belongs: it starts trained.
         gentle = replace(rates, rate_weights=0.4 * rates.rate_weights, beta=10.0, a=a, resting_gamma=True)
-        return train_backprop(task, gentle, lambda share: report("training with E_orth", share))
+        return train_backprop(task, gentle, lambda share: report("training with orthogonality", share))
 
     agreement = Agreement(0.02, 1e-4)
     return Options(train, agreement, (1024, 1024), None, 1024, starts, constrained, distortion, seed, report)

@@ -123,7 +123,7 @@ def refuse_few_conditions(problem: Problem, options: Options, groups: Sequence[G
     if conditions < 11 and conditions <= unknowns:
         raise DegenerateGeometryError(
             f"view {problem.views.names[0]!r}: nearly all points lie in one plane, which gives {conditions} "
-            f"conditions for {unknowns} unknowns; give more points off the plane, or more of the camera "
+            f"conditions for {unknowns} unknowns; give more points off the plane, or known parameters "
             "(--type 2, --no-skew)"
         )
 

@@ -92,7 +92,7 @@ class _Search:
         order = slice(None) if views.order is None else views.order
         self.kept[order] = consensus.kept
         for view in np.flatnonzero(consensus.hopeless):
-            self._drop(views.names[view], "its points and pixels do not belong together")
+            self._drop(views.names[view], "its pixels do not match its points")
         if self.kept.all():
             if first is None:
                 assert failure is not None
@@ -119,11 +119,11 @@ class _Search:
             raise failure
         if len(self.wrong_views) == self.points.n_views:
             raise DegenerateGeometryError(
-                "in no view do points and pixels belong together, as far as their noise lets one tell; check "
-                "that each pixel belongs to its point, and the order of the columns"
+                "the pixels do not match the points in any view; check that each pixel belongs to its point, "
+                "and the order of the columns"
             )
         raise DegenerateGeometryError(
-            f"{100 * (1 - share):.0f} % of the points contradict the others"
+            f"{100 * (1 - share):.0f} % of the points are outliers"
             + (f" ({', '.join(map(repr, self.wrong_views))} as whole views)" if self.wrong_views else "")
             + "; check that each pixel belongs to its point, and that all views are of one camera"
         )
@@ -186,7 +186,7 @@ class _Search:
         share = np.bincount(index, near, self.points.n_views) / np.bincount(index)
         for view in np.flatnonzero(share <= _MAJORITY):
             name = self.points.view_names[view]
-            self.wrong_views.setdefault(name, "most of its points contradict the camera")
+            self.wrong_views.setdefault(name, "most of its points are outliers")
         return np.asarray(near & (share > _MAJORITY)[index])
 
     def rejected(self) -> Rejected:

@@ -146,9 +146,9 @@ def _corner_warning(problem: Problem) -> tuple[str, ...]:
     if problem.restraint is None:
         return ()
     return (
-        f"the points do not reach the image's corners, where the distortion {problem.lens.model} that fits "
-        "them best folds back; the best one that does not is given, and what it says of the corners is a "
-        "guess: add views that show the board there",
+        f"the distortion model {problem.lens.model} that fits the points best is not monotonic (maps two "
+        "directions to one pixel) in the image's corners, where there are no points; the best monotonic fit "
+        "is used, which is a guess in the corners; add views that show the board there",
     )
 
 
@@ -160,8 +160,8 @@ def _mirrored_warning(views: list[str]) -> tuple[str, ...]:
         f" and {len(views) - _NAMED} more" * (len(views) > _NAMED)
     )
     return (
-        f"the target is seen from its other side in {names}, as if mirrored: the poses of these views are "
-        "wrong; check the order of their points",
+        f"the target appears mirrored in {names}, so the poses of these views are wrong; check the order of "
+        "their points",
     )
 
 
@@ -179,5 +179,5 @@ def _rejection_warnings(rejected: Rejected, kept: int) -> tuple[str, ...]:
             places.append(f"{points.place(int(row))}{label}")
         more = f" and {single.size - _NAMED} more, listed in the calibration" if single.size > _NAMED else ""
         share = f"{single.size} of {kept + len(rejected)} points"
-        lines.append(f"{share} contradict the others and are left out: {', '.join(places)}{more}")
+        lines.append(f"{share} are outliers and are left out: {', '.join(places)}{more}")
     return tuple(lines)
