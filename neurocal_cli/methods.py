@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.job import Strategy
-from neurocal_cli.bundle_adjustment.problem import Known, KnownCamera, known_for
+from neurocal_cli.bundle_adjustment.problem import Known, known_for
 from neurocal_cli.calibrating.assembly import assemble
 from neurocal_cli.calibrating.fitting import Fitter
 from neurocal_cli.calibrating.outlier_rejection import fit_robustly
-from neurocal_cli.calibration import Calibration, Rejected
-from neurocal_cli.camera.distortion_models import MODELS, Lens, coefficient_names
+from neurocal_cli.calibration import Calibration, Rejected, camera_of
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS, Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
@@ -43,7 +44,7 @@ def calibrate(
     points: Correspondences,
     type: int = 1,
     image_center: tuple[float, float] | None = None,
-    intrinsics: Intrinsics | KnownCamera | Array | None = None,
+    intrinsics: Camera | Calibration | Intrinsics | Array | None = None,
     extrinsics: Mapping[str, Pose] | None = None,
     method: str = "neuro",
     trainer: str = "lm",
@@ -68,8 +69,8 @@ def calibrate(
         4 the extrinsics.
     image_center : (u0, v0), optional [px]
         Type 2; else the one with the points, else the centre of their image size.
-    intrinsics : Intrinsics, (3, 3) array or a camera with a lens, optional
-        Type 3. A camera with a lens is a `Calibration` or what `read_intrinsics` returns.
+    intrinsics : Camera, Calibration, Intrinsics or (3, 3) array, optional
+        Type 3. The first two bring their distortion with them.
     extrinsics : dict of Pose by view name, optional
         Type 4.
     method : {"neuro"}
@@ -105,9 +106,9 @@ def calibrate(
         Points that cannot give an answer, with the reason.
     """
     _check_options(method, trainer, distortion, outliers, starts, seed)
-    camera, lens = _given_camera(intrinsics)
-    known = known_for(points, type, image_center, camera, extrinsics, skew)
-    known, choice = _with_lens(known, distortion, lens)
+    given = None if intrinsics is None else camera_of(intrinsics)
+    known = known_for(points, type, image_center, given.intrinsics if given else None, extrinsics, skew)
+    known, choice = _with_lens(known, distortion, given.distortion if given else Distortion())
     report = progress or (lambda stage, share: None)
     try:
         fitter = Fitter(known, choice, _strategy(trainer, starts, backprop, report), seed, report)
@@ -127,7 +128,7 @@ def calibrate(
         raise DegenerateGeometryError(f"{points.source}: {error}") from error
 
 
-def fit_poses(points: Correspondences, camera: Intrinsics | KnownCamera, seed: int) -> Calibration:
+def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:
     """Poses of the views of a given camera from all their points, however badly they fit (type 3).
 
     Raises
@@ -135,8 +136,8 @@ def fit_poses(points: Correspondences, camera: Intrinsics | KnownCamera, seed: i
     InputError, DegenerateGeometryError
         Points that do not determine the poses.
     """
-    intrinsics, lens = _given_camera(camera)
-    known, _ = _with_lens(known_for(points, 3, None, intrinsics, None, True), "none", lens)
+    given = camera_of(camera)
+    known, _ = _with_lens(known_for(points, 3, None, given.intrinsics, None, True), "none", given.distortion)
     quiet: Progress = lambda stage, share: None  # noqa: E731
     fit = Fitter(known, "", _strategy("lm", _STARTS, None, quiet), seed, quiet).fit(points)
     return assemble(fit, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
@@ -154,22 +155,12 @@ def _refuse_misfit(calibration: Calibration) -> None:
     )
 
 
-def _given_camera(given: Intrinsics | KnownCamera | Array | None) -> tuple[Intrinsics | None, Lens]:
-    if given is None or isinstance(given, Intrinsics):
-        return given, Lens()
-    if isinstance(given, (np.ndarray, list, tuple)):
-        return Intrinsics.from_matrix(np.asarray(given)), Lens()
-    if not isinstance(getattr(given, "intrinsics", None), Intrinsics):
-        raise UsageError("intrinsics must be an Intrinsics, a 3 x 3 matrix, a Calibration or a camera file")
-    return given.intrinsics, Lens(given.distortion_model, given.distortion)
-
-
-def _with_lens(known: Known, distortion: str, given: Lens) -> tuple[Known, str]:
+def _with_lens(known: Known, distortion: str, given: Distortion) -> tuple[Known, str]:
     """What is known of the lens, and how it is found otherwise: "auto", "plumb-line" or neither."""
     if known.type != 3:
         if distortion in ("auto", "plumb-line"):
             return known, distortion
-        return replace(known, lens=Lens(distortion), free_lens=distortion != "none"), ""
+        return replace(known, lens=Distortion(distortion), free_lens=distortion != "none"), ""
     if distortion not in ("auto", "none", given.model):
         raise UsageError(
             f"type 3 takes the lens of the given camera ({given.model}), not distortion {distortion}"

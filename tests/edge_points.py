@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 from bent import without_camera
+from plain_projection import project
 from scenes import board_midpoints, random_flat_set
 
 from neurocal_cli import Correspondences
-from neurocal_cli.camera.distortion_models import distort
-from neurocal_cli.camera.pinhole import Intrinsics, project
+from neurocal_cli.camera.distortion import distort
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.geometry import Array
 
 

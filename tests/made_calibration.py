@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from plain_projection import project
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from plain_projection import project
 
 from neurocal_cli import calibrate
 from neurocal_cli.bundle_adjustment.adjust import adjust
@@ -13,7 +14,7 @@ from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.problem import Known, known_for
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.views import Views, arrange
-from neurocal_cli.camera.pinhole import Intrinsics, Pose, project
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from plain_projection import project
 from scenes import Scene, pinhole, random_flat_set, random_solid
 
 from neurocal_cli import Calibration, Correspondences
-from neurocal_cli.camera.pinhole import project
 from neurocal_cli.errors import NeurocalError
 
 SIGMA = 0.3

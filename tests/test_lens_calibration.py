@@ -5,14 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plain_projection import project
 from scenes import Scene, board_midpoints, random_flat_set, table_1
 from test_real_data import zhang
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
 from neurocal_cli.bundle_adjustment.point_batches import batches_of
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks, residuals
-from neurocal_cli.camera.distortion_models import Lens, distort
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, project
+from neurocal_cli.camera.distortion import Distortion, distort
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import write_calibration
@@ -200,7 +201,7 @@ def test_coefficients_that_are_noise_are_named() -> None:
 
 def test_too_many_coefficients_are_refused() -> None:
     with pytest.raises(InputError, match="k1k2 has 2"):
-        Lens("k1k2", np.array([0.1, 0.2, 0.3]))
+        Distortion("k1k2", np.array([0.1, 0.2, 0.3]))
 
 
 def test_reported_std_is_true_with_a_lens() -> None:

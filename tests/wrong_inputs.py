@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from plain_projection import project
 from scenes import board_midpoints
 
 from neurocal_cli import Calibration, Correspondences, Intrinsics, Pose, calibrate
-from neurocal_cli.camera.distortion_models import distort
-from neurocal_cli.camera.pinhole import project
+from neurocal_cli.camera.distortion import distort
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.verdict.assessment import judged
 

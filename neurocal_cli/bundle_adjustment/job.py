@@ -12,7 +12,7 @@ from neurocal_cli.bundle_adjustment.adjust import Adjusted, Restraint, adjust
 from neurocal_cli.bundle_adjustment.problem import Known
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import pinhole_coefficients
+from neurocal_cli.camera.distortion import pinhole_coefficients
 from neurocal_cli.geometry import Array
 from neurocal_cli.training import Task, Trained, Trainer
 from neurocal_cli.training.starts import Agreement

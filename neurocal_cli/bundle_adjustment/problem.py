@@ -8,42 +8,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Known", "KnownCamera", "intrinsic_matrix", "known_for"]
+__all__ = ["Known", "intrinsic_matrix", "known_for"]
 
 
 _LARGEST = 1e9  # px; no image is larger
-
-
-class KnownCamera(Protocol):
-    """A camera with a lens: a `Calibration`, or what `read_intrinsics` returns."""
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """Its five parameters."""
-        ...
-
-    @property
-    def distortion_model(self) -> str:
-        """One of `lens.MODELS`."""
-        ...
-
-    @property
-    def distortion(self) -> Array:
-        """The model's coefficients."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +42,7 @@ class Known:
         Names of the given intrinsic parameters, and of coefficients of the lens that stay as they are.
     intrinsics : Intrinsics or None
         All of them, for type 3: returned as they are.
-    lens : Lens
+    lens : Distortion
         The model to end with; its coefficients where they are given.
     free_lens : bool
         Whether the other coefficients are estimated.
@@ -74,7 +54,7 @@ class Known:
     poses: Mapping[str, Pose] | None
     fixed: frozenset[str]
     intrinsics: Intrinsics | None
-    lens: Lens = field(default_factory=Lens)
+    lens: Distortion = field(default_factory=Distortion)
     free_lens: bool = False
 
     @property

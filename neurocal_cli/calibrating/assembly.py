@@ -21,7 +21,7 @@ from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibrating.fitting import Fit
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
-from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -149,7 +149,7 @@ class _Assembly:
             network=self._network(rmse),
             camera_name=name,
             warnings=parameter_warnings(
-                intrinsics, Lens(known.lens.model, adjusted.state.k), std, self.lens_chosen
+                intrinsics, Distortion(known.lens.model, adjusted.state.k), std, self.lens_chosen
             ),
         )
 

@@ -13,7 +13,7 @@ from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Known
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
-from neurocal_cli.bundle_adjustment.units import Seen, normalised
+from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import StraightLines
 from neurocal_cli.distortion.candidate_models import supported
@@ -60,9 +60,9 @@ class Fit:
     refusal: str = ""
 
     @property
-    def seen(self) -> Seen:
+    def seen(self) -> CameraState:
         """The camera and the poses in pixels and world units, poses in the order of the job's views."""
-        return Seen.of(self.job.views, self.job.known, self.solution.adjusted.state)
+        return in_pixels(self.job.views, self.job.known, self.solution.adjusted.state)
 
 
 @dataclass(frozen=True, eq=False)

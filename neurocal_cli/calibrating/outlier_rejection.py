@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.common_noise import with_common_share
 from neurocal_cli.bundle_adjustment.measured_directions import single, unit, variance_across
 from neurocal_cli.bundle_adjustment.outlier_views import find_outlier_view
+from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibrating.fitting import Fit, Fitter
 from neurocal_cli.calibration import Rejected
@@ -219,10 +220,9 @@ class _Errors:
 
 
 def _errors(fit: Fit, points: Correspondences) -> _Errors:
-    seen = fit.seen
     place = {name: k for k, name in enumerate(fit.job.views.names)}
     view = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
-    predicted, in_front = seen.predict(points.world, np.maximum(view, 0))
+    predicted, in_front = predicted_pixels(fit.seen, points.world, np.maximum(view, 0))
     residuals = predicted - points.pixels
     stated = None
     if points.covariance is not None:

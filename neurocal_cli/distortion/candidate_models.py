@@ -17,7 +17,7 @@ from neurocal_cli.bundle_adjustment.problem import Known
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import Lens, bend, coefficient_names, pinhole_coefficients
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, pinhole_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.distortion.monotonic_fit import MonotonicFit, fit_monotonic, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
@@ -96,7 +96,7 @@ def supported(known: Known, model: str, views: Views) -> Known | None:
     """What is known with this model to be estimated; None when there are too few points for it."""
     # Coefficients that stay as they are belong to another model.
     fixed = known.fixed & set(INTRINSIC_NAMES)
-    with_lens = replace(known, lens=Lens(model), free_lens=model != "none", fixed=fixed)
+    with_lens = replace(known, lens=Distortion(model), free_lens=model != "none", fixed=fixed)
     equations = views.n_distinct_equations
     if model != "none" and equations < _SPARE * parameter_count(with_lens, views.n_views) + 4:
         return None
@@ -218,9 +218,7 @@ class _Bench:
             lost = np.full_like(lost, np.inf)
         cov = covariance(adjusted.normal, known.free_camera, known.free_poses, views.n_equations)
         noise = _noise(known, state, self.reach, cov.entries)
-        folds = where_not_monotonic(
-            Lens(state.lens, state.k), known.matrix(state.entries[0], views), self.points
-        )
+        folds = where_not_monotonic(state.distortion, known.matrix(state.entries[0], views), self.points)
         determined = _determined(views, known, state, cov)
         return Candidate(known, adjusted, lost, noise, folds, determined, restraint)
 
@@ -301,7 +299,7 @@ def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -
     # the straight one r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
     radial = [0.0 if name in ("p1", "p2") else k for name, k in old.items()]
-    bent = bend(state.lens, radial, r, np.zeros_like(r))[0][0]
+    bent = distort(state.lens, radial, r, np.zeros_like(r))[0]
     q = np.arctan(r) if fisheye else r
     of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][:most]
     powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)

@@ -13,8 +13,7 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.job import Job, Solution
 from neurocal_cli.bundle_adjustment.problem import Known, intrinsic_matrix
-from neurocal_cli.camera.distortion_models import Lens
-from neurocal_cli.camera.monotonic import straight_pixels
+from neurocal_cli.camera.projection import undistorted_pixels
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.points import Correspondences
@@ -30,9 +29,9 @@ def straighten(points: Correspondences, known: Known) -> Correspondences:
     InputError
         A pixel that the given lens cannot see.
     """
-    if known.free_lens or not known.lens.bends:
+    if known.free_lens or known.lens.is_identity:
         return points
-    straight = straight_pixels(known.lens, intrinsic_matrix(known.entries), points.pixels)
+    straight = undistorted_pixels(known.lens, intrinsic_matrix(known.entries), points.pixels)
     lost = ~np.isfinite(straight[:, 0])
     if lost.any():
         row = int(np.argmax(lost))
@@ -71,7 +70,7 @@ def check_lens(job: Job, solution: Solution, points: Correspondences) -> tuple[J
         state = replace(solution.adjusted.state, lens=lens.model, k=lens.coefficients)
         solution = Solution(job.adjust(state), job.tally)
     state = solution.adjusted.state
-    where = where_not_monotonic(Lens(lens.model, state.k), known.matrix(state.entries[0], job.views), points)
+    where = where_not_monotonic(state.distortion, known.matrix(state.entries[0], job.views), points)
     if where is None:
         return job, solution
     if where == "image" and known.free_lens and solution.shared is None:

@@ -23,7 +23,7 @@ from neurocal_cli.bundle_adjustment.job import Job, Solution
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import MODELS
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.distortion.candidate_models import Candidate, falls_short, fit_candidates, worth
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences

@@ -27,8 +27,9 @@ from neurocal_cli.bundle_adjustment.problem import Known
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names, distort
-from neurocal_cli.camera.monotonic import first_fold, radial_slope, straight_pixels
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort
+from neurocal_cli.camera.monotonic import monotonic_radius, radial_slope
+from neurocal_cli.camera.projection import undistorted_pixels
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -85,7 +86,7 @@ class MonotonicFit:
         return rows.T @ rows, rows.T @ missing
 
 
-def where_not_monotonic(lens: Lens, A: Array, points: Correspondences) -> str | None:
+def where_not_monotonic(lens: Distortion, A: Array, points: Correspondences) -> str | None:
     """Where a lens folds back: within the points, within the rest of the image, or nowhere.
 
     The image is looked at where its size is known: at its corners, which nothing is farther out than,
@@ -98,14 +99,14 @@ def where_not_monotonic(lens: Lens, A: Array, points: Correspondences) -> str | 
     away = np.hypot(points.pixels[:, 0] - A[0, 2], points.pixels[:, 1] - A[1, 2])
     farthest = points.pixels[np.argsort(-away, kind="stable")[:_FARTHEST]]
     border = np.zeros((0, 2))
-    if points.image_size is not None and not (lens.model == "fisheye" and np.isinf(first_fold(lens))):
+    if points.image_size is not None and not (lens.model == "fisheye" and np.isinf(monotonic_radius(lens))):
         border = _border(points.image_size, lens)
     if _sees(lens, A, np.concatenate([farthest, border])):
         return None
     return "image" if len(border) and _sees(lens, A, farthest) else "points"
 
 
-def _border(image_size: tuple[int, int], lens: Lens) -> Array:
+def _border(image_size: tuple[int, int], lens: Distortion) -> Array:
     """Pixels along the image's border, or its corners; (N, 2)."""
     tangential = "p1" in coefficient_names(lens.model)
     along = np.linspace(0, 1, _BORDER if tangential else 2)
@@ -114,9 +115,9 @@ def _border(image_size: tuple[int, int], lens: Lens) -> Array:
     return np.concatenate([np.column_stack(side) for side in sides]) * (np.array(image_size) - 1)
 
 
-def _sees(lens: Lens, A: Array, pixels: Array) -> bool:
+def _sees(lens: Distortion, A: Array, pixels: Array) -> bool:
     """Whether all the pixels lie where the lens has not folded back."""
-    return bool(np.isfinite(straight_pixels(lens, A, pixels)).all())
+    return bool(np.isfinite(undistorted_pixels(lens, A, pixels)).all())
 
 
 @_quietly
@@ -174,7 +175,9 @@ def _with_slope(
         if not adjusted.cost.sum() <= most:
             return None
         if (
-            where_not_monotonic(Lens(state.lens, state.k), known.matrix(state.entries[0], views), points)
+            where_not_monotonic(
+                Distortion(state.lens, state.k), known.matrix(state.entries[0], views), points
+            )
             is None
         ):
             return _settled(views, known, adjusted, restraint)
@@ -196,7 +199,7 @@ def _settled(
 
 def _fold(state: CameraState) -> float:
     """Straight radius, or a fisheye's angle, of the first fold."""
-    r = first_fold(Lens(state.lens, state.k))
+    r = monotonic_radius(state.distortion)
     return float(np.arctan(r)) if state.lens == "fisheye" else r
 
 

@@ -13,10 +13,10 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from bent import through
+from plain_projection import project
 from scenes import random_flat_set, table_1
 
 from neurocal_cli import Correspondences, calibrate, read_points
-from neurocal_cli.camera.pinhole import project
 
 VIEWS = [13, 100, 1000]
 
