@@ -94,13 +94,11 @@ def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDA
     width = _LENS + len(coefficient_names(state.lens)) + 1
     by_batch = np.empty((n_batches, width, width))
     sensible = np.empty(n_batches, dtype=bool)
-    buffer: Array | None = None
+    buffer = batches.memory(width)
     for chunk in batches.chunks():
-        count = len(batches.view[chunk])
-        if buffer is None or len(buffer) != count:
-            buffer = np.zeros((count, width, 2, n))
-        sensible[chunk] = derivatives(batches, chunk, state, buffer)
-        J = buffer.reshape(count, width, 2 * n)
+        part = buffer[: chunk.stop - chunk.start]
+        sensible[chunk] = derivatives(batches, chunk, state, part)
+        J = part.reshape(len(part), width, 2 * n)
         np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
     if n_batches == batches.n_views:
         return by_batch, sensible
@@ -161,9 +159,11 @@ def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Ar
         entries, state.lens, state.coefficients(view), (Xc[:, 0], Xc[:, 1], Xc[:, 2]),
         out[:, :5], by_point, out[:, _LENS:-1],
     )  # fmt: skip
+    product = np.empty(by_omega[:, 0].shape)
     for n, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):
         np.multiply(Y[:, i, None], by_point[:, j], out=by_omega[:, n])
-        by_omega[:, n] -= Y[:, j, None] * by_point[:, i]
+        np.multiply(Y[:, j, None], by_point[:, i], out=product)
+        by_omega[:, n] -= product
     np.subtract(pixels[:, 0], u, out=out[:, -1, 0])
     np.subtract(pixels[:, 1], v, out=out[:, -1, 1])
     if batches.whitening is not None:

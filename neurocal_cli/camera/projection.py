@@ -125,11 +125,16 @@ def project_with_jacobian(
     by_entries[..., 3, 0, :] = by_entries[..., 4, 1, :] = 1.0
     by_X, by_Y, by_Z = (by_point[..., n, :, :] for n in range(3))
     np.multiply(ux, q, out=by_X[..., 0, :])
-    np.multiply(vx, q, out=by_X[..., 1, :])
-    np.multiply(uy, q, out=by_Y[..., 0, :])
     np.multiply(vy, q, out=by_Y[..., 1, :])
-    np.multiply(-x[..., None, :], by_X, out=by_Z)
-    by_Z -= y[..., None, :] * by_Y
+    if model == "none" and _is_zero(s):
+        by_X[..., 1, :] = by_Y[..., 0, :] = 0.0
+        np.multiply(-x, by_X[..., 0, :], out=by_Z[..., 0, :])
+        np.multiply(-y, by_Y[..., 1, :], out=by_Z[..., 1, :])
+    else:
+        np.multiply(vx, q, out=by_X[..., 1, :])
+        np.multiply(uy, q, out=by_Y[..., 0, :])
+        np.multiply(-x[..., None, :], by_X, out=by_Z)
+        by_Z -= y[..., None, :] * by_Y
     for column, (dx, dy) in enumerate(image.by_coefficient):
         np.multiply(a, dx, out=by_coefficient[..., column, 0, :])
         np.multiply(b, dy, out=by_coefficient[..., column, 1, :])
