@@ -130,7 +130,7 @@ def straight_edge(distance: Array, normal: Array, psf: float) -> Array:
 @pytest.mark.parametrize("tilt", [30.0, 60.0, 72.0])
 def test_edges_of_a_tilted_board_are_straight_edges_between_its_vertices(tilt: float) -> None:
     scene = facing(34.0, 0.0, (80.0, 60.0), 0.8)
-    scene = replace(scene, camera=replace(scene.camera, size=(320, 240)), psf=0.8)
+    scene = replace(scene, camera=replace(scene.camera, image_size=(320, 240)), psf=0.8)
     scene = replace(scene, pose=board_pose(scene, np.array([160.2, 119.6]), 36.0, tilt, 0.7, 0.15))
     picture = noise_free(scene) / 65535
     truth, target = ground_truth(scene).planes[0], scene.targets[0]

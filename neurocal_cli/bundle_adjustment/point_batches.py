@@ -48,7 +48,7 @@ class PointBatches:
     first: NDArray[np.intp]
     view: NDArray[np.intp]
     counts: NDArray[np.intp]
-    _memory: dict[int, Array] = field(default_factory=dict, repr=False)
+    _memory: dict[int, Array] = field(default_factory=dict, init=False, repr=False)
 
     @property
     def n_views(self) -> int:

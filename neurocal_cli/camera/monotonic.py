@@ -21,6 +21,7 @@ _NEWTON_STEPS = 30
 _STEP = 1e-15
 _ACCURACY = 1e-11
 _SMALL_STEP = 0.02  # of Newton's in the image plane: the next one would be a thousandth
+_SMALLEST = 1e-100  # coefficient; what is less overflows, and has no root near any image
 _REAL = 1e-6  # imaginary part of a double root, over its real part, that rounding makes
 
 
@@ -82,7 +83,7 @@ def _twice_s_slope(p: Array) -> Array:
 
 def _first_root(coefficients: Array) -> float:
     """Smallest positive real root of a polynomial, infinity if there is none; lowest order first."""
-    roots = np.roots(coefficients[::-1])
+    roots = np.roots(np.where(np.abs(coefficients) > _SMALLEST, coefficients, 0.0)[::-1])
     real = roots.real[(np.abs(roots.imag) <= _REAL * np.abs(roots.real)) & (roots.real > 0)]
     return float(real.min(initial=np.inf))
 
