@@ -18,7 +18,7 @@ __all__ = ["is_monotonic", "monotonic_radius", "nearly_undistorted", "radial_slo
 _FARTHEST = 1e3  # undistorted radius that no image reaches
 _TABLE = 4096
 _NEWTON_STEPS = 30
-_STEP = 1e-15
+_STEP = 1e-9  # of Newton's: the next one, its square, is rounding
 _ACCURACY = 1e-11
 _SMALL_STEP = 0.02  # of Newton's in the image plane: the next one would be a thousandth
 _SMALLEST = 1e-100  # coefficient; what is less overflows, and has no root near any image
@@ -92,7 +92,7 @@ def is_monotonic(distortion: Distortion, x: Array, y: Array) -> NDArray[np.bool_
     """Whether undistorted normalised points lie where the model is monotonic."""
     with np.errstate(all="ignore"):
         _, (xx, xy, yx, yy), _ = distort_with_jacobian(distortion.model, distortion.coefficients, x, y)
-        return np.asarray((np.hypot(x, y) < monotonic_radius(distortion)) & (xx * yy - xy * yx > 0))
+        return np.asarray((x * x + y * y < monotonic_radius(distortion) ** 2) & (xx * yy - xy * yx > 0))
 
 
 def undistort(
@@ -141,9 +141,10 @@ def _newton(
             sx, sy = sx + step[0], sy + step[1]
             if not np.nanmax(np.hypot(*step) / (1 + np.hypot(sx, sy)), initial=0.0) > _STEP:
                 break
-        bx, by = distort(model, k, sx, sy)
+        (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(model, k, sx, sy)
         good = np.hypot(bx - x, by - y) < _ACCURACY * (1 + np.hypot(x, y))
-    return sx, sy, good & is_monotonic(distortion, sx, sy)
+        good &= (sx * sx + sy * sy < monotonic_radius(distortion) ** 2) & (xx * yy - xy * yx > 0)
+    return sx, sy, good
 
 
 def _radially(distortion: Distortion, x: Array, y: Array) -> tuple[Array, Array]:

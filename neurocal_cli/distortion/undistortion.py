@@ -17,8 +17,9 @@ from neurocal_cli.bundle_adjustment.measured_directions import unit
 from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
-from neurocal_cli.camera.monotonic import is_monotonic, monotonic_radius
+from neurocal_cli.camera.monotonic import monotonic_radius
 from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.camera.projection import image_points_with_jacobian
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -77,8 +78,10 @@ def sources(camera: Camera, new: Camera, u: Array, v: Array) -> tuple[Array, Arr
     """
     x, y = new.normalised_points(u, v)
     with np.errstate(all="ignore"):
-        seen = is_monotonic(camera.distortion, x, y)
-        u, v = camera.image_points(x, y)
+        u, v, _, _, (ux, uy, vx, vy), _ = image_points_with_jacobian(
+            camera.entries, camera.model, camera.distortion.coefficients, x, y
+        )
+        seen = (x * x + y * y < monotonic_radius(camera.distortion) ** 2) & (ux * vy > uy * vx)
     return np.where(seen, u, np.nan), np.where(seen, v, np.nan)
 
 
