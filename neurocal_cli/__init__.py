@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
     from neurocal_cli.calibration import Calibration
+    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.camera.pinhole import Intrinsics, Pose
     from neurocal_cli.detection.detect import detect_points
     from neurocal_cli.distortion.remapping import undistort_image
@@ -61,6 +62,7 @@ _HOMES = {
     "ZoomLens": "zoom_lens.zoom_lens",
     "Board": "board",
     "Calibration": "calibration",
+    "Camera": "camera.camera",
     "Correspondences": "points",
     "Intrinsics": "camera.pinhole",
     "NeurocalError": "errors",
@@ -97,6 +99,7 @@ _HOMES = {
 __all__ = [
     "Board",
     "Calibration",
+    "Camera",
     "Correspondences",
     "Intrinsics",
     "NeurocalError",

@@ -9,11 +9,23 @@ from functools import cached_property
 
 import numpy as np
 
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Calibration", "NetworkRecord", "Rejected", "StopReason", "StraightLines", "Verdict", "ViewResult"]
+__all__ = [
+    "Calibration",
+    "NetworkRecord",
+    "Rejected",
+    "StopReason",
+    "StraightLines",
+    "Verdict",
+    "ViewResult",
+    "camera_of",
+]
 
 
 class StopReason(str, Enum):
@@ -219,6 +231,12 @@ class Calibration:
         return len(self.rejected)
 
     @property
+    def camera(self) -> Camera:
+        """The camera alone."""
+        distortion = Distortion(self.distortion_model, self.distortion)
+        return Camera(self.intrinsics, distortion, self.image_size, self.camera_name)
+
+    @property
     def K(self) -> Array:
         """(3, 3) camera matrix A, skew included."""
         return self.intrinsics.A
@@ -247,3 +265,24 @@ class Calibration:
     def projections(self) -> dict[str, Array]:
         """(3, 4) matrix P = A [R | t] of each view, paper eq. (1)."""
         return {name: self.K @ view.pose.D for name, view in self.views.items()}
+
+
+def camera_of(given: Camera | Calibration | Intrinsics | Array) -> Camera:
+    """Take a camera in any of the forms that users have it in; a matrix has no distortion.
+
+    Raises
+    ------
+    UsageError
+        Something else.
+    InputError
+        A matrix that is no camera's.
+    """
+    if isinstance(given, Camera):
+        return given
+    if isinstance(given, Calibration):
+        return given.camera
+    if isinstance(given, Intrinsics):
+        return Camera(given)
+    if isinstance(given, (np.ndarray, list, tuple)):
+        return Camera(Intrinsics.from_matrix(np.asarray(given)))
+    raise UsageError("the camera must be a Camera, a Calibration, an Intrinsics or a 3 x 3 matrix")

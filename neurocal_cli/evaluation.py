@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.problem import KnownCamera
-from neurocal_cli.bundle_adjustment.units import see
-from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.calibration import Calibration, camera_of
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
@@ -88,15 +86,14 @@ class CameraEvaluation:
 
 
 def evaluate_camera(
-    calibration: Calibration | KnownCamera | Intrinsics, points: Correspondences | None = None
+    calibration: Calibration | Camera | Intrinsics, points: Correspondences | None = None
 ) -> CameraEvaluation:
     """Reprojection error of a calibrated camera.
 
     Parameters
     ----------
-    calibration : Calibration, or a camera without poses
-        With intrinsic parameters, or a camera file's intrinsics and lens, the pose of every view is
-        fitted.
+    calibration : Calibration, Camera or Intrinsics
+        Of a camera without poses, the pose of every view is fitted.
     points : Correspondences, optional
         Default: the points that the camera was calibrated from.
 
@@ -128,7 +125,8 @@ def evaluate_camera(
         new_poses, problems = _fit_poses(calibration, points.select(fitted[points.view_index]), seed)
         poses.update(new_poses)
         warnings += problems
-    predicted, in_front = _predict(calibration, [poses[name] for name in points.view_names], points)
+    camera = camera_of(calibration)
+    predicted, in_front = _predict(camera, [poses[name] for name in points.view_names], points)
     residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
     if not in_front.all():
         n_behind = np.count_nonzero(~in_front)
@@ -155,7 +153,7 @@ def _compare(calibration: Calibration, points: Correspondences) -> list[str]:
 
 
 def _fit_poses(
-    camera: KnownCamera | Intrinsics, points: Correspondences, seed: int
+    camera: Calibration | Camera | Intrinsics, points: Correspondences, seed: int
 ) -> tuple[dict[str, Pose], list[str]]:
     """Type 3: poses of views that the calibration does not know, and what to warn of."""
     from neurocal_cli.methods import fit_poses  # the trainers: only when there is something to train
@@ -168,16 +166,11 @@ def _fit_poses(
     return poses, warnings
 
 
-def _predict(
-    known: KnownCamera | Intrinsics, poses: list[Pose], points: Correspondences
-) -> tuple[Array, NDArray[np.bool_]]:
+def _predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:
     """Pixels of all the points, each through the pose of its view, and which lie in front."""
     R = np.stack([pose.R for pose in poses])[points.view_index]
     t = np.stack([pose.t for pose in poses])[points.view_index]
-    camera = np.einsum("nij,nj->ni", R, points.world) + t
-    if isinstance(known, Intrinsics):
-        return see(known.A, Lens(), camera)
-    return see(known.intrinsics.A, Lens(known.distortion_model, known.distortion), camera)
+    return camera.project(np.einsum("nij,nj->ni", R, points.world) + t)
 
 
 def _measure(

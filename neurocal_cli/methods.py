@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.problem import KnownCamera, problem_for
-from neurocal_cli.calibration import Calibration, Rejected
-from neurocal_cli.camera.distortion_models import MODELS, Lens
+from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.calibration import Calibration, Rejected, camera_of
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
@@ -40,7 +41,7 @@ def calibrate(
     points: Correspondences,
     type: int = 1,
     image_center: tuple[float, float] | None = None,
-    intrinsics: Intrinsics | KnownCamera | Array | None = None,
+    intrinsics: Camera | Calibration | Intrinsics | Array | None = None,
     extrinsics: Mapping[str, Pose] | None = None,
     method: str = "neuro",
     trainer: str = "lm",
@@ -65,8 +66,8 @@ def calibrate(
         4 the extrinsics.
     image_center : (u0, v0), optional [px]
         Type 2; else the one with the points, else the centre of their image size.
-    intrinsics : Intrinsics, (3, 3) array or a camera with a lens, optional
-        Type 3. A camera with a lens is a `Calibration` or what `read_intrinsics` returns.
+    intrinsics : Camera, Calibration, Intrinsics or (3, 3) array, optional
+        Type 3. The first two bring their distortion with them.
     extrinsics : dict of Pose by view name, optional
         Type 4.
     method : {"neuro"}
@@ -102,10 +103,11 @@ def calibrate(
         Points that cannot give an answer, with the reason.
     """
     _check_options(method, trainer, distortion, outliers, starts, seed)
-    camera, lens = _given_camera(intrinsics)
+    given = None if intrinsics is None else camera_of(intrinsics)
+    lens = Distortion() if given is None else given.distortion
     type_3 = isinstance(type, (int, np.integer)) and type == 3
     if not type_3:
-        lens = Lens() if distortion in _FOUND else Lens(distortion)
+        lens = Distortion() if distortion in _FOUND else Distortion(distortion)
     elif distortion not in ("auto", "none", lens.model):
         raise UsageError(
             f"type 3 uses the distortion of the given camera ({lens.model}), not {distortion}; leave it out"
@@ -113,7 +115,9 @@ def calibrate(
     way = distortion if distortion in _FOUND and not type_3 else ""
     options = options_for(trainer, starts, seed, distortion=way, backprop=backprop, progress=progress)
     try:
-        problem = problem_for(points, type, image_center, camera, extrinsics, skew, lens)
+        problem = problem_for(
+            points, type, image_center, given.intrinsics if given else None, extrinsics, skew, lens
+        )
         if outliers == "reject":
             solution, rejected = fit_robustly(problem, options)
         else:
@@ -132,7 +136,7 @@ def calibrate(
         raise DegenerateGeometryError(f"{points.source}: {error}") from error
 
 
-def fit_poses(points: Correspondences, camera: Intrinsics | KnownCamera, seed: int) -> Calibration:
+def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:
     """Poses of the views of a given camera from all their points, however badly they fit (type 3).
 
     Raises
@@ -140,8 +144,8 @@ def fit_poses(points: Correspondences, camera: Intrinsics | KnownCamera, seed: i
     InputError, DegenerateGeometryError
         Points that do not determine the poses.
     """
-    intrinsics, lens = _given_camera(camera)
-    problem = problem_for(points, 3, intrinsics=intrinsics, lens=lens)
+    given = camera_of(camera)
+    problem = problem_for(points, 3, intrinsics=given.intrinsics, lens=given.distortion)
     solution = fit(problem, options_for("lm", _STARTS, seed))
     return calibration_of(solution, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
 
@@ -156,16 +160,6 @@ def _refuse_misfit(calibration: Calibration) -> None:
         f"no camera fits these points: the error of the best one is {calibration.rmse_px:.3g} px rms; "
         f"check that each pixel belongs to its point, the order and the signs of X,Y,Z and u,v{given}"
     )
-
-
-def _given_camera(given: Intrinsics | KnownCamera | Array | None) -> tuple[Intrinsics | None, Lens]:
-    if given is None or isinstance(given, Intrinsics):
-        return given, Lens()
-    if isinstance(given, (np.ndarray, list, tuple)):
-        return Intrinsics.from_matrix(np.asarray(given)), Lens()
-    if not isinstance(getattr(given, "intrinsics", None), Intrinsics):
-        raise UsageError("intrinsics must be an Intrinsics, a 3 x 3 matrix, a Calibration or a camera file")
-    return given.intrinsics, Lens(given.distortion_model, given.distortion)
 
 
 def _check_options(method: str, trainer: str, distortion: str, outliers: str, starts: int, seed: int) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, Verdict, ViewResult
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.evaluation import CameraEvaluation
 from neurocal_cli.verdict.report import verdict_json, verdict_lines

@@ -11,8 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from support.plain_projection import project
 
-from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose, project
+from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, euler_to_rotation, similarity
 from neurocal_cli.network import (

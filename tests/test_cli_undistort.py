@@ -209,7 +209,7 @@ def test_the_new_camera_is_that_of_the_corrected_images(camera: Path, images: Pa
     )
     assert result.exit_code == 0
     new = read_intrinsics(tmp_path / "n.yaml")
-    assert (new.distortion_model, new.image_size, new.camera_name) == ("none", SIZE, "left")
+    assert (new.distortion.model, new.image_size, new.name) == ("none", SIZE, "left")
     assert new.intrinsics.alpha_u < 480
     again = undistort(tmp_path / "n.yaml", tmp_path / "a.png", "-o", tmp_path / "b.png")
     assert again.exit_code == 0

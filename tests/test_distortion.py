@@ -6,13 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.distorted import through
+from support.plain_projection import project
 from support.scenes import Scene, board_midpoints, random_flat_set, table_1
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
 from neurocal_cli.bundle_adjustment.point_batches import batches_of
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks, residuals
-from neurocal_cli.camera.distortion_models import Lens
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, project
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import write_calibration
@@ -174,7 +175,7 @@ def test_a_lens_that_folds_inside_the_image_is_refused() -> None:
         pixels.append(through(centred, "k1", [-3.2]).pixels)
         names += [f"v{k}"] * len(near)
     points = Correspondences(np.concatenate(worlds), np.concatenate(pixels), names, (352, 240))
-    with pytest.raises(DegenerateGeometryError, match="is not monotonic .* inside the image"):
+    with pytest.raises(DegenerateGeometryError, match=r"is not monotonic .* inside the image"):
         calibrate(points, distortion="k1")
 
 
@@ -192,7 +193,7 @@ def test_coefficients_that_are_noise_are_named() -> None:
 
 def test_too_many_coefficients_are_refused() -> None:
     with pytest.raises(InputError, match="k1k2 has 2"):
-        Lens("k1k2", np.array([0.1, 0.2, 0.3]))
+        Distortion("k1k2", np.array([0.1, 0.2, 0.3]))
 
 
 @pytest.mark.parametrize("trials", [50, pytest.param(150, marks=pytest.mark.slow)])

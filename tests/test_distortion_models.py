@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from support.distorted import LENSES
 
-from neurocal_cli.camera.distortion_models import MODELS, bend, coefficient_names, distort
+from neurocal_cli.camera.distortion import (
+    MODELS,
+    Distortion,
+    coefficient_names,
+    distort,
+    distort_with_jacobian,
+)
 from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.errors import InputError
 
@@ -23,7 +29,7 @@ def test_derivatives_by_the_point_are_those_of_differences(
 ) -> None:
     x, y = points
     k = LENSES[model]
-    _, (xx, xy, yx, yy), _ = bend(model, k, x, y)
+    _, (xx, xy, yx, yy), _ = distort_with_jacobian(model, k, x, y)
     by_x = [
         (a - b) / (2 * STEP)
         for a, b in zip(distort(model, k, x + STEP, y), distort(model, k, x - STEP, y), strict=True)
@@ -42,7 +48,7 @@ def test_derivatives_by_the_coefficients_are_those_of_differences(
 ) -> None:
     x, y = points
     k = np.array(LENSES[model])
-    _, _, by = bend(model, k, x, y)
+    _, _, by = distort_with_jacobian(model, k, x, y)
     assert len(by) == len(k) == len(coefficient_names(model))
     for n, pair in enumerate(by):
         step = np.zeros(len(k))
@@ -55,7 +61,7 @@ def test_derivatives_by_the_coefficients_are_those_of_differences(
 @pytest.mark.parametrize("model", list(MODELS))
 def test_undistort_inverts_distort(model: str, points: tuple[np.ndarray, ...]) -> None:
     x, y = points
-    back = undistort(model, LENSES[model], *distort(model, LENSES[model], x, y))
+    back = undistort(Distortion(model, LENSES[model]), *distort(model, LENSES[model], x, y))
     assert np.array(back) == pytest.approx(np.array([x, y]), abs=1e-11)
 
 
@@ -76,7 +82,7 @@ def test_opencv_bends_the_same_way(model: str, points: tuple[np.ndarray, ...]) -
 
 def test_what_no_point_bends_to_is_nan() -> None:
     # With k1 = -1 the image never gets beyond 2 / (3 sqrt 3) = 0.385.
-    x, _ = undistort("k1", [-1.0], np.array([0.3, 0.5]), np.zeros(2))
+    x, _ = undistort(Distortion("k1", [-1.0]), np.array([0.3, 0.5]), np.zeros(2))
     assert np.isfinite(x[0])
     assert np.isnan(x[1])
 

@@ -11,7 +11,7 @@ from support.distorted import BENT, SIGMA, bent_set, new_views, within_reach
 from support.scenes import Scene, random_solid, table_1
 
 from neurocal_cli import Calibration, calibrate
-from neurocal_cli.camera.distortion_models import MODELS
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.errors import DegenerateGeometryError
 
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.distorted import SIGMA, bent_set, new_views, through
+from support.plain_projection import project
 
 from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
-from neurocal_cli.camera.distortion_models import Lens, bend
+from neurocal_cli.camera.distortion import Distortion, distort_with_jacobian
 from neurocal_cli.camera.monotonic import radial_slope
-from neurocal_cli.camera.pinhole import Pose, project
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.distortion.monotonic_fit import MonotonicFit, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.stereo.fit_rig import fit_rig
@@ -45,7 +46,7 @@ def test_the_slope_and_its_derivatives_are_those_of_differences(model: str) -> N
     slope, by_k = radial_slope(model, k, r)
     without = np.where(np.isin(np.arange(len(k)), (2, 3)) & (model != "fisheye"), 0.0, k)
     radius = np.tan(r) if model == "fisheye" else r
-    _, (along, *_), _ = bend(model, without, radius, np.zeros_like(r))
+    _, (along, *_), _ = distort_with_jacobian(model, without, radius, np.zeros_like(r))
     assert slope == pytest.approx(along * (1 + radius**2 if model == "fisheye" else 1.0), rel=1e-12)
     for n in range(len(k)):
         step = h * (np.arange(len(k)) == n)
@@ -73,8 +74,8 @@ def test_a_fold_where_no_point_is_goes_and_new_views_are_predicted_better(
     found = calibrate(points, distortion="auto" if asked == "auto" else model, skew=False)
     free = free_fit(points, model)
     assert found.distortion_model == model
-    assert where_not_monotonic(Lens(model, free.distortion), free.K, points) == "image"
-    assert where_not_monotonic(Lens(model, found.distortion), found.K, points) is None
+    assert where_not_monotonic(Distortion(model, free.distortion), free.K, points) == "image"
+    assert where_not_monotonic(Distortion(model, found.distortion), found.K, points) is None
     assert found.converged
     assert free.rmse_px < found.rmse_px < 1.01 * free.rmse_px
     scene, k = bent_set(model, seed)
@@ -95,7 +96,7 @@ def test_a_lens_that_does_not_fold_is_the_same_to_the_last_bit(model: str, seed:
 def test_points_that_deny_every_lens_without_a_fold_are_refused() -> None:
     # A true k1k2 and plenty of points: k1 alone follows them only with a fold.
     points = noisy("k1k2", 130)
-    with pytest.raises(DegenerateGeometryError, match="k1 is not monotonic .* inside the image"):
+    with pytest.raises(DegenerateGeometryError, match=r"k1 is not monotonic .* inside the image"):
         calibrate(points, distortion="k1", skew=False)
 
 
@@ -103,11 +104,11 @@ def test_a_fisheye_need_not_see_the_corners() -> None:
     # A picture of 200 degrees across its diagonal: the corners lie beyond 90 degrees.
     A, lens = (
         np.array([[180.0, 0, 319.5], [0, 180.0, 239.5], [0, 0, 1]]),
-        Lens("fisheye", [0.02, 0.0, 0.0, 0.0]),
+        Distortion("fisheye", [0.02, 0.0, 0.0, 0.0]),
     )
     points = Correspondences(np.zeros((1, 3)), np.array([[330.0, 250.0]]), image_size=(640, 480))
     assert where_not_monotonic(lens, A, points) is None
-    assert where_not_monotonic(Lens("fisheye", [-0.2, 0.0, 0.0, 0.0]), A, points) == "image"
+    assert where_not_monotonic(Distortion("fisheye", [-0.2, 0.0, 0.0, 0.0]), A, points) == "image"
 
 
 def test_standard_deviations_are_not_too_small() -> None:

@@ -21,7 +21,7 @@ from support.scenes import Scene, board_midpoints, random_flat_set, random_rotat
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
 from neurocal_cli.board import Board
 from neurocal_cli.bundle_adjustment.views import noise_model
-from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, LinesSeen, find_lines
 from neurocal_cli.distortion.plumb_line import PlumbLine, fit_plumb_line, lines_in_pixels
@@ -129,7 +129,7 @@ def test_derivatives_are_those_of_differences() -> None:
     whitening = noise_model(weights)[1]
     seen = lines_in_pixels(points, find_lines(points), np.array([480, 390]), 900.0, whitening)
     entries, k = np.array([1.0, 0.02, 0.98, 0.03, -0.02]), np.array([-0.21, 0.08, 0.01, -0.02])
-    curves = bent_lines(seen, entries, Lens("k1k2p1p2", k))
+    curves = bent_lines(seen, entries, Distortion("k1k2p1p2", k))
     r, J, nu = curves.derivatives()
     assert np.hypot(*nu.T) == pytest.approx(1.0)
     for column in range(9):
@@ -149,7 +149,7 @@ def test_lines_that_a_lens_bends_have_no_error() -> None:
     lines = find_lines(scene.points())
     a, _, b, u0, v0 = (*scene.intrinsics.A[0, :2], scene.intrinsics.A[1, 1], *scene.intrinsics.A[:2, 2])
     seen = lines_in_pixels(scene.points(), lines, np.zeros(2), 1.0)
-    curves = bent_lines(seen, np.array([a, 0, b, u0, v0]), Lens("k1k2", [-0.2, 0.1]))
+    curves = bent_lines(seen, np.array([a, 0, b, u0, v0]), Distortion("k1k2", [-0.2, 0.1]))
     assert curves.sensible
     assert np.abs(curves.errors()).max() < 1e-9
 

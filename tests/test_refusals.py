@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from support.plain_projection import project
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.pinhole import project
 from neurocal_cli.errors import DegenerateGeometryError, InputError, NeurocalError, UsageError
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.noise import noisy, whitener
+from support.plain_projection import project
 from support.scenes import pinhole, random_flat_set, random_solid
 
 from neurocal_cli import Correspondences
@@ -14,7 +15,7 @@ from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose, project
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
 
 

@@ -12,27 +12,20 @@ from support.scenes import Scene, pinhole, random_flat_set, table_1
 from support.wrong_inputs import flat
 
 from neurocal_cli import Calibration, Correspondences, calibrate
-from neurocal_cli.bundle_adjustment.units import see
-from neurocal_cli.camera.distortion_models import Lens
-from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
 from neurocal_cli.verdict.assessment import assess, gather_evidence
 
 
 def moved_pixels(true: Calibration, other: Calibration, pixels: np.ndarray, depth: float) -> np.ndarray:
     """Where another calibration sees what the first one sees at these pixels and a depth."""
-    A, lens = true.K, Lens(true.distortion_model, true.distortion)
-    y = (pixels[:, 1] - A[1, 2]) / A[1, 1]
-    x = (pixels[:, 0] - A[0, 2] - A[0, 1] * y) / A[0, 0]
-    if lens.model != "none":
-        x, y = undistort(lens.model, lens.coefficients, x, y)
-    points = depth * np.column_stack([x, y, np.ones(len(x))])
+    points = true.camera.unproject(pixels)
+    points *= depth / points[:, 2:]
     back = []
     for name, view in true.views.items():
         world = (points - view.pose.t) @ view.pose.R
         pose = other.views[name].pose
         back.append(world @ pose.R.T + pose.t)
-    seen, _ = see(other.K, Lens(other.distortion_model, other.distortion), np.mean(back, axis=0))
+    seen, _ = other.camera.project(np.mean(back, axis=0))
     return seen - pixels
 
 

@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
 from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
 
@@ -76,7 +76,7 @@ def pose_std(R: Array, centre: Array, scale: Array, covariance: Array) -> Array:
 
 
 def parameter_warnings(
-    intrinsics: Intrinsics, lens: Lens, std: Mapping[str, float], lens_chosen: bool
+    intrinsics: Intrinsics, lens: Distortion, std: Mapping[str, float], lens_chosen: bool
 ) -> tuple[str, ...]:
     """Parameters that exist but are badly determined, and coefficients that the data does not tell from 0.
 
@@ -104,7 +104,7 @@ def _poor(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:
     )
 
 
-def _noise_coefficients(lens: Lens, std: Mapping[str, float]) -> tuple[str, ...]:
+def _noise_coefficients(lens: Distortion, std: Mapping[str, float]) -> tuple[str, ...]:
     """Warn of coefficients that the data does not tell from 0."""
     pairs = zip(coefficient_names(lens.model), lens.coefficients, strict=True)
     noise = [

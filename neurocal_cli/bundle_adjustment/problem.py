@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,37 +15,18 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.adjust import Adjusted, Restraint, adjust
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
 from neurocal_cli.bundle_adjustment.views import Views, arrange
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names, pinhole_coefficients
-from neurocal_cli.camera.monotonic import straight_pixels
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.projection import undistorted_pixels
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["KnownCamera", "Problem", "intrinsic_matrix", "problem_for"]
+__all__ = ["Problem", "intrinsic_matrix", "problem_for"]
 
 _LARGEST = 1e9  # px; no image is larger
 _PINHOLE_STEPS = 2  # enough to make the points agree on a camera; a distorted image has no exact one
 _MAX_ITERATIONS = 200
-
-
-class KnownCamera(Protocol):
-    """A camera with a lens: a `Calibration`, or what `read_intrinsics` returns."""
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """Its five parameters."""
-        ...
-
-    @property
-    def distortion_model(self) -> str:
-        """One of `distortion_models.MODELS`."""
-        ...
-
-    @property
-    def distortion(self) -> Array:
-        """The model's coefficients."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +50,7 @@ class Problem:
         Names of the given intrinsic parameters, and of distortion coefficients that stay as they are.
     intrinsics : Intrinsics or None
         All of them, for type 3: returned as they are.
-    lens : Lens
+    lens : Distortion
         The distortion model to end with; its coefficients where they are given.
     free_lens : bool
         Whether the other coefficients are estimated.
@@ -86,7 +66,7 @@ class Problem:
     poses: Mapping[str, Pose] | None
     fixed: frozenset[str]
     intrinsics: Intrinsics | None
-    lens: Lens
+    lens: Distortion
     free_lens: bool
     restraint: Restraint | None = None
 
@@ -142,7 +122,7 @@ class Problem:
         """The same points with another distortion model to be estimated."""
         # Coefficients that stay as they are belong to the model before.
         fixed = self.fixed & set(INTRINSIC_NAMES)
-        return replace(self, lens=Lens(model), free_lens=model != "none", fixed=fixed, restraint=None)
+        return replace(self, lens=Distortion(model), free_lens=model != "none", fixed=fixed, restraint=None)
 
     def with_seen_pixels(self) -> Problem:
         """The same problem with the pixels as they were seen, normalised as before."""
@@ -188,7 +168,7 @@ def problem_for(
     intrinsics: Intrinsics | None = None,
     extrinsics: Mapping[str, Pose] | None = None,
     skew: bool = True,
-    lens: Lens | None = None,
+    lens: Distortion | None = None,
 ) -> Problem:
     """Check what is given against what the problem type needs.
 
@@ -198,7 +178,7 @@ def problem_for(
     type : int
     image_center, intrinsics, extrinsics, skew
         As for `calibrate`.
-    lens : Lens, optional
+    lens : Distortion, optional
         The distortion: given with type 3, else the model to be estimated.
 
     Raises
@@ -243,7 +223,7 @@ def problem_for(
         fixed = set(INTRINSIC_NAMES)
     elif type == 4:
         poses = _poses(points, extrinsics)
-    lens = lens or Lens()
+    lens = lens or Distortion()
     free_lens = type != 3 and lens.model != "none"
     if type == 3:
         fixed |= set(coefficient_names(lens.model))
@@ -257,11 +237,11 @@ def _arranged(points: Correspondences, problem: Problem) -> Views:
     return arrange(_undistorted(points, problem.lens, problem.entries))
 
 
-def _undistorted(points: Correspondences, lens: Lens, entries: Array) -> Correspondences:
+def _undistorted(points: Correspondences, lens: Distortion, entries: Array) -> Correspondences:
     """Points without a given distortion."""
-    if not lens.bends:
+    if lens.is_identity:
         return points
-    pixels = straight_pixels(lens, intrinsic_matrix(entries), points.pixels)
+    pixels = undistorted_pixels(lens, intrinsic_matrix(entries), points.pixels)
     lost = ~np.isfinite(pixels[:, 0])
     if lost.any():
         row = int(np.argmax(lost))

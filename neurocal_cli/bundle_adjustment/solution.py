@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
-from neurocal_cli.bundle_adjustment.units import Seen
+from neurocal_cli.bundle_adjustment.units import in_pixels
 from neurocal_cli.calibration import StraightLines
 from neurocal_cli.geometry import Array
 
@@ -101,6 +101,6 @@ class Solution:
         return self.adjusted.state
 
     @property
-    def in_pixels(self) -> Seen:
+    def in_pixels(self) -> CameraState:
         """The camera and the poses in pixels and world units, poses in the order of the problem's views."""
-        return Seen.of(self.problem, self.state)
+        return in_pixels(self.problem, self.state)

@@ -14,7 +14,7 @@ from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from neurocal_cli.io.camera_files import CameraFile
+    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
     from neurocal_cli.training.backprop import BackpropOptions
 
@@ -145,7 +145,7 @@ class Estimation:
         return center
 
 
-def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, CameraFile]:
+def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera]:
     """Read a known camera; give the points its image size if they have none.
 
     Raises

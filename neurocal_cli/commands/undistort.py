@@ -16,8 +16,8 @@ from neurocal_cli.commands.streams import check_one_stdin, is_terminal, note, on
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
+    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.distortion.remapping import Remapping
-    from neurocal_cli.io.camera_files import CameraFile
 
 __all__ = ["undistort"]
 
@@ -188,7 +188,7 @@ def _correct_all(work: _Work, paths: Sequence[str], outputs: Sequence[str]) -> i
 class _Work:
     """One camera, what is prepared for its images, and what there is to say."""
 
-    camera: CameraFile
+    camera: Camera
     alpha: float | None
     interpolation: str
     folder: str | None
@@ -216,14 +216,14 @@ class _Work:
 
     def _image(self, path: str, output: str) -> bytes:
         from neurocal_cli.distortion.remapping import Remapping
-        from neurocal_cli.distortion.undistortion import undistortion
+        from neurocal_cli.distortion.undistortion import undistorted_camera
         from neurocal_cli.io.images import encode_image, read_picture
 
         picture = read_picture(path)
         if self.remapping is None:
             self.size = self.size or picture.size
-            step = undistortion(self.camera, self.alpha, self.size)
-            self.remapping = Remapping(step, self.size, self.interpolation)
+            new = undistorted_camera(self.camera, self.alpha, self.size)
+            self.remapping = Remapping(self.camera, new, self.size, self.interpolation)
         try:
             corrected = self.remapping(picture.pixels)
             content = encode_image(corrected, ".png" if output == "-" else os.path.splitext(output)[1])
@@ -254,12 +254,12 @@ class _Work:
 
     def write_camera(self, path: str) -> None:
         """Write the camera of what was corrected."""
-        from neurocal_cli.distortion.undistortion import undistortion
+        from neurocal_cli.distortion.undistortion import undistorted_camera
         from neurocal_cli.io.camera_info import format_camera_info
         from neurocal_cli.io.files import write_whole
 
-        step = undistortion(self.camera, self.alpha, self.size)
-        write_whole(path, format_camera_info(self.camera.camera_name, self.size, step.new.A))
+        new = undistorted_camera(self.camera, self.alpha, self.size)
+        write_whole(path, format_camera_info(new.name, self.size, new.A))
 
 
 def _size(size: tuple[int, int] | None) -> str:

@@ -16,7 +16,7 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import Lens, bend, coefficient_names, pinhole_coefficients
+from neurocal_cli.camera.distortion import coefficient_names, distort, pinhole_coefficients
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
@@ -207,8 +207,8 @@ class _Chain:
             lost = np.full_like(lost, np.inf)
         cov = covariance(adjusted.normal, free, problem.free_poses, views.n_equations)
         noise = _noise(problem.lens.model, state, self.reach, cov.entries)
-        lens, A = Lens(state.lens, state.k), problem.matrix(state.entries[0])
-        bad = where_not_monotonic(lens, A, problem.points)
+        A = problem.matrix(state.entries[0])
+        bad = where_not_monotonic(state.distortion, A, problem.points)
         return Candidate(problem, adjusted, lost, noise, bad, _determined(problem, state, cov))
 
 
@@ -288,7 +288,7 @@ def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -
     # the straight one r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
     radial = [0.0 if name in ("p1", "p2") else k for name, k in old.items()]
-    bent = bend(state.lens, radial, r, np.zeros_like(r))[0][0]
+    bent = distort(state.lens, radial, r, np.zeros_like(r))[0]
     q = np.arctan(r) if fisheye else r
     of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][:most]
     powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.camera.distortion_models import Lens
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 
@@ -37,7 +36,7 @@ def check_distortion(solution: Solution) -> Solution:
         adjusted = problem.adjust(replace(solution.adjusted, state=start))
         solution = replace(solution, problem=problem, adjusted=adjusted)
     state = solution.state
-    where = where_not_monotonic(Lens(lens.model, state.k), problem.matrix(state.entries[0]), problem.points)
+    where = where_not_monotonic(state.distortion, problem.matrix(state.entries[0]), problem.points)
     if where is None:
         return solution
     if where == "image" and problem.free_lens and solution.shared is None:

@@ -23,7 +23,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import MODELS
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.distortion.candidate_models import Candidate, falls_short, fit_candidates, worth
 from neurocal_cli.geometry import Array
 
@@ -177,8 +177,8 @@ def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
         bad = candidate.not_monotonic is not None and not candidate.noise
         if bad and chosen.lost.sum() > _FAR_WORSE**2 * candidate.lost.sum():
             return (
-                f"the distortion is strong, and the model {model} that fits the points is not monotonic (maps "
-                f"two directions to one pixel) inside the {candidate.not_monotonic}; give points nearer to "
-                "the image's corners, or choose a --distortion"
+                f"the distortion is strong, and the model {model} that fits the points is not monotonic "
+                f"(maps two directions to one pixel) inside the {candidate.not_monotonic}; give points "
+                "nearer to the image's corners, or choose a --distortion"
             )
     return ""

@@ -26,8 +26,9 @@ from neurocal_cli.bundle_adjustment.adjust import Adjusted, Restraint
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names, distort
-from neurocal_cli.camera.monotonic import first_fold, radial_slope, straight_pixels
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort
+from neurocal_cli.camera.monotonic import monotonic_radius, radial_slope
+from neurocal_cli.camera.projection import undistorted_pixels
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -87,7 +88,7 @@ def normal_part(restraint: Restraint, state: CameraState, free: NDArray[np.bool_
     return rows.T @ rows, rows.T @ missing
 
 
-def where_not_monotonic(lens: Lens, A: Array, points: Correspondences) -> str | None:
+def where_not_monotonic(lens: Distortion, A: Array, points: Correspondences) -> str | None:
     """Where a lens folds back: within the points, within the rest of the image, or nowhere.
 
     The image is looked at where its size is known: at its corners, which nothing is farther out than,
@@ -100,14 +101,14 @@ def where_not_monotonic(lens: Lens, A: Array, points: Correspondences) -> str | 
     away = np.hypot(points.pixels[:, 0] - A[0, 2], points.pixels[:, 1] - A[1, 2])
     farthest = points.pixels[np.argsort(-away, kind="stable")[:_FARTHEST]]
     border = np.zeros((0, 2))
-    if points.image_size is not None and not (lens.model == "fisheye" and np.isinf(first_fold(lens))):
+    if points.image_size is not None and not (lens.model == "fisheye" and np.isinf(monotonic_radius(lens))):
         border = _border(points.image_size, lens)
     if _sees(lens, A, np.concatenate([farthest, border])):
         return None
     return "image" if len(border) and _sees(lens, A, farthest) else "points"
 
 
-def _border(image_size: tuple[int, int], lens: Lens) -> Array:
+def _border(image_size: tuple[int, int], lens: Distortion) -> Array:
     """Pixels along the image's border, or its corners; (N, 2)."""
     tangential = "p1" in coefficient_names(lens.model)
     along = np.linspace(0, 1, _BORDER if tangential else 2)
@@ -116,9 +117,9 @@ def _border(image_size: tuple[int, int], lens: Lens) -> Array:
     return np.concatenate([np.column_stack(side) for side in sides]) * (np.array(image_size) - 1)
 
 
-def _sees(lens: Lens, A: Array, pixels: Array) -> bool:
+def _sees(lens: Distortion, A: Array, pixels: Array) -> bool:
     """Whether all the pixels lie where the lens has not folded back."""
-    return bool(np.isfinite(straight_pixels(lens, A, pixels)).all())
+    return bool(np.isfinite(undistorted_pixels(lens, A, pixels)).all())
 
 
 @_quietly
@@ -165,8 +166,8 @@ def _with_slope(
         state = adjusted.state
         if not adjusted.cost.sum() <= most:
             return None
-        lens, A = Lens(state.lens, state.k), problem.matrix(state.entries[0])
-        if where_not_monotonic(lens, A, problem.points) is None:
+        A = problem.matrix(state.entries[0])
+        if where_not_monotonic(state.distortion, A, problem.points) is None:
             return _settled(restrained, adjusted)
         corner = beyond * _farthest(problem, state)
         last += max(corner - _distorted(state, last), 0.01 * corner) / _GUESS
@@ -182,7 +183,7 @@ def _settled(problem: Problem, adjusted: Adjusted) -> tuple[Problem, Adjusted] |
 
 def _turn(state: CameraState) -> float:
     """Undistorted radius, or a fisheye's angle, up to which the distortion is monotonic."""
-    r = first_fold(Lens(state.lens, state.k))
+    r = monotonic_radius(state.distortion)
     return float(np.arctan(r)) if state.lens == "fisheye" else r
 
 

@@ -40,7 +40,8 @@ from neurocal_cli.bundle_adjustment.reprojection import (
     normal_blocks,
 )
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.camera.distortion_models import Lens, bend, coefficient_names
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort_with_jacobian
+from neurocal_cli.camera.projection import normalised_points
 from neurocal_cli.distortion.plumb_line import PlumbLine, lines_in_pixels
 from neurocal_cli.distortion.straightness import CAMERA, Curves, bent_lines
 from neurocal_cli.errors import DegenerateGeometryError
@@ -91,8 +92,8 @@ def lens_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondence
     lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
     start = solution.adjusted.state
     start = replace(start, lens=MODEL, k=_same_lens(start.entries[0], seen.pixels, views.pixels))
-    problem = replace(problem, points=points, views=seen, lens=Lens(MODEL, start.k), free_lens=True)
-    together = _Together(problem, bent_lines(lines, start.entries[0], Lens(MODEL, start.k)))
+    problem = replace(problem, points=points, views=seen, lens=Distortion(MODEL, start.k), free_lens=True)
+    together = _Together(problem, bent_lines(lines, start.entries[0], Distortion(MODEL, start.k)))
     adjusted = together.solved(start)
     done = solution.adjusted.iterations + adjusted.iterations
     return replace(
@@ -105,17 +106,11 @@ def lens_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondence
 
 def _same_lens(entries: Array, seen: Array, corrected: Array) -> Array:
     """Coefficients that take corrected pixels to the seen ones, in the terms of a camera."""
-    x, y = _normalised(entries, corrected)
-    bent_x, bent_y = _normalised(entries, seen)
-    _, _, by = bend(MODEL, np.zeros(_K), x, y)
+    x, y = normalised_points(entries, *corrected.T)
+    bent_x, bent_y = normalised_points(entries, *seen.T)
+    _, _, by = distort_with_jacobian(MODEL, np.zeros(_K), x, y)
     columns = np.column_stack([np.concatenate(pair) for pair in by])
     return np.linalg.lstsq(columns, np.concatenate([bent_x - x, bent_y - y]), rcond=None)[0]
-
-
-def _normalised(entries: Array, pixels: Array) -> tuple[Array, Array]:
-    a, s, b, u0, v0 = entries
-    y = (pixels[:, 1] - v0) / b
-    return (pixels[:, 0] - u0 - s * y) / a, y
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import MODELS
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_files import read_intrinsics
@@ -110,8 +110,8 @@ def _listed(table: Table) -> _Rows:
     return _Rows(
         dict(table.numbers) | parameters,
         np.array([k.theta for k in K]),
-        [camera.distortion_model for camera in cameras],
-        [camera.distortion for camera in cameras],
+        [camera.distortion.model for camera in cameras],
+        [camera.distortion.coefficients for camera in cameras],
         {size for size in sizes if size is not None},
     )
 

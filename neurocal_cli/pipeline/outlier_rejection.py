@@ -24,6 +24,7 @@ from neurocal_cli.bundle_adjustment.common_noise import with_common_share
 from neurocal_cli.bundle_adjustment.measured_directions import single, unit, variance_across
 from neurocal_cli.bundle_adjustment.outlier_views import find_outlier_view
 from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Rejected
@@ -222,10 +223,9 @@ class _Errors:
 
 
 def _errors(solution: Solution, points: Correspondences) -> _Errors:
-    camera = solution.in_pixels
     place = {name: k for k, name in enumerate(solution.problem.views.names)}
     view = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
-    predicted, in_front = camera.predict(points.world, np.maximum(view, 0))
+    predicted, in_front = predicted_pixels(solution.in_pixels, points.world, np.maximum(view, 0))
     residuals = predicted - points.pixels
     stated = None
     if points.covariance is not None:

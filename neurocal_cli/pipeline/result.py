@@ -17,7 +17,6 @@ from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
-from neurocal_cli.camera.distortion_models import Lens
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
 
@@ -80,7 +79,7 @@ def calibration_of(
         rejected=rejected,
         lens_choice=solution.model_errors or {},
         warnings=(
-            *parameter_warnings(intrinsics, Lens(problem.lens.model, state.k), std, chosen),
+            *parameter_warnings(intrinsics, state.distortion, std, chosen),
             *_corner_warning(problem),
             *_mirrored_warning(seen_from_behind(views, state)),
             *_rejection_warnings(rejected, len(problem.points)),

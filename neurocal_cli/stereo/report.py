@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.report import align, rounded
 from neurocal_cli.stereo.evaluation import StereoEvaluation

@@ -20,11 +20,12 @@ from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.cross_validation import disagreement, held_out
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
-from neurocal_cli.bundle_adjustment.units import Seen, normalised
+from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.projection_uncertainty import (
@@ -66,17 +67,19 @@ class _AtMinimum:
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.points = calibration, calibration.points
         views = [calibration.views[name] for name in self.points.view_names]
-        self.seen = Seen(
-            calibration.K,
-            Lens(calibration.distortion_model, calibration.distortion),
+        self.camera = calibration.camera
+        self.given = CameraState(
+            np.array([self.camera.entries]),
             np.stack([view.pose.R for view in views]),
             np.stack([view.pose.t for view in views]),
+            self.camera.distortion.model,
+            self.camera.distortion.coefficients,
         )
-        predicted, _ = self.seen.predict(self.points.world, self.points.view_index)
+        predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
         self.views = weighed(self.points, self.points.pixels - predicted)
         self.free = _free(calibration)
         self.free_poses = not all(view.fixed for view in views)
-        state = normalised(self.seen, self.views)
+        state = normalised(self.given, self.views)
         adjusted = adjust(self.views.batches, state, self.free, self.free_poses, _STEPS)
         self.state, self.normal = adjusted.state, adjusted.normal
         self.cost = float(self.normal[:, -1, -1].sum())
@@ -134,10 +137,10 @@ class _AtMinimum:
         if self.points.image_size is None:
             return None
         view = self.points.view_index
-        depth = (self.seen.R[view, 2] * self.points.world).sum(axis=1) + self.seen.t[view, 2]
+        depth = (self.given.R[view, 2] * self.points.world).sum(axis=1) + self.given.t[view, 2]
         depths = np.append(np.quantile(depth, [0.0, 0.5, 1.0]), _DISTANT * depth.max())
         return projection_uncertainty(
-            self.views, self.state, self.seen, self.normal, self.free, self.free_poses,
+            self.views, self.state, self.camera, self.normal, self.free, self.free_poses,
             self.cost / self.spare, image_grid(self.points.image_size), depths,
         )  # fmt: skip
 

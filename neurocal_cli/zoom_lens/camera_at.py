@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, ViewResult
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.points import Correspondences

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.report import align, rounded
 from neurocal_cli.zoom_lens.evaluation import LensEvaluation

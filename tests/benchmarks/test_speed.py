@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from support.distorted import through
+from support.plain_projection import project
 from support.scenes import random_flat_set, table_1
 
 from neurocal_cli import Correspondences, calibrate, read_points
-from neurocal_cli.camera.pinhole import project
 
 VIEWS = [13, 100, 1000]
 

@@ -8,15 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.units import Seen, normalised
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import Lens, distort
-from neurocal_cli.camera.monotonic import first_fold, is_seen
-from neurocal_cli.camera.pinhole import Pose, project
+from neurocal_cli.camera.distortion import Distortion, distort
+from neurocal_cli.camera.monotonic import is_monotonic, monotonic_radius
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
+from support.plain_projection import project
 from support.scenes import Scene, random_flat_set
 
 BENT = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "fisheye")
@@ -45,10 +47,13 @@ def bent_set(model: str, seed: int) -> tuple[Scene, list[float]]:
         reach = float(np.hypot(*((corners - A[:2, 2]) / [A[0, 0], A[1, 1]]).T).max())
         k = coefficients(model, 0.6 * width / A[0, 0], rng)
         enough = len(scene.world) >= 25 * n_views
-        if not enough or (model != "none" and first_fold(Lens(model, k)) < 1.6 * reach):
+        if not enough or (model != "none" and monotonic_radius(Distortion(model, k)) < 1.6 * reach):
             continue
         bent = through(scene, model, k)
-        if sees(scene, model, k).all() and where_not_monotonic(Lens(model, k), A, bent.points()) is None:
+        if (
+            sees(scene, model, k).all()
+            and where_not_monotonic(Distortion(model, k), A, bent.points()) is None
+        ):
             return bent, k
 
 
@@ -67,7 +72,7 @@ def coefficients(model: str, r: float, rng: np.random.Generator) -> list[float]:
 def sees(scene: Scene, model: str, k: list[float]) -> NDArray[np.bool_]:
     """Whether the scene's points, as a pinhole has them, lie where the lens does not fold."""
     x, y = without_camera(scene.intrinsics.A, scene.pixels)
-    return is_seen(Lens(model, k), x, y)
+    return is_monotonic(Distortion(model, k), x, y)
 
 
 def without_camera(A: Array, pixels: Array) -> tuple[Array, Array]:
@@ -85,8 +90,10 @@ class NewViews:
     def error(self, camera: Calibration) -> float:
         """Rms error [px] of a camera in them, each through the pose that suits the camera best."""
         views, R = arrange(self.points), np.stack([pose.R for pose in self.poses])
-        lens = Lens(camera.distortion_model, camera.distortion)
-        start = normalised(Seen(camera.K, lens, R, np.stack([pose.t for pose in self.poses])), views)
+        known, t = camera.camera, np.stack([pose.t for pose in self.poses])
+        lens = known.distortion
+        given = CameraState(np.array([known.entries]), R, t, lens.model, lens.coefficients)
+        start = normalised(given, views)
         found = adjust(views.batches, start, np.zeros(5 + len(start.k), dtype=bool))
         return float(np.sqrt(found.cost.sum() / len(views.index))) * views.pixel_scale
 

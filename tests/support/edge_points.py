@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli import Correspondences
-from neurocal_cli.camera.distortion_models import distort
-from neurocal_cli.camera.pinhole import Intrinsics, project
+from neurocal_cli.camera.distortion import distort
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.geometry import Array
 from support.distorted import without_camera
+from support.plain_projection import project
 from support.scenes import board_midpoints, random_flat_set
 
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli import Calibration, Correspondences
-from neurocal_cli.camera.pinhole import project
 from neurocal_cli.errors import NeurocalError
+from support.plain_projection import project
 from support.scenes import Scene, pinhole, random_flat_set, random_solid
 
 SIGMA = 0.3

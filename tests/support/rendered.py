@@ -15,11 +15,12 @@ from typing import Literal
 import numpy as np
 
 from neurocal_cli.board import Plane
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import (
     Background,
-    Camera,
     Disc,
     Illumination,
     Rectangle,
@@ -31,7 +32,6 @@ from neurocal_cli.simulation.rendering import (
     ground_truth,
     render,
 )
-from neurocal_cli.simulation.rendering.rays import Lens
 from neurocal_cli.simulation.rendering.scene import CLUTTER_KINDS
 
 IMAGES = 8  # per condition, by default
@@ -72,7 +72,8 @@ def single(recipe: Recipe, rng: np.random.Generator) -> Scene:
     size = (round(640 * recipe.zoom), round(480 * recipe.zoom))
     focal = recipe.focal * recipe.zoom
     centre = (0.5 * (size[0] - 1) + 2.3 * recipe.zoom, 0.5 * (size[1] - 1) - 1.7 * recipe.zoom)
-    camera = Camera(Intrinsics(focal, 1.003 * focal, *centre, recipe.theta), size, recipe.distortion)
+    intrinsics = Intrinsics(focal, 1.003 * focal, *centre, recipe.theta)
+    camera = Camera(intrinsics, Distortion("plumb_bob", recipe.distortion), size)
     plane = Plane("", recipe.cols, recipe.rows, SQUARE)
     margin = Sides.all(recipe.margin)
     target = Target(plane, recipe.black, recipe.white, bool(rng.integers(2)), margin=margin)
@@ -91,7 +92,7 @@ def single(recipe: Recipe, rng: np.random.Generator) -> Scene:
 
 def _posed(scene: Scene, recipe: Recipe, rng: np.random.Generator) -> Scene:
     """Try random poses until the board is in the frame as it should be."""
-    width, height = scene.camera.size
+    width, height = scene.size
     spread = 0.5 if recipe.framing == "cut" else 0.25
     for attempt in range(2000):
         azimuth, roll = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(-recipe.roll, recipe.roll))
@@ -115,7 +116,7 @@ def board_pose(scene: Scene, middle: Array, square: float, tilt: float, azimuth:
     R = np.eye(3) + np.sin(tilted) * K + (1 - np.cos(tilted)) * K @ K
     c, s = np.cos(roll), np.sin(roll)
     R = R @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    ray = Lens(scene.camera).rays(middle[:1], middle[1:])
+    ray = scene.camera.rays(middle[:1], middle[1:])
     depth = scene.camera.intrinsics.alpha_u * plane.square / square
     centre = plane.at([(plane.cols - 1) / 2, (plane.rows - 1) / 2])
     return Pose(R, depth * np.array([ray.x[0], ray.y[0], 1.0]) - R @ centre)
@@ -133,8 +134,9 @@ def _framed(scene: Scene, framing: str) -> bool:
         [np.stack(np.broadcast_arrays(*p), -1) for p in ((x, y_low), (x, y_high), (x_low, y), (x_high, y))]
     )
     matrix = scene.plane_to_camera(scene.targets[0])
-    pixels, seen = Lens(scene.camera).project(edge @ matrix[:, :2].T + matrix[:, 2])
-    inside = (pixels > 2) & (pixels < np.array(scene.camera.size) - 3)
+    points = edge @ matrix[:, :2].T + matrix[:, 2]
+    pixels, seen = scene.camera.project(points)[0], scene.camera.sees(points)
+    inside = (pixels > 2) & (pixels < np.array(scene.size) - 3)
     return share == 1 and bool(seen.all() and inside.all())
 
 
@@ -147,7 +149,8 @@ def folded(
 ) -> Scene:
     """Planes at right angles, the pattern up to the fold, or with squares that run across it."""
     focal, square = 800.0, 28.0 if planes == 2 else 26.0
-    camera = Camera(Intrinsics(focal, 1.003 * focal, 321.8, 237.8), (640, 480), distortion)
+    intrinsics = Intrinsics(focal, 1.003 * focal, 321.8, 237.8)
+    camera = Camera(intrinsics, Distortion("plumb_bob", distortion), (640, 480))
     gap = 0.5 if across else 1.0
     start = gap * SQUARE
     side = start if planes == 3 else SQUARE

@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from neurocal_cli import Correspondences, Intrinsics, Pose
+from neurocal_cli import Camera, Correspondences, Intrinsics, Pose
 from neurocal_cli.bundle_adjustment.reprojection import residuals
-from neurocal_cli.camera.distortion_models import Lens, distort
+from neurocal_cli.camera.distortion import Distortion, distort
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.camera_files import CameraFile
 from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import RigState
 
@@ -22,7 +21,7 @@ class RigScene:
     """Two cameras, a target and its poses in the left camera's frame."""
 
     cameras: tuple[Intrinsics, Intrinsics]
-    lenses: tuple[Lens, Lens]
+    lenses: tuple[Distortion, Distortion]
     sizes: tuple[tuple[int, int], tuple[int, int]]
     rig: Pose
     world: Array
@@ -32,9 +31,8 @@ class RigScene:
     names: tuple[str, str] = ("{}", "{}")
     ids: tuple[str, ...] = field(default=())
 
-    def camera(self, side: int) -> CameraFile:
-        lens = self.lenses[side]
-        return CameraFile(self.cameras[side], lens.model, lens.coefficients, self.sizes[side], "camera")
+    def camera(self, side: int) -> Camera:
+        return Camera(self.cameras[side], self.lenses[side], self.sizes[side])
 
     def pose(self, side: int, view: str) -> Pose:
         """Pose of a view in one camera."""
@@ -112,9 +110,9 @@ def random_rig(
     verge = np.arctan2(baseline, distance) * (0.3 if kind in ("parallel", "narrow") else 1.0)
     R = Pose.from_euler(*rng.normal(0, 0.02, 3), np.zeros(3)).R @ Pose.from_euler(0, verge, 0, np.zeros(3)).R
     centre = np.array([baseline, rng.normal(0, 0.05) * baseline, rng.normal(0, 0.1) * baseline])
-    lenses = (Lens(), Lens())
+    lenses = (Distortion(), Distortion())
     if lens == "k1k2":
-        lenses = (Lens("k1k2", np.array([-0.2, 0.08])), Lens("k1k2", np.array([-0.15, 0.05])))
+        lenses = (Distortion("k1k2", np.array([-0.2, 0.08])), Distortion("k1k2", np.array([-0.15, 0.05])))
     middle = target.mean(axis=0)
     poses = {}
     for k in range(n_views):

@@ -13,9 +13,10 @@ from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.views import Views, arrange
-from neurocal_cli.camera.pinhole import Intrinsics, Pose, project
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
+from support.plain_projection import project
 
 # Every point, a pinhole: what a reference optimiser does.
 pinhole = partial(calibrate, distortion="none", outliers="keep")

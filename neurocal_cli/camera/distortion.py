@@ -1,7 +1,7 @@
-"""Lenses that bend: distortion of normalised image coordinates, its derivatives and its inverse.
+"""Distortion of normalised image points, and its derivatives.
 
-A camera's point (x, y) = (Xc_1, Xc_2) / Xc_3 goes to (x', y') and then through A. The models and the
-order of coefficients are OpenCV's:
+A point (x, y) = (X, Y) / Z of the camera's frame goes to (x', y') and then through A. The models and the
+order of their coefficients are OpenCV's:
 
     k1, k1k2, k1k2p1p2, plumb_bob, rational
         x' = x R + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = y R + p1 (r^2 + 2 y^2) + 2 p2 x y,
@@ -11,6 +11,8 @@ order of coefficients are OpenCV's:
     fisheye
         (x', y') = (x, y) theta (1 + k1 theta^2 + ... + k4 theta^8) / r,  theta = atan(r)
                                                                   (Kannala and Brandt 2006)
+
+The inverse is `neurocal_cli.camera.monotonic.undistort`.
 """
 
 from __future__ import annotations
@@ -26,10 +28,11 @@ from neurocal_cli.geometry import Array
 
 __all__ = [
     "MODELS",
-    "Lens",
-    "bend",
+    "Coefficients",
+    "Distortion",
     "coefficient_names",
     "distort",
+    "distort_with_jacobian",
     "pinhole_coefficients",
 ]
 
@@ -60,7 +63,7 @@ def coefficient_names(model: str) -> tuple[str, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Lens:
+class Distortion:
     """A distortion model with its coefficients; without arguments, none.
 
     Parameters
@@ -92,17 +95,20 @@ class Lens:
         object.__setattr__(self, "coefficients", padded)
 
     @property
-    def bends(self) -> bool:
-        """Whether it changes anything; a fisheye always does."""
-        return bool(self.coefficients.any()) or self.model == "fisheye"
+    def is_identity(self) -> bool:
+        """Whether it moves no point; a fisheye always moves some."""
+        return self.model != "fisheye" and not self.coefficients.any()
 
 
 # A number, or an array that broadcasts against the points.
 Coefficients = Sequence[Any] | Array
 
+# (x', y'); dx'/dx, dx'/dy, dy'/dx, dy'/dy; and dx', dy' by each coefficient.
+Distorted = tuple[tuple[Array, Array], tuple[Array, Array, Array, Array], list[tuple[Array, Array]]]
+
 
 def pinhole_coefficients(model: str) -> Array:
-    """Coefficients with which a lens does not bend.
+    """Coefficients with which a model moves no point.
 
     For a fisheye to the ninth order, where tan(theta) = theta (1 + theta^2 / 3 + ...).
     """
@@ -112,7 +118,7 @@ def pinhole_coefficients(model: str) -> Array:
 
 
 def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
-    """Bend normalised image points.
+    """Distort normalised image points.
 
     Parameters
     ----------
@@ -125,13 +131,11 @@ def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Arr
     -------
     x', y' : arrays of that shape
     """
-    return bend(model, k, x, y)[0]
+    return distort_with_jacobian(model, k, x, y)[0]
 
 
-def bend(
-    model: str, k: Coefficients, x: Array, y: Array
-) -> tuple[tuple[Array, Array], tuple[Array, Array, Array, Array], list[tuple[Array, Array]]]:
-    """Bend points, with derivatives.
+def distort_with_jacobian(model: str, k: Coefficients, x: Array, y: Array) -> Distorted:
+    """Distort normalised image points, with derivatives.
 
     Returns
     -------
@@ -142,59 +146,52 @@ def bend(
         dx', dy' by each coefficient.
     """
     if model == "fisheye":
-        return _bend_fisheye(k, x, y)
-    return _bend_polynomial(k, x, y)
+        return _fisheye(k, x, y)
+    return _polynomial(k, x, y)
 
 
-def _bend_polynomial(
-    k: Coefficients, x: Array, y: Array
-) -> tuple[tuple[Array, Array], tuple[Array, Array, Array, Array], list[tuple[Array, Array]]]:
+def _polynomial(k: Coefficients, x: Array, y: Array) -> Distorted:
     count = len(k)
     full: list[Any] = [*k, *[0.0] * (8 - count)]
     k1, k2, p1, p2, k3, k4, k5, k6 = full
     r2 = x * x + y * y
     r4 = r2 * r2
     r6 = r4 * r2
-    top = 1 + k1 * r2 + k2 * r4 + k3 * r6
-    inverse: Array | float = 1.0
+    R = 1 + k1 * r2 + k2 * r4 + k3 * r6
     slope = k1 + 2 * k2 * r2 + 3 * k3 * r4  # dR / d(r^2)
-    R = top
+    by_radial = [(x * power, y * power) for power in (r2, r4, r6)[: 3 if count > 4 else min(count, 2)]]
     if count > 5:
         inverse = 1.0 / (1 + k4 * r2 + k5 * r4 + k6 * r6)
-        R = top * inverse
+        R = R * inverse
         slope = (slope - R * (k4 + 2 * k5 * r2 + 3 * k6 * r4)) * inverse
-    cross = 2 * x * y * slope
-    xx, yy = R + 2 * x * x * slope, R + 2 * y * y * slope
-    bent_x, bent_y = x * R, y * R
-    by: list[tuple[Array, Array]] = []
-    for power in (r2, r4)[: min(count, 2)]:
-        by.append((x * power * inverse, y * power * inverse))
-    if count > 2:
-        xy2 = 2 * x * y
-        bent_x = bent_x + p1 * xy2 + p2 * (r2 + 2 * x * x)
-        bent_y = bent_y + p1 * (r2 + 2 * y * y) + p2 * xy2
-        mixed = 2 * (p1 * x + p2 * y)
-        cross = cross + mixed
-        xx, yy = xx + 2 * p1 * y + 6 * p2 * x, yy + 6 * p1 * y + 2 * p2 * x
-        by += [(xy2, r2 + 2 * y * y), (r2 + 2 * x * x, xy2)]
-    if count > 4:
-        by.append((x * r6 * inverse, y * r6 * inverse))
+        by_radial = [(dx * inverse, dy * inverse) for dx, dy in by_radial]
+    xx2, xy2, yy2 = 2 * x * x, 2 * x * y, 2 * y * y
+    cross, xx, yy = xy2 * slope, R + xx2 * slope, R + yy2 * slope
+    distorted = x * R, y * R
+    if count <= 2:
+        return distorted, (xx, cross, cross, yy), by_radial
+    by_p1, by_p2 = (xy2, r2 + yy2), (r2 + xx2, xy2)
+    distorted = (
+        distorted[0] + p1 * by_p1[0] + p2 * by_p2[0],
+        distorted[1] + p1 * by_p1[1] + p2 * by_p2[1],
+    )
+    cross = cross + 2 * (p1 * x + p2 * y)
+    xx, yy = xx + 2 * p1 * y + 6 * p2 * x, yy + 6 * p1 * y + 2 * p2 * x
+    by = [*by_radial[:2], by_p1, by_p2, *by_radial[2:]]
     if count > 5:
-        by += [(-x * R * p * inverse, -y * R * p * inverse) for p in (r2, r4, r6)]
-    return (bent_x, bent_y), (xx, cross, cross, yy), by
+        by += [(-R * dx, -R * dy) for dx, dy in by_radial]
+    return distorted, (xx, cross, cross, yy), by
 
 
-def _bend_fisheye(
-    k: Coefficients, x: Array, y: Array
-) -> tuple[tuple[Array, Array], tuple[Array, Array, Array, Array], list[tuple[Array, Array]]]:
+def _fisheye(k: Coefficients, x: Array, y: Array) -> Distorted:
     k1, k2, k3, k4 = k
     r2 = np.maximum(x * x + y * y, _TINY)
     r = np.sqrt(r2)
     theta = np.arctan(r)
     t2 = theta * theta
-    bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    radius = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
     growth = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-    scale = bent / r
+    scale = radius / r
     slope = (growth / (1 + r2) - scale) / r2  # d(scale) / dr / r
     by = []
     power = theta * t2 / r
