@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.schur_complement import inverse_scaled, schur_covariance
+from neurocal_cli.least_squares.normal_equations import inverse_scaled
+from neurocal_cli.least_squares.schur_complement import schur_covariance
 
 __all__ = ["Covariance", "covariance"]
 
