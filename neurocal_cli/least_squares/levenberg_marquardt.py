@@ -224,6 +224,7 @@ class LevenbergMarquardt:
         trial, after, sensible = problem.move(step, active)
         better = sensible & (after < before)
         problem.accept(trial, better, active)
+        del trial, step  # large arrays: gone before the next ones are made
         self.iteration += 1
         gained = before - after
         excess = np.minimum(2 * (gained / promised) - 1, 2.0)
