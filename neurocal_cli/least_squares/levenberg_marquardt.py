@@ -209,7 +209,7 @@ class LevenbergMarquardt:
         self.outcome = Outcome(np.zeros(G, dtype=np.int64), np.zeros(G, dtype=np.int8))
         exact, out = self.cost <= self.floor, self.limit <= 0
         if exact.any() or out.any():
-            self._retire(exact | out, np.where(exact, Stop.EXACT, Stop.LIMIT))
+            self._retire(exact | out, np.where(exact, Stop.EXACT, Stop.LIMIT).astype(np.int8))
 
     def run(self) -> None:
         """Step until every group has stopped."""
@@ -240,19 +240,19 @@ class LevenbergMarquardt:
         stuck = ~better & (self.damping > options.largest_damping)
         done = settled | stuck | (self.limit <= self.iteration)
         if done.any():
-            reasons = [exact, converged, flat, stuck]
-            names = [Stop.EXACT, Stop.CONVERGED, Stop.FLAT, Stop.STUCK]
-            self._retire(done, np.select(reasons, names, Stop.LIMIT))
+            stop = np.zeros(len(done), dtype=np.int8)
+            stop[stuck], stop[flat] = Stop.STUCK, Stop.FLAT
+            stop[converged], stop[exact] = Stop.CONVERGED, Stop.EXACT
+            self._retire(done, stop)
 
     def renew(self) -> None:
         """Take up the problem's costs after it has changed by itself; all groups must be active."""
         self.cost = self.problem.cost
 
-    def _retire(self, done: NDArray[np.bool_], stop: NDArray[Any]) -> None:
+    def _retire(self, done: NDArray[np.bool_], stop: NDArray[np.int8]) -> None:
         """Leave the groups that have stopped alone from now on."""
-        self.outcome.iterations[self.active[done]] = self.iteration
-        self.outcome.stop[self.active[done]] = stop[done]
-        going = ~done
+        ended, going = self.active[done], ~done
+        self.outcome.iterations[ended], self.outcome.stop[ended] = self.iteration, stop[done]
         self.active, self.cost, self.floor = self.active[going], self.cost[going], self.floor[going]
         self.damping, self.growth = self.damping[going], self.growth[going]
         self.limit = self.limit[going]
