@@ -82,6 +82,9 @@ class Options:
         Initial lambda.
     shrink : float
         Smallest factor of lambda after an accepted step.
+    by_ratio : bool
+        Whether that factor follows rho, or is the smallest after every accepted step, as Marquardt had it:
+        bold, for many random starts of which some may fail.
     least_damping, largest_damping : float
         lambda does not fall below the one; where it exceeds the other no step of any length helps.
     tolerance : float
@@ -99,6 +102,7 @@ class Options:
 
     damping: float = 1e-4
     shrink: float = 0.01
+    by_ratio: bool = True
     least_damping: float = 1e-14
     largest_damping: float = 1e10
     tolerance: float = 1e-9
@@ -199,7 +203,7 @@ class LevenbergMarquardt:
         floor: float | Array = 0.0,
         limit: NDArray[np.int64] | None = None,
     ) -> None:
-        self.problem, self.options, self.cost = problem, options, problem.cost
+        self.problem, self.options, self.cost = problem, options, problem.cost.copy()
         G = len(self.cost)
         self.active = np.arange(G)
         self.damping, self.growth = np.full(G, options.damping), np.full(G, 2.0)
@@ -227,14 +231,16 @@ class LevenbergMarquardt:
         del trial, step  # large arrays: gone before the next ones are made
         self.iteration += 1
         gained = before - after
-        excess = np.minimum(2 * (gained / promised) - 1, 2.0)
-        shrink = np.maximum(options.shrink, 1 - excess * excess * excess)
+        shrink: float | Array = options.shrink
+        if options.by_ratio:
+            excess = np.minimum(2 * (gained / promised) - 1, 2.0)
+            shrink = np.maximum(shrink, 1 - excess * excess * excess)
         self.damping = np.maximum(self.damping * np.where(better, shrink, self.growth), options.least_damping)
         self.growth = np.where(better, 2.0, 2 * self.growth)
         self.cost = np.where(better, after, before)
         gain = promised if options.by_promise else gained
         converged = better & (gain < options.tolerance * before + options.negligible)
-        flat = sensible & ~better & (promised < options.flat * before)
+        flat = sensible & ~better & (np.abs(promised) < options.flat * before)
         exact = self.cost <= self.floor
         settled = converged | flat | exact
         stuck = ~better & (self.damping > options.largest_damping)
@@ -247,7 +253,7 @@ class LevenbergMarquardt:
 
     def renew(self) -> None:
         """Take up the problem's costs after it has changed by itself; all groups must be active."""
-        self.cost = self.problem.cost
+        self.cost = self.problem.cost.copy()
 
     def _retire(self, done: NDArray[np.bool_], stop: NDArray[np.int8]) -> None:
         """Leave the groups that have stopped alone from now on."""
