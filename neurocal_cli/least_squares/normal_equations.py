@@ -6,10 +6,11 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["NOTHING", "damped_step", "inverse_scaled", "solve_scaled"]
+__all__ = ["NOTHING", "ROUNDING", "damped_step", "inverse_scaled", "solve_scaled"]
 
 NOTHING = 1e-300  # keeps an empty diagonal from dividing by 0
-_ROUNDING = 1e-30  # an eigenvalue this far below the diagonal is not there
+ROUNDING = 1e-14  # a ridge that holds off a singular system and does not show in a regular one
+_ABSENT = 1e-30  # an eigenvalue this far below the diagonal is not there
 
 
 def solve_scaled(H: Array, rhs: Array, ridge: float = 0.0) -> Array:
@@ -20,7 +21,7 @@ def solve_scaled(H: Array, rhs: Array, ridge: float = 0.0) -> Array:
     H : (..., n, n) array
     rhs : (..., n, m) array
     ridge : float
-        Added to the unit diagonal: a little keeps what nothing determines from being infinite.
+        Added to the unit diagonal: a little (`ROUNDING`) keeps what nothing determines from being infinite.
     """
     scale = 1.0 / np.sqrt(np.abs(np.diagonal(H, axis1=-2, axis2=-1)) + NOTHING)
     scaled = H * scale[..., :, None] * scale[..., None, :]
@@ -71,7 +72,7 @@ def inverse_scaled(H: Array, reference: Array) -> tuple[Array, float]:
         return np.full_like(H, np.nan), 0.0
     values, vectors = np.linalg.eigh(scaled)
     smallest = float(values.min(initial=1.0))
-    if smallest < _ROUNDING:
+    if smallest < _ABSENT:
         return np.full_like(H, np.nan), 0.0
     inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     return inverse * outer, smallest
