@@ -252,8 +252,13 @@ class LevenbergMarquardt:
             self._retire(done, stop)
 
     def renew(self) -> None:
-        """Take up the problem's costs after it has changed by itself; all groups must be active."""
+        """Take up the costs of a problem that has changed by itself; all groups must be active.
+
+        Where the old one had come to its end, damping begins anew.
+        """
         self.cost = self.problem.cost.copy()
+        self.damping = np.minimum(self.damping, self.options.damping)
+        self.growth = np.full(len(self.cost), 2.0)
 
     def _retire(self, done: NDArray[np.bool_], stop: NDArray[np.int8]) -> None:
         """Leave the groups that have stopped alone from now on."""
