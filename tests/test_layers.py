@@ -21,7 +21,6 @@ HOMES = {
     "matplotlib": ("plots.py", "zoom_lens/plots.py"),
     "yaml": ("io/",),
     "cv2": ("detection/", "simulation/", "io/images.py", "distortion/remapping.py"),
-    "scipy": (),
 }
 # Rooms, a folder or a module each, from the ground up: each imports from itself and from lower levels only.
 LEVELS = (

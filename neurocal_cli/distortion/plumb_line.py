@@ -28,7 +28,7 @@ from neurocal_cli.distortion.straightness import Curves, SeenLines, bent_lines, 
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import Options, minimise
-from neurocal_cli.least_squares.normal_equations import damped_step
+from neurocal_cli.least_squares.normal_equations import damped_step, unit_diagonal
 from neurocal_cli.points import Correspondences
 
 __all__ = ["PlumbLine", "fit_plumb_line", "lines_in_pixels"]
@@ -268,6 +268,5 @@ def _check_lines(curves: Curves) -> None:
 
 def _check(H: Array) -> None:
     """Refuse lines on which the lens does not show, all through its centre or in one place."""
-    diagonal = np.sqrt(np.diagonal(H))
-    if not (diagonal > 0).all() or np.linalg.eigvalsh(H / np.outer(diagonal, diagonal))[0] < _SINGULAR:
+    if not (np.diagonal(H) > 0).all() or np.linalg.eigvalsh(unit_diagonal(H)[0])[0] < _SINGULAR:
         raise DegenerateGeometryError(_UNTOLD)

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.normal_equations import NOTHING
+from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
 __all__ = ["Quadratics", "folds_of", "inverse_or_nan", "solve_or_nan"]
 
@@ -97,8 +97,7 @@ def folds_of(n_groups: int, n_folds: int) -> NDArray[np.intp]:
 @_quietly
 def solve_or_nan(S: Array, g: Array) -> Array:
     """S^-1 g of a stack (..., f, f), (..., f); nan where S is singular to rounding."""
-    scale = 1.0 / np.sqrt(np.abs(np.diagonal(S, axis1=-2, axis2=-1)) + NOTHING)
-    scaled = S * scale[..., :, None] * scale[..., None, :]
+    scaled, scale = unit_diagonal(S)
     usable = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
     step = np.full(g.shape, np.nan)
     if g.shape[-1] == 0:

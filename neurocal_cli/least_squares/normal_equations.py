@@ -6,15 +6,21 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["NOTHING", "ROUNDING", "damped_step", "inverse_scaled", "solve_scaled"]
+__all__ = ["NOTHING", "ROUNDING", "damped_step", "inverse_scaled", "solve_scaled", "unit_diagonal"]
 
 NOTHING = 1e-300  # keeps an empty diagonal from dividing by 0
 ROUNDING = 1e-14  # a ridge that holds off a singular system and does not show in a regular one
 _ABSENT = 1e-30  # an eigenvalue this far below the diagonal is not there
 
 
+def unit_diagonal(H: Array) -> tuple[Array, Array]:
+    """Matrices (..., n, n) with rows and columns scaled to a unit diagonal, and the scales (..., n)."""
+    scale = 1.0 / np.sqrt(np.abs(np.diagonal(H, axis1=-2, axis2=-1)) + NOTHING)
+    return H * scale[..., :, None] * scale[..., None, :], scale
+
+
 def solve_scaled(H: Array, rhs: Array, ridge: float = 0.0) -> Array:
-    """Solve symmetric systems scaled to a unit diagonal; a singular one yields nan.
+    """Solve systems scaled to a unit diagonal; a singular one yields nan.
 
     Parameters
     ----------
@@ -23,8 +29,7 @@ def solve_scaled(H: Array, rhs: Array, ridge: float = 0.0) -> Array:
     ridge : float
         Added to the unit diagonal: a little (`ROUNDING`) keeps what nothing determines from being infinite.
     """
-    scale = 1.0 / np.sqrt(np.abs(np.diagonal(H, axis1=-2, axis2=-1)) + NOTHING)
-    scaled = H * scale[..., :, None] * scale[..., None, :]
+    scaled, scale = unit_diagonal(H)
     if ridge:
         scaled += ridge * np.eye(H.shape[-1])
     try:
