@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
-from neurocal_cli.least_squares.levenberg_marquardt import LevenbergMarquardt, Options, Stop, minimise
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop, minimise
 from neurocal_cli.least_squares.normal_equations import ROUNDING, damped_step, inverse_scaled, solve_scaled
 from neurocal_cli.least_squares.schur_complement import eliminate, schur_covariance, schur_step
 
 Residuals = Callable[[Array], tuple[Array, Array]]  # p (n,) -> r (m,) and dr/dp (m, n)
-TIGHT = Options(tolerance=1e-15, flat=1e-13, max_iterations=1000)
+TIGHT = DescentOptions(tolerance=1e-15, flat=1e-13, max_iterations=1000)
 
 
 class Stack:
@@ -156,7 +156,7 @@ def test_the_cost_never_rises() -> None:
 def test_a_trial_that_is_not_sensible_is_no_step() -> None:
     """The way to the minimum (1, 1) is barred beyond x = 0.5."""
     problem = Stack(rosenbrock, [[-1.2, 1.0]], sensible=lambda p: bool(p[0] < 0.5))
-    minimise(problem, Options(max_iterations=500))
+    minimise(problem, DescentOptions(max_iterations=500))
     assert problem.p[0, 0] < 0.5
     np.testing.assert_allclose(problem.cost, (1 - 0.5) ** 2, rtol=0.1)  # the valley's floor beside the bar
 
@@ -167,13 +167,13 @@ def test_what_is_no_number_is_no_step() -> None:
             return np.log(p) - 1, np.array([1 / p])
 
     problem = Stack(logarithm, [[60.0]])  # the undamped step leads to a negative number
-    assert minimise(problem, Options(damping=1e-12)).settled.all()
+    assert minimise(problem, DescentOptions(damping=1e-12)).settled.all()
     assert problem.p[0, 0] == pytest.approx(np.e, rel=1e-6)
 
 
 def test_too_few_iterations_are_told() -> None:
     problem = Stack(rosenbrock, [[-1.2, 1.0], [1.0, 1.0]])
-    outcome = minimise(problem, Options(max_iterations=3), floor=1e-26)
+    outcome = minimise(problem, DescentOptions(max_iterations=3), floor=1e-26)
     assert outcome.stop.tolist() == [Stop.LIMIT, Stop.EXACT]
     assert outcome.iterations.tolist() == [3, 0]
     assert outcome.settled.tolist() == [False, True]
@@ -181,7 +181,7 @@ def test_too_few_iterations_are_told() -> None:
 
 def test_each_group_may_have_a_limit_of_its_own() -> None:
     problem = Stack(rosenbrock, [[-1.2, 1.0]] * 3)
-    descent = LevenbergMarquardt(problem, Options(), limit=np.array([0, 2, 5]))
+    descent = LevenbergMarquardt(problem, DescentOptions(), limit=np.array([0, 2, 5]))
     descent.run()
     assert descent.outcome.iterations.tolist() == [0, 2, 5]
     np.testing.assert_array_equal(problem.p[0], [-1.2, 1.0])
@@ -205,7 +205,7 @@ def test_a_problem_that_changes_is_taken_up_again() -> None:
     goal = np.array([1.0])
     problem = Stack(lambda p: (p - goal, np.eye(1)), [[4.0]])
     descent = LevenbergMarquardt(
-        problem, Options(tolerance=0.0, flat=0.0, largest_damping=np.inf), floor=-1.0
+        problem, DescentOptions(tolerance=0.0, flat=0.0, largest_damping=np.inf), floor=-1.0
     )
     with np.errstate(all="ignore"):
         for _ in range(60):

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.geometry import Array, orthonormalised
-from neurocal_cli.least_squares.levenberg_marquardt import Options, minimise
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.normal_equations import damped_step
 from neurocal_cli.least_squares.schur_complement import schur_step
 
@@ -27,7 +27,7 @@ __all__ = ["Adjusted", "Restraint", "adjust"]
 
 # A share of 1e-9 of the cost is 2e-4 standard deviations of one of ten unknowns for a thousand equations.
 # test_refine.py holds the minimum against SciPy's.
-OPTIONS = Options(damping=1e-4, tolerance=1e-9, flat=1e-6, max_iterations=200)
+OPTIONS = DescentOptions(damping=1e-4, tolerance=1e-9, flat=1e-6, max_iterations=200)
 FLOOR = 1e-13  # rms in normalised pixels that rounding alone accounts for
 
 # Equations on the camera beside those of the points: derivatives (m, 5 + K), and what is missing (m,).

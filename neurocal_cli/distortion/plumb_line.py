@@ -27,7 +27,7 @@ from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, LinesSeen, 
 from neurocal_cli.distortion.straightness import Curves, SeenLines, bent_lines, crookedness
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.levenberg_marquardt import Options, minimise
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.normal_equations import damped_step, unit_diagonal
 from neurocal_cli.points import Correspondences
 
@@ -39,7 +39,7 @@ _CENTRE, _COEFFICIENTS = [3, 4], [5, 6]  # columns of the derivatives
 _STRENGTHS = (0.0, -0.2, -0.5, -1.0, -2.0, -4.0, -8.0, 0.3, 1.0)
 _PRIOR = 0.25  # standard deviation of the centre, in units of s
 _FEWEST_EQUATIONS = 12  # places on lines, less two for each line
-_OPTIONS = Options(tolerance=1e-10, flat=1e-10, largest_damping=1e8, max_iterations=50)
+_OPTIONS = DescentOptions(tolerance=1e-10, flat=1e-10, largest_damping=1e8, max_iterations=50)
 _FLOOR = 1e-13  # rms in units of s that rounding alone accounts for
 _SINGULAR = 1e-10  # eigenvalue of a normal matrix with unit diagonal
 _UNBENT = 1e-6  # share of the distortion that curves the lines: with less, all go through the centre

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array, nearest_rotation
-from neurocal_cli.least_squares.levenberg_marquardt import LevenbergMarquardt, Options
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 
 __all__ = ["SharedIntrinsics", "pose_from_product", "shared_intrinsics"]
 
 # Bundle adjustment goes on from here, so a gain of 1e-4 of the loss is the last worth having. Starts are
 # random, so it is the real gain that counts; test_orthogonality.py holds the share of starts that arrive.
-_OPTIONS = Options(
+_OPTIONS = DescentOptions(
     damping=1e-2, shrink=0.1, by_ratio=False, least_damping=1e-12, largest_damping=1e8,
     tolerance=1e-4, by_promise=False, flat=0.0, max_iterations=50,
 )  # fmt: skip

@@ -36,13 +36,13 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["LevenbergMarquardt", "Options", "Outcome", "Problem", "Stop", "minimise"]
+__all__ = ["DescentOptions", "LeastSquaresProblem", "LevenbergMarquardt", "Outcome", "Stop", "minimise"]
 
 Step = TypeVar("Step")
 Trial = TypeVar("Trial")
 
 
-class Problem(Protocol[Step, Trial]):
+class LeastSquaresProblem(Protocol[Step, Trial]):
     """G sums of squares as the solver sees them: linearised where they are, and moved.
 
     `active` (A,) are the groups that still descend, in ascending order; the others must stay as they are.
@@ -73,7 +73,7 @@ class Problem(Protocol[Step, Trial]):
 
 
 @dataclass(frozen=True)
-class Options:
+class DescentOptions:
     """How to descend and when to stop.
 
     Parameters
@@ -158,19 +158,19 @@ class Outcome:
 
 
 def minimise(
-    problem: Problem[Any, Any], options: Options | None = None, floor: float | Array = 0.0
+    problem: LeastSquaresProblem[Any, Any], options: DescentOptions | None = None, floor: float | Array = 0.0
 ) -> Outcome:
     """Descend in all groups until each has stopped.
 
     Parameters
     ----------
-    problem : Problem
+    problem : LeastSquaresProblem
         At its start; at the minimum afterwards.
-    options : Options, optional
+    options : DescentOptions, optional
     floor : float or (G,) array
         Cost that rounding alone accounts for.
     """
-    descent = LevenbergMarquardt(problem, options or Options(), floor)
+    descent = LevenbergMarquardt(problem, options or DescentOptions(), floor)
     descent.run()
     return descent.outcome
 
@@ -180,8 +180,8 @@ class LevenbergMarquardt:
 
     Parameters
     ----------
-    problem : Problem
-    options : Options
+    problem : LeastSquaresProblem
+    options : DescentOptions
     floor : float or (G,) array
     limit : (G,) int array, optional
         Iterations of each group, instead of the options' `max_iterations`.
@@ -198,8 +198,8 @@ class LevenbergMarquardt:
 
     def __init__(
         self,
-        problem: Problem[Any, Any],
-        options: Options,
+        problem: LeastSquaresProblem[Any, Any],
+        options: DescentOptions,
         floor: float | Array = 0.0,
         limit: NDArray[np.int64] | None = None,
     ) -> None:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.levenberg_marquardt import LevenbergMarquardt, Options, Stop
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop
 from neurocal_cli.network import Patterns, optimal_gamma
 from neurocal_cli.training.task import Task, Trained
 
@@ -62,7 +62,7 @@ class LMOptions:
 _FLOOR = 1e-13  # rms error, in units of the normalised image, that rounding alone accounts for
 # Random starts are far from the minimum: lambda falls to a tenth at most, and a step is judged by what it
 # gained. test_convergence.py and test_starts.py hold the share of starts that arrive.
-_FAR = Options(shrink=0.1, least_damping=1e-12, largest_damping=1e8, by_promise=False, flat=0.0)
+_FAR = DescentOptions(shrink=0.1, least_damping=1e-12, largest_damping=1e8, by_promise=False, flat=0.0)
 _SOFTENED = 0.1  # share of the initial damping after the stiffness is taken away
 
 
@@ -185,7 +185,7 @@ class _Networks:
             networks, damping = networks[ended], _SOFTENED * options.damping
         self.settled[networks] = True
 
-    def _descend(self, problem: _Stiffened, settings: Options, most: int) -> NDArray[np.bool_]:
+    def _descend(self, problem: _Stiffened, settings: DescentOptions, most: int) -> NDArray[np.bool_]:
         """Train some networks with one stiffness; which of them ended before the limit."""
         networks, before = problem.networks, self.iterations[problem.networks]
         self.history.append((before, networks, self.loss[networks]))

@@ -15,7 +15,7 @@ from functools import partial
 import numpy as np
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.levenberg_marquardt import Options
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.interpolation import (
     grid_axes,
@@ -146,6 +146,6 @@ def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Ri
     start = np.asarray(np.linalg.lstsq(monomials(x, powers), outputs, rcond=None)[0], dtype=float)
     constants = np.zeros(table.normal.H.shape[1] - outputs.shape[1])
     error = QuadraticError(x, table.local, table.normal, lens.variance)
-    found, shared, _ = error.minimum(_Polynomials(scale, powers, start), constants, Options())
+    found, shared, _ = error.minimum(_Polynomials(scale, powers, start), constants, DescentOptions())
     moved = table.constants.moved(shared) if len(shared) else table.constants
     return lambda to: (found.local(to), moved)

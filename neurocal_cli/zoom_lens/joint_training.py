@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.levenberg_marquardt import Options
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.network_training import followed
 from neurocal_cli.zoom_lens.parameter_networks import LensNets
@@ -29,7 +29,7 @@ _SETTLED = 0.5  # of 2 E, a quarter of a standard deviation: a round that gains 
 NEARLY = 1e-3  # share of 2 E: what gains less than this in the last round has converged
 # On one set of matrices. A step that gains less than 0.02 of 2 E, a seventh of a standard deviation, is
 # the last.
-_OPTIONS = Options(
+_OPTIONS = DescentOptions(
     damping=1e-4, shrink=0.1, least_damping=1e-12, largest_damping=1e8,
     tolerance=0.0, negligible=0.02, by_promise=False, flat=0.0, max_iterations=25,
 )  # fmt: skip

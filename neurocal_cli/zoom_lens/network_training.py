@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.levenberg_marquardt import LevenbergMarquardt, Options
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 from neurocal_cli.zoom_lens.mlfn import Topology, respond_with_jacobian
 
 __all__ = ["Schedule", "Trained", "followed", "prior_precision", "sparse_controls", "train"]
@@ -27,7 +27,7 @@ _MOST = 1e4  # precision of a prior
 _LEAST, _LEAST_SPARSE, _LEAST_TILT = 0.03, 1.0, 1.0
 _ENOUGH_VALUES = 4
 # A network never stops by itself: its priors follow the data until the schedule ends.
-_OPTIONS = Options(
+_OPTIONS = DescentOptions(
     damping=1e-2, shrink=0.2, least_damping=1e-10, largest_damping=np.inf,
     tolerance=0.0, flat=0.0, max_iterations=1_000_000,
 )  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.levenberg_marquardt import Options, minimise
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.normal_equations import ROUNDING, damped_step, solve_scaled
 from neurocal_cli.zoom_lens.setting_normals import Normal
 
@@ -92,7 +92,7 @@ class QuadraticError:
         rhs[P:] = pull[:, L:].sum(axis=0)
         return gauss_newton(J, self.normal.H / self.variance, prior), rhs
 
-    def minimum(self, model: Model, shared: Array, options: Options) -> tuple[Model, Array, float]:
+    def minimum(self, model: Model, shared: Array, options: DescentOptions) -> tuple[Model, Array, float]:
         """The model and the constants' step at the minimum, and 2 E there."""
         problem = _Problem(self, model, shared)
         minimise(problem, options)

@@ -17,7 +17,7 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion_models import coefficient_names
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.levenberg_marquardt import Options, minimise
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.schur_complement import schur_covariance, schur_step
 from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
@@ -26,7 +26,9 @@ from neurocal_cli.zoom_lens.settings import LensPoints, describe
 
 __all__ = ["StaticFit", "Tables", "calibrate_each", "common_tables", "fit_local", "local_covariance"]
 
-_OPTIONS = Options(damping=1e-3, largest_damping=1e12)  # the static calibrations are near, not at the minimum
+_OPTIONS = DescentOptions(
+    damping=1e-3, largest_damping=1e12
+)  # the static calibrations are near, not at the minimum
 
 
 @dataclass(frozen=True, eq=False)
