@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_calibration import CAMERA, made_calibration, made_points, pose_of, two_planes
+from support.made_calibration import CAMERA, made_calibration, made_points, pose_of, two_planes
 
 from neurocal_cli import Correspondences, NeurocalError, evaluate_camera
 from neurocal_cli.camera.pinhole import project

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid, table_1
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from test_uncertainty import noisy, whitener
+from support.noise import noisy, whitener
+from support.scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid, table_1
 
 from neurocal_cli import Correspondences, Intrinsics, Pose
 from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.problem import Known
+from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion_models import Lens, distort
@@ -34,10 +34,10 @@ class Seen:
     t: Array
 
     @classmethod
-    def of(cls, views: Views, known: Known, state: CameraState) -> Seen:
+    def of(cls, problem: Problem, state: CameraState) -> Seen:
         """Take a normalised state out of its units."""
-        A = known.matrix(state.entries[0], views)
-        return cls(A, Lens(state.lens, state.k), state.R, translations(views, state))
+        A = problem.matrix(state.entries[0])
+        return cls(A, Lens(state.lens, state.k), state.R, translations(problem.views, state))
 
     def predict(self, world: Array, view: NDArray[np.intp]) -> tuple[Array, NDArray[np.bool_]]:
         """Pixels (N, 2) of world points through the pose of each one's view, and which lie in front."""

@@ -49,7 +49,8 @@ class Remapping:
     def __init__(self, step: Undistortion, size: tuple[int, int], interpolation: str = "cubic") -> None:
         if max(size) > _LONGEST:
             raise InputError(
-                f"images of {size[0]} x {size[1]} px cannot be corrected: a side has at most {_LONGEST} px; "
+                f"images of {size[0]} x {size[1]} px cannot be undistorted: a side has at most {_LONGEST} "
+                "px; "
                 "cut them into parts"
             )
         self.step, self.size = step, size
@@ -73,8 +74,8 @@ class Remapping:
         height, width = image.shape[:2]
         if (width, height) != self.size:
             raise InputError(
-                f"has {width} x {height} px, the camera's images have {self.size[0]} x {self.size[1]}; give "
-                "images as the camera took them"
+                f"has {width} x {height} px, but the camera is for {self.size[0]} x {self.size[1]} px; give "
+                "original images of this camera"
             )
         whole: NDArray[Any] = np.ascontiguousarray(image)
         corrected = np.empty_like(image, order="C")
