@@ -14,7 +14,7 @@ from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.points import Correspondences
 from neurocal_cli.zoom_lens.alternating_training import train_alternating
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.joint_training import JointLearner, loosened, train_joint
+from neurocal_cli.zoom_lens.joint_training import JointLearner, train_joint
 from neurocal_cli.zoom_lens.mlfn import Topology, respond, respond_with_jacobian
 from neurocal_cli.zoom_lens.network_training import Schedule, train
 from neurocal_cli.zoom_lens.parameter_networks import (
@@ -26,6 +26,7 @@ from neurocal_cli.zoom_lens.parameter_networks import (
     outputs_to_local,
     to_scale,
 )
+from neurocal_cli.zoom_lens.quadratic_error import loosened
 from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData
 from neurocal_cli.zoom_lens.settings import LensPoints, scaled_controls
 from neurocal_cli.zoom_lens.static_calibration import (

@@ -1,17 +1,17 @@
-"""The last step of training: the true pixel error (3), with exact rotations.
+"""Bundle adjustment: the reprojection error (3), with exact rotations, at its minimum.
 
     E = sum_k sum_i |m_ki - pi(A (R_k M_i + t_k))|^2
 
-over the free entries of A and the lens's coefficients, shared by all views, and one pose for each
-view. Rotations move by R -> exp(omega) R, so they stay rotations. Levenberg-Marquardt; the poses
-are eliminated view by view (Schur complement), so the cost grows linearly with the views.
+over the free entries of A and the distortion coefficients, shared by all views, and one pose for each
+view. Rotations move by R -> exp(omega) R, so they stay rotations. `least_squares` descends: views that
+share unknowns are one group, whose poses are eliminated view by view (Schur complement), so the cost
+grows linearly with the views; views that share nothing are a group each.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,15 +19,16 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.geometry import Array, orthonormalised
-from neurocal_cli.least_squares.schur_complement import schur_step, solve_scaled
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
+from neurocal_cli.least_squares.normal_equations import damped_step
+from neurocal_cli.least_squares.schur_complement import schur_step
 
 __all__ = ["Adjusted", "Restraint", "adjust"]
 
-_TOLERANCE = 1e-9  # a step that would lower E by a smaller share is the last
-_FLOOR = 1e-13  # rms in normalised pixels that rounding alone accounts for
-_LARGEST_DAMPING = 1e10
-_FLAT_SHARE = 1e-6  # a rejected step that promised less than this share: the bottom
-
+# A share of 1e-9 of the cost is 2e-4 standard deviations of one of ten unknowns for a thousand equations.
+# test_refine.py holds the minimum against SciPy's.
+OPTIONS = DescentOptions(damping=1e-4, tolerance=1e-9, flat=1e-6, max_iterations=200)
+FLOOR = 1e-13  # rms in normalised pixels that rounding alone accounts for
 
 # Equations on the camera beside those of the points: derivatives (m, 5 + K), and what is missing (m,).
 Restraint = Callable[[CameraState], tuple[Array, Array]]
@@ -41,7 +42,7 @@ class Adjusted:
     ----------
     state : CameraState
     normal : (V, 12 + K, 12 + K) array
-        From `pixel_error.normal_blocks`.
+        From `reprojection.normal_blocks`.
     cost : (V,) array
         Sum of squared (whitened) residuals of each view.
     iterations : int
@@ -66,10 +67,10 @@ def adjust(
     start: CameraState,
     free: NDArray[np.bool_],
     free_pose: bool = True,
-    max_iterations: int = 200,
+    max_iterations: int = OPTIONS.max_iterations,
     restraint: Restraint | None = None,
 ) -> Adjusted:
-    """Minimise the pixel error (3) from a start that is already near.
+    """Minimise the reprojection error (3) from a start that is already near.
 
     Parameters
     ----------
@@ -77,7 +78,7 @@ def adjust(
     start : CameraState
         With all points in front of the camera.
     free : (5 + K,) bool array
-        Which entries of A and coefficients of the lens move. With none free, or with a camera for
+        Which entries of A and distortion coefficients move. With none free, or with a camera for
         each view, the views are independent problems, solved side by side, each with its own damping.
     free_pose : bool
         Whether the poses move.
@@ -86,20 +87,25 @@ def adjust(
         Of a camera that is shared: squares to be added to those of the pixels; the result's `normal` and
         `cost` are of the pixels alone.
     """
-    descent = _Descent(batches, start, free, free_pose, restraint)
-    iterations = 0
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        while iterations < max_iterations and not descent.done.all():
-            descent.step()
-            iterations += 1
-    state, normal = replace(descent.state, R=orthonormalised(descent.state.R)), descent.normal
+    problem = _Reprojection(batches, start, free, free_pose, restraint)
+    options = replace(OPTIONS, max_iterations=max_iterations)
+    outcome = minimise(problem, options, problem.by_group(2.0 * FLOOR**2 * batches.counts.astype(float)))
+    state, normal = replace(problem.state, R=orthonormalised(problem.state.R)), problem.normal
     if restraint is not None:
-        normal, _ = normal_blocks(batches, descent.state)
-    return Adjusted(state, normal, normal[:, -1, -1].copy(), iterations, descent.settled)
+        normal, _ = normal_blocks(batches, problem.state)
+    iterations = int(outcome.iterations.max())
+    return Adjusted(state, normal, normal[:, -1, -1].copy(), iterations, outcome.settled)
 
 
-class _Descent:
-    """Levenberg-Marquardt over groups: all views together when they share what is sought, else one each."""
+_Step = tuple[Array, Array]  # of the cameras (1 or V, 5 + K) and of the poses (V, 6)
+_Trial = tuple[CameraState, Array]  # a state and its normal matrices
+
+
+class _Reprojection:
+    """The reprojection error as `least_squares` sees it.
+
+    All views together are one group when they share what is sought; else each view is one.
+    """
 
     def __init__(
         self,
@@ -110,18 +116,63 @@ class _Descent:
         restraint: Restraint | None,
     ) -> None:
         self.batches, self.state, self.restraint = batches, start, restraint
-        # Columns of the free camera parameters, and their places among all of them.
+        # Columns of the camera's parameters, and the places of the free ones among them.
         self.camera = camera_columns(start.k.shape[-1])
         self.free, self.free_pose = np.flatnonzero(free), free_pose
         self.together = len(start.entries) == 1 and bool(self.free.size) and batches.n_views > 1
-        groups = 1 if self.together else batches.n_views
         self.normal, _ = self._blocks(start)
-        self.cost = self._by_group(self.normal[:, -1, -1])
-        self.damping = np.full(groups, 1e-4)
-        self.growth = np.full(groups, 2.0)
-        self.floor = self._by_group(batches.counts * 2.0 * _FLOOR**2)
-        self.settled = self.cost <= self.floor
-        self.done = self.settled.copy()
+
+    @property
+    def cost(self) -> Array:
+        """Sum of squares of each group."""
+        return self.by_group(self.normal[:, -1, -1])
+
+    def by_group(self, by_view: Array) -> Array:
+        """Sums over the views of each group."""
+        return by_view.sum(keepdims=True) if self.together else by_view
+
+    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
+        """Steps of the cameras and the poses, and the gains that they promise."""
+        if not self.together:
+            return self._solve_apart(self.normal, damping, active)
+        if not self.free_pose:
+            (by_camera, _), promised = self._solve_apart(
+                self.normal.sum(axis=0, keepdims=True), damping, active
+            )
+            return (by_camera, np.zeros((self.batches.n_views, 6))), promised
+        return self._solve_together(float(damping[0]))
+
+    def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
+        """The state after a step, with all points in front of their cameras and none folded back."""
+        trial = self.state.moved(*step)
+        normal, by_view = self._blocks(trial)
+        sensible = np.array([by_view.all()]) if self.together else by_view
+        sensible &= (trial.entries[:, [0, 2]] > 0).all(axis=1)
+        cost = self.by_group(normal[:, -1, -1])
+        if len(active) < len(cost):
+            cost, sensible = cost[active], sensible[active]
+        return (trial, normal), cost, sensible
+
+    def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
+        """Take over the groups that became better."""
+        if not better.any():
+            return
+        state, normal = trial
+        if better.all() and (self.together or len(active) == len(self.normal)):
+            self.state, self.normal = state, normal
+            return
+        views, old = active[better], self.state
+        R, t = old.R.copy(), old.t.copy()
+        R[views], t[views] = state.R[views], state.t[views]
+        entries, k = old.entries, old.k
+        if len(entries) > 1:
+            entries = entries.copy()
+            entries[views] = state.entries[views]
+        if k.ndim > 1:
+            k = k.copy()
+            k[views] = state.k[views]
+        self.state = replace(old, entries=entries, R=R, t=t, k=k)
+        self.normal[views] = normal[views]
 
     def _blocks(self, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
         normal, sensible = normal_blocks(self.batches, state)
@@ -132,74 +183,22 @@ class _Descent:
             normal[0] += rows.T @ rows  # of any view: the camera is that of all
         return normal, sensible
 
-    def _by_group(self, by_view: NDArray[Any]) -> Array:
-        return by_view.sum(keepdims=True) if self.together else by_view
-
-    def step(self) -> None:
-        """One step of every group that is not done; the others stay."""
-        by_camera, by_pose, predicted = self._solve()
-        trial = self.state.moved(by_camera, by_pose)
-        normal, by_view = self._blocks(trial)
-        sensible = by_view.all(keepdims=True) if self.together else by_view
-        sensible = sensible & (trial.entries[:, [0, 2]] > 0).all(axis=1)
-        after = self._by_group(normal[:, -1, -1])
-        better = sensible & (after < self.cost) & ~self.done
-        small = predicted < _TOLERANCE * self.cost
-        stuck = ~better & (self.damping > _LARGEST_DAMPING)
-        bottom = ~better & sensible & (predicted < _FLAT_SHARE * self.cost)
-        ratio = (self.cost - after) / predicted
-        self._accept(trial, normal, after, better)
-        settled = (better & small) | bottom | (self.cost <= self.floor)
-        self.settled |= settled & ~self.done
-        self.done |= settled | stuck
-        gained = np.minimum(2 * ratio - 1, 2.0)
-        shrink = np.maximum(0.01, 1 - gained * gained * gained)
-        self.damping = np.maximum(self.damping * np.where(better, shrink, self.growth), 1e-14)
-        self.growth = np.where(better, 2.0, 2 * self.growth)
-
-    def _accept(self, trial: CameraState, normal: Array, cost: Array, better: NDArray[np.bool_]) -> None:
-        if better.all():
-            self.state, self.normal, self.cost = trial, normal, cost
-        elif better.any():
-            keep, old = better[:, None, None], self.state
-            entries = old.entries
-            if len(entries) > 1:
-                entries = np.where(better[:, None], trial.entries, entries)
-            R = np.where(keep, trial.R, old.R)
-            t = np.where(better[:, None], trial.t, old.t)
-            self.state = replace(old, entries=entries, R=R, t=t)
-            self.normal = np.where(keep, normal, self.normal)
-            self.cost = np.where(better, cost, self.cost)
-
-    def _solve(self) -> tuple[Array, Array, Array]:
-        """Steps of the camera (1 or V, 5 + K) and poses (V, 6), and what each group should gain."""
-        if not self.together:
-            return self._solve_apart(self.normal)
-        if not self.free_pose:
-            by_camera, _, predicted = self._solve_apart(self.normal.sum(axis=0, keepdims=True))
-            return by_camera, np.zeros((self.batches.n_views, 6)), predicted
-        return self._solve_together()
-
-    def _solve_apart(self, N: Array) -> tuple[Array, Array, Array]:
-        """Each group has its own unknowns."""
+    def _solve_apart(self, N: Array, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
+        """Each group has its own unknowns; those that have ended stay where they are."""
         pose = np.arange(POSE.start, POSE.stop) if self.free_pose else np.arange(0)
         columns = np.concatenate([self.camera[self.free], pose])
-        H, g = N[:, columns[:, None], columns], N[:, columns, -1]
-        ridge = self.damping[:, None] * (np.diagonal(H, axis1=1, axis2=2) + 1e-300)
-        H[:, range(len(columns)), range(len(columns))] += ridge
-        step = solve_scaled(H, g[..., None])[..., 0]
-        predicted = (step * (g + ridge * step)).sum(axis=1)
-        step[self.done] = 0.0
+        moving = N if len(active) == len(N) else N[active]
+        H, g = moving[:, columns[:, None], columns], moving[:, columns, -1]
+        step, promised = damped_step(H, g, damping)
         whole = np.zeros((len(N), N.shape[1]))
-        whole[:, columns] = step
+        whole[active[:, None], columns] = step
         by_camera = whole[:, self.camera] if self.free.size else np.zeros((1, len(self.camera)))
-        return by_camera, whole[:, POSE], predicted
+        return (by_camera, whole[:, POSE]), promised
 
-    def _solve_together(self) -> tuple[Array, Array, Array]:
+    def _solve_together(self, damping: float) -> tuple[_Step, Array]:
         """One A, a pose for each view: the poses are eliminated by the Schur complement."""
         own = np.arange(POSE.start, POSE.stop)
-        damping = float(self.damping[0])
-        step, by_pose, gain = schur_step(self.normal, self.camera[self.free], own, damping)
+        step, by_pose, promised = schur_step(self.normal, self.camera[self.free], own, damping)
         by_camera = np.zeros((1, len(self.camera)))
         by_camera[0, self.free] = step
-        return by_camera, by_pose, np.array([gain])
+        return (by_camera, by_pose), np.array([promised])

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.schur_complement import inverse_scaled, schur_covariance
+from neurocal_cli.least_squares.normal_equations import inverse_scaled
+from neurocal_cli.least_squares.schur_complement import schur_covariance
 
 __all__ = ["Covariance", "covariance"]
 
@@ -26,7 +27,7 @@ class Covariance:
     Attributes
     ----------
     entries : (f, f) array
-        Of A's free entries and the lens's free coefficients.
+        Of A's free entries and the free distortion coefficients.
     poses : (V, 6, 6) array
         Of omega and tau of each view; zero where poses are given.
     smallest : float
@@ -41,19 +42,19 @@ class Covariance:
 def covariance(
     normal: Array, free: NDArray[np.bool_], free_pose: bool, n_residuals: float, shared: Array | None = None
 ) -> Covariance:
-    """Invert the normal matrix of a adjusted calibration.
+    """Invert the normal matrix of an adjusted calibration.
 
     Parameters
     ----------
     normal : (V, 12 + K, 12 + K) array
         From `adjust`.
     free : (5 + K,) bool array
-        Of A's entries and the lens's coefficients.
+        Of A's entries and the distortion coefficients.
     free_pose : bool
     n_residuals : int
-        Number of equations: two for most points; see `directions`.
+        Number of equations: two for most points; see `measured_directions`.
     shared : (f, f) array, optional
-        Covariance of what is free of A and the lens, where it comes from elsewhere; the poses' follows.
+        Covariance of what is free of A and the distortion, where it comes from elsewhere; the poses' follows.
     """
     f = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     V = len(normal)

@@ -10,17 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.cross_validation import (
-    Quadratics,
-    inverse,
-    moves_without_each,
-    reduced,
-    without_each,
-)
+from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
 
 __all__ = ["find_outlier_view", "free_networks", "seen_from_behind"]
 
@@ -72,15 +67,15 @@ def _largest_move(q: Quadratics, variance: float) -> float:
     """Most standard deviations by which leaving one view out moves a shared parameter."""
     S = q.S.sum(axis=0)
     with np.errstate(invalid="ignore"):
-        std = np.sqrt(np.abs(np.diagonal(inverse(S))) * variance)
-        moves = np.abs(moves_without_each(q)) / std
+        std = np.sqrt(np.abs(np.diagonal(inverse_or_nan(S))) * variance)
+        moves = np.abs(q.moves_without_each()) / std
     return float(np.where(np.isfinite(moves), moves, np.inf).max(initial=0.0))
 
 
 def _contradictions(q: Quadratics, own: Array, conditions: NDArray[np.intp]) -> Array:
     """(V,) squared error that each view would spare with a camera of its own, by condition."""
     with np.errstate(invalid="ignore"):
-        spared = q.cost.sum() - without_each(q) - own
+        spared = q.cost.sum() - q.cost_without_each() - own
     return np.asarray(np.where(np.isfinite(spared), spared, 0.0) / conditions)
 
 

@@ -1,14 +1,14 @@
-"""Plumb-line lens calibration: the lens that makes the images of straight lines straight (Brown 1971).
+"""Plumb-line calibration: the distortion that makes the images of straight lines straight (Brown 1971).
 
-No camera and no poses are needed. The lens is radial, k1 and k2 about a centre that is estimated as
-well, in pixels of a fixed scale s:
+No camera and no poses are needed. The distortion is radial, k1 and k2 about a centre that is estimated
+as well, in pixels of a fixed scale s:
 
     m = c + s distort(x; k1, k2),  x on straight lines
 
 Collinearity survives any homography, so lines tell nothing of the scale, the skew and the tilt of the
-ideal image, which stay as the form of the lens leaves them; the camera that is calibrated from the
-corrected points takes them up. Where hardly anything bends, nothing tells the centre either: it is held
-near the middle of the image by a prior with a standard deviation of a quarter of the image's size.
+undistorted image; the camera that is calibrated from the corrected points takes them up. Where hardly
+anything is distorted, nothing tells the centre either: a prior holds it near the middle of the image,
+with a standard deviation of a quarter of the image's size.
 """
 
 from __future__ import annotations
@@ -27,21 +27,22 @@ from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, LinesSeen, 
 from neurocal_cli.distortion.straightness import Curves, SeenLines, bent_lines, crookedness
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
+from neurocal_cli.least_squares.normal_equations import damped_step, unit_diagonal
 from neurocal_cli.points import Correspondences
 
 __all__ = ["PlumbLine", "fit_plumb_line", "lines_in_pixels"]
 
 _MODEL = "k1k2"
 _CENTRE, _COEFFICIENTS = [3, 4], [5, 6]  # columns of the derivatives
-# k1 of lenses to begin with, in units of s: the last barrel is a fisheye's of half the image's width.
+# k1 to begin with, in units of s; the strongest barrel is a fisheye whose circle is half the image wide.
 _STRENGTHS = (0.0, -0.2, -0.5, -1.0, -2.0, -4.0, -8.0, 0.3, 1.0)
 _PRIOR = 0.25  # standard deviation of the centre, in units of s
 _FEWEST_EQUATIONS = 12  # places on lines, less two for each line
-_ITERATIONS = 50
-_TOLERANCE = 1e-10
-_LARGEST_DAMPING = 1e8
+_OPTIONS = DescentOptions(tolerance=1e-10, flat=1e-10, largest_damping=1e8, max_iterations=50)
+_FLOOR = 1e-13  # rms in units of s that rounding alone accounts for
 _SINGULAR = 1e-10  # eigenvalue of a normal matrix with unit diagonal
-_UNBENT = 1e-6  # share of what a lens moves points by that bends their lines: all go through the centre
+_UNBENT = 1e-6  # share of the distortion that curves the lines: with less, all go through the centre
 _UNTOLD = (
     "the straight lines do not determine the distortion; give points on lines all over the image, or use "
     "--distortion none"
@@ -176,7 +177,7 @@ def _frame(points: Correspondences) -> tuple[Array, float]:
 
 
 def _fit(curves: Curves, free: NDArray[np.intp], spare: int) -> Curves:
-    """Least squares over some columns of the derivatives, by Levenberg-Marquardt.
+    """Least squares over some columns of the derivatives.
 
     Parameters
     ----------
@@ -192,30 +193,65 @@ def _fit(curves: Curves, free: NDArray[np.intp], spare: int) -> Curves:
     DegenerateGeometryError
         The lines do not tell what is to move.
     """
-    prior = np.zeros(5 + len(curves.lens.coefficients))
-    prior[_CENTRE] = _PRIOR**-2
-    r, J, _ = curves.derivatives()
-    cost, damping = float(r @ r), 1e-4
-    for _ in range(_ITERATIONS):
-        # The prior counts as one more residual of the noise's size.
-        weight = prior * cost / spare
-        before = np.concatenate([curves.entries, curves.lens.coefficients])
-        H = (J.T @ J + np.diag(weight))[free[:, None], free]
-        g = (J.T @ r - weight * before)[free]
+    problem = _Crookedness(curves, free, spare)
+    minimise(problem, _OPTIONS, len(curves.feet) * _FLOOR**2)
+    return problem.curves
+
+
+class _Crookedness:
+    """The distances from straight lines as `least_squares` sees them: one group.
+
+    The centre's prior counts as one more residual of the noise's size, and the noise is what is left of
+    the distances. With the noise eliminated from the likelihood of r and c, whose logarithm is
+    -(n log r.r + |c|^2 / prior^2) / 2, what is to be as small as possible is
+
+        E = r.r exp(|c|^2 / (n prior^2))
+
+    and its slope that of r.r + |c|^2 (r.r / n) / prior^2, but for the factor.
+    """
+
+    def __init__(self, curves: Curves, free: NDArray[np.intp], spare: int) -> None:
+        self.free = free
+        self.share = np.zeros(5 + len(curves.lens.coefficients))
+        self.share[_CENTRE] = _PRIOR**-2 / spare
+        self.curves = curves
+        self.r, self.J, _ = curves.derivatives()
+
+    @property
+    def cost(self) -> Array:
+        """(1,) E."""
+        return self._cost(self.curves)
+
+    def _values(self, curves: Curves) -> Array:
+        return np.concatenate([curves.entries, curves.lens.coefficients])
+
+    def _factor(self, curves: Curves) -> float:
+        return float(np.exp(self.share @ self._values(curves) ** 2))
+
+    def _cost(self, curves: Curves) -> Array:
+        return np.array([(curves.errors() ** 2).sum() * self._factor(curves)])
+
+    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Damped step of what moves, and what it promises."""
+        weight, free = self.share * (self.r @ self.r), self.free
+        H = (self.J.T @ self.J + np.diag(weight))[free[:, None], free]
+        g = (self.J.T @ self.r - weight * self._values(self.curves))[free]
         _check(H)
-        step = np.zeros(len(before))
-        step[free] = np.linalg.solve(H + damping * np.diag(np.diag(H)), g)
-        trial = curves.seen_through((before + step)[:5], (before + step)[5:]).settled()
-        after = float((trial.errors() ** 2).sum()) if trial.sensible else np.inf
-        gain = cost - after + weight @ (before**2 - (before + step) ** 2)
-        if gain > 0:
-            curves, cost, damping = trial, after, max(0.1 * damping, 1e-12)
-            r, J, _ = curves.derivatives()
-        else:
-            damping *= 10
-        if abs(gain) <= _TOLERANCE * cost or damping > _LARGEST_DAMPING or cost < 1e-26 * len(r):
-            break
-    return curves
+        step, promised = damped_step(H[None], g[None], damping)
+        return step[0], promised * self._factor(self.curves)
+
+    def move(self, step: Array, active: NDArray[np.intp]) -> tuple[Curves, Array, NDArray[np.bool_]]:
+        """The lines through another lens, all of them straight and none folded back."""
+        values = self._values(self.curves)
+        values[self.free] += step
+        trial = self.curves.seen_through(values[:5], values[5:]).settled()
+        return trial, self._cost(trial), np.array([trial.sensible])
+
+    def accept(self, trial: Curves, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
+        """Take it over."""
+        if better[0]:
+            self.curves = trial
+            self.r, self.J, _ = trial.derivatives()
 
 
 def _check_lines(curves: Curves) -> None:
@@ -232,6 +268,5 @@ def _check_lines(curves: Curves) -> None:
 
 def _check(H: Array) -> None:
     """Refuse lines on which the lens does not show, all through its centre or in one place."""
-    diagonal = np.sqrt(np.diagonal(H))
-    if not (diagonal > 0).all() or np.linalg.eigvalsh(H / np.outer(diagonal, diagonal))[0] < _SINGULAR:
+    if not (np.diagonal(H) > 0).all() or np.linalg.eigvalsh(unit_diagonal(H)[0])[0] < _SINGULAR:
         raise DegenerateGeometryError(_UNTOLD)

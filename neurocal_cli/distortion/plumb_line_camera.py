@@ -1,26 +1,27 @@
-"""A lens from straight lines, and a camera with poses from everything else: the last step of plumb-line.
+"""Newton's method on two sets of equations that are not the slope of one cost, so no descent does it.
 
-Once the network has found the camera from corrected points, the lens is written in the camera's own
-terms, coefficients k of `MODEL` in coordinates that A normalises, and both are made to agree on the
-pixels as they were seen:
+The distortion comes from straight lines, and camera and poses from everything else: the last step of
+plumb-line. Once the network has found the camera from corrected points, the distortion is written in the
+camera's own terms, coefficients k of `MODEL` in coordinates that A normalises, and both are made to agree
+on the pixels as they were seen:
 
-    lines   sum r dr/dk = 0      the lens, given A: no pose and no shape of the target enters
-    points  sum e . J = 0        camera and poses through a fixed lens: e are the errors of the pixels, J
-                                 the derivatives of the pixels by the poses and by the A that moves the
-                                 corrected points, while the lens stays where it is in the image
+    lines   sum r dr/dk = 0      the distortion, given A: no pose and no shape of the target enters
+    points  sum e . J = 0        camera and poses: e are the errors of the pixels, J the derivatives of the
+                                 pixels by the poses and by the A that moves the corrected points, while
+                                 the distortion stays where it is in the image
 
-with r and its derivatives from `straightness`. Newton's method, with both sets of equations by A and k as
-they are meant, A moving its lens along, and the poses eliminated.
+with r and its derivatives from `straightness`. Both sets of equations are solved for A and k, A moving its
+distortion along, with the poses eliminated.
 
 Covariance, to first order and in whitened pixels of noise. The lines' equations H_kk dk + H_kA dA = s
 have the variance M = sum_i G_i^T G_i, with G_i = sum nu dr/dk over the lines through a point i. The points'
 equations, reduced to A, are Q_AA dA + Q_Ak dk = g, and g has the variance S = J^T J, reduced. What A and
-the poses move through a fixed lens leaves straight lines straight, so s and g are independent, and with
+the poses move through a fixed distortion leaves straight lines straight, so s and g are independent, and with
 B = [[Q_AA, Q_Ak], [H_kA, H_kk]],
 
     cov(A, k) = B^-1 [[S, 0], [0, M]] B^-T.
 
-The poses' follows as in `uncertainty`. The noise is that of each set's own residuals.
+The poses' follows as in `bundle_adjustment.covariance`. The noise is that of each set's own residuals.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ from neurocal_cli.distortion.plumb_line import PlumbLine, lines_in_pixels
 from neurocal_cli.distortion.straightness import CAMERA, Curves, bent_lines
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.points import Correspondences
 
 __all__ = ["MODEL", "lens_and_camera"]
@@ -55,13 +57,13 @@ MODEL = "k1k2p1p2"
 _ITERATIONS = 50
 _TOLERANCE = 1e-10  # step in normalised units that is none any more
 _HALVINGS = 8
-_SINGULAR = 1e-13
+_SINGULAR = 1e-13  # reciprocal condition below which a scaled matrix is rounding
 _K = len(coefficient_names(MODEL))
 _BY_K = CAMERA + np.arange(_K)  # columns of the lines' derivatives
 
 
 def lens_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondences) -> Solution:
-    """Make lens and camera agree, from the result of the corrected points.
+    """Make distortion and camera agree, from the result of the corrected points.
 
     Parameters
     ----------
@@ -170,7 +172,7 @@ class _Together:
         return np.concatenate([points.by_own, by_k @ J[:, self.columns]]), by_k @ r
 
     def _moved(self, state: CameraState, points: _PointEquations, step: Array) -> tuple[CameraState, float]:
-        """Take the step, or as much of it as keeps the points in front and the lens fit_monotonic."""
+        """Take the step, or as much of it as keeps the points in front and the distortion monotonic."""
         by_camera = np.zeros((1, 5 + _K))
         by_camera[0, self.columns] = step
         by_pose = np.zeros((self.problem.views.n_views, 6))
@@ -260,12 +262,7 @@ def _solve(matrix: Array, right: Array) -> Array:
     DegenerateGeometryError
         A singular matrix.
     """
-    diagonal = np.abs(np.diagonal(matrix, axis1=-2, axis2=-1))
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
-    scaled = matrix * scale[..., :, None] * scale[..., None, :]
-    try:
-        if not np.isfinite(scaled).all() or np.linalg.cond(scaled).max() > 1 / _SINGULAR:
-            raise np.linalg.LinAlgError
-        return scale[..., :, None] * np.linalg.solve(scaled, scale[..., :, None] * right)
-    except np.linalg.LinAlgError:
-        raise DegenerateGeometryError(_UNTOLD) from None
+    scaled, _ = unit_diagonal(matrix)
+    if not np.isfinite(scaled).all() or np.linalg.cond(scaled).max(initial=0.0) > 1 / _SINGULAR:
+        raise DegenerateGeometryError(_UNTOLD)
+    return solve_scaled(matrix, right)

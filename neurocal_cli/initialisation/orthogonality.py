@@ -15,11 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 
 __all__ = ["SharedIntrinsics", "pose_from_product", "shared_intrinsics"]
 
-_MAX_ITERATIONS = 50
-_TOLERANCE = 1e-4  # stage 3 goes on from here
+# Bundle adjustment goes on from here, so a gain of 1e-4 of the loss is the last worth having. Starts are
+# random, so it is the real gain that counts; test_orthogonality.py holds the share of starts that arrive.
+_OPTIONS = DescentOptions(
+    damping=1e-2, shrink=0.1, by_ratio=False, least_damping=1e-12, largest_damping=1e8,
+    tolerance=1e-4, by_promise=False, flat=0.0, max_iterations=50,
+)  # fmt: skip
+_FLOOR = 1e-28  # loss that rounding alone accounts for
+_LONGEST = 2.0  # step of any entry; in the logarithm a factor of 7
 _ENOUGH = 3  # starts that have ended at the same, lowest loss
 
 
@@ -72,13 +79,12 @@ def shared_intrinsics(
     conditions = _Conditions(solid, flat, free)
     p = np.where(free, rng.uniform(-1, 1, (starts, 5)), _to_log(given))
     p[:, [0, 2]] = np.where(free[[0, 2]], np.log(np.abs(p[:, [0, 2]]) + 1e-3), p[:, [0, 2]])
-    p, loss = _descend(conditions, p)
+    p, loss = _minimum(conditions, p)
     order = np.argsort(loss, kind="stable")
     p, loss = p[order], loss[order]
     entries = p.copy()
     entries[:, [0, 2]] = np.exp(p[:, [0, 2]])
-    tie = 1e-3 * loss[0] + 1e-16
-    agreed = int((np.abs(loss - loss[0]) <= tie).sum())
+    agreed = int((np.abs(loss - loss[0]) <= _tie(loss[0])).sum())
     distinct = [0]
     for n in range(1, starts):
         gap = np.abs(p[n] - p[distinct]).max(axis=1).min()
@@ -145,34 +151,63 @@ def _through_inverse(p: Array, h: Array) -> tuple[Array, Array]:
     return y, dy
 
 
-def _descend(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
-    """Levenberg-Marquardt on B parameter sets at once; parameters (B, 5) and loss (B,)."""
-    f = conditions.free
-    damping, growth = np.full(len(p), 1e-2), np.full(len(p), 2.0)
-    done = np.zeros(len(p), dtype=bool)
+_Trial = tuple[Array, Array, Array]  # parameters, their residuals and derivatives
+
+
+class _Starts:
+    """The conditions as `least_squares` sees them: each of B parameter sets (B, 5) is a group."""
+
+    def __init__(self, conditions: _Conditions, p: Array) -> None:
+        self.conditions, self.p = conditions, p.copy()
+        self.r, self.J = conditions(self.p)
+        self.loss = 0.5 * (self.r * self.r).sum(axis=1)
+
+    @property
+    def cost(self) -> Array:
+        """(B,) half the sum of squared conditions."""
+        return self.loss
+
+    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Steps damped by the mean of the diagonal, none too long, and what they promise."""
+        J, f = self.J[active], len(self.conditions.free)
+        H = np.swapaxes(J, 1, 2) @ J
+        g = -(np.swapaxes(J, 1, 2) @ self.r[active][..., None])[..., 0]
+        ridge = damping * (np.trace(H, axis1=1, axis2=2) / f + 1e-12)
+        step = np.linalg.solve(H + ridge[:, None, None] * np.eye(f), g[..., None])[..., 0]
+        step = np.minimum(np.maximum(step, -_LONGEST), _LONGEST)
+        return step, (step * (g - 0.5 * (H @ step[..., None])[..., 0])).sum(axis=1)
+
+    def move(self, step: Array, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
+        """The parameters after a step; all of them are cameras."""
+        trial = self.p[active]
+        trial[:, self.conditions.free] += step
+        r, J = self.conditions(trial)
+        return (trial, r, J), 0.5 * (r * r).sum(axis=1), np.ones(len(trial), dtype=bool)
+
+    def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
+        """Take over the starts that became better."""
+        kept = active[better]
+        self.p[kept], self.r[kept], self.J[kept] = (values[better] for values in trial)
+        self.loss[kept] = 0.5 * (self.r[kept] * self.r[kept]).sum(axis=1)
+
+
+def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
+    """Train parameter sets (B, 5) until all have ended, or enough at the same, lowest loss (B,)."""
+    starts = _Starts(conditions, p)
+    descent = LevenbergMarquardt(starts, _OPTIONS, _FLOOR)
     with np.errstate(all="ignore"):
-        r, J = conditions(p)
-        loss = 0.5 * (r * r).sum(axis=1)
-        for _ in range(_MAX_ITERATIONS):
-            H = np.swapaxes(J, 1, 2) @ J
-            g = (np.swapaxes(J, 1, 2) @ r[..., None])[..., 0]
-            scale = np.trace(H, axis1=1, axis2=2) / len(f) + 1e-12
-            step = -np.linalg.solve(H + (damping * scale)[:, None, None] * np.eye(len(f)), g[..., None])[
-                ..., 0
-            ]
-            trial = p.copy()
-            trial[:, f] += np.minimum(np.maximum(step, -2.0), 2.0)  # two in the logarithm is a factor of 7
-            r_new, J_new = conditions(trial)
-            new = 0.5 * (r_new * r_new).sum(axis=1)
-            better = (new < loss) & ~done
-            done |= (better & (loss - new <= _TOLERANCE * loss)) | (loss < 1e-28) | (damping > 1e8)
-            for old, fresh in ((p, trial), (r, r_new), (J, J_new), (loss, new)):
-                old[better] = fresh[better]
-            damping = np.where(better, np.maximum(damping * 0.1, 1e-12), damping * growth)
-            growth = np.where(better, 2.0, growth * 2)
-            if done.all() or (np.abs(loss - loss.min()) <= 1e-3 * loss.min() + 1e-16)[done].sum() >= _ENOUGH:
+        while descent.active.size:
+            descent.step()
+            ended = np.ones(len(p), dtype=bool)
+            ended[descent.active] = False
+            if (np.abs(starts.loss - starts.loss.min()) <= _tie(starts.loss.min()))[ended].sum() >= _ENOUGH:
                 break
-    return p, np.where(np.isfinite(loss), loss, np.inf)
+    return starts.p, np.where(np.isfinite(starts.loss), starts.loss, np.inf)
+
+
+def _tie(loss: float) -> float:
+    """How near to a loss another one is the same."""
+    return 1e-3 * loss + 1e-16
 
 
 def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:

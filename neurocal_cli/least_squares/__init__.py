@@ -1,1 +1,1 @@
-"""Nonlinear least squares that knows no cameras: steps, Schur complements, covariances."""
+"""Nonlinear least squares that knows no cameras: steps, Schur complements, covariances, leaving out."""

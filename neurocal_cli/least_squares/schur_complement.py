@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import NOTHING, inverse_scaled, solve_scaled
 
-__all__ = ["SchurCovariance", "inverse_scaled", "schur_covariance", "schur_step", "solve_scaled"]
+__all__ = ["SchurCovariance", "eliminate", "schur_covariance", "schur_step"]
 
-_ROUNDING = 1e-30  # an eigenvalue this far below the diagonal is not there
-_NOTHING = 1e-300
+Columns = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,9 +40,7 @@ class SchurCovariance:
     smallest: float
 
 
-def schur_step(
-    N: Array, shared: NDArray[np.intp], own: NDArray[np.intp], damping: float
-) -> tuple[Array, Array, float]:
+def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple[Array, Array, float]:
     """Damped Gauss-Newton step.
 
     Parameters
@@ -66,9 +64,9 @@ def schur_step(
     # Sums of what is needed only: the whole matrices are larger.
     U, g = N[:, f[:, None], f].sum(axis=0), N[:, f, -1].sum(axis=0)
     g_own = N[:, own, -1]
-    ridge = damping * (np.diagonal(U) + _NOTHING)
+    ridge = damping * (np.diagonal(U) + NOTHING)
     B = N[:, own[:, None], own]
-    ridge_own = damping * (np.diagonal(B, axis1=1, axis2=2) + _NOTHING)
+    ridge_own = damping * (np.diagonal(B, axis1=1, axis2=2) + NOTHING)
     places = np.arange(len(own))
     B[:, places, places] += ridge_own
     C = N[:, f[:, None], own]  # (V, f, p)
@@ -83,7 +81,31 @@ def schur_step(
     return step, by_own, float(gain)
 
 
-def schur_covariance(N: Array, shared: NDArray[np.intp], own: NDArray[np.intp]) -> SchurCovariance:
+def eliminate(N: Array, kept: Columns, own: Columns, ridge: float = 0.0) -> tuple[Array, Array]:
+    """Take a block's own unknowns out of its normal matrix: what is left when they follow the others.
+
+    Parameters
+    ----------
+    N : (..., D, D) array
+    kept : (k,) int array
+        Columns that stay; with the residual's column the right side and the sum of squares stay as well.
+    own : (p,) int array
+    ridge : float
+        As for `solve_scaled`.
+
+    Returns
+    -------
+    reduced : (..., k, k) array
+        N_kk - N_ko N_oo^-1 N_ok.
+    solved : (..., p, k) array
+        N_oo^-1 N_ok: how the own unknowns follow the others, and for the residual their own step.
+    """
+    cross = N[..., own[:, None], kept]
+    solved = solve_scaled(N[..., own[:, None], own], cross, ridge)
+    return N[..., kept[:, None], kept] - np.swapaxes(cross, -1, -2) @ solved, solved
+
+
+def schur_covariance(N: Array, shared: Columns, own: Columns) -> SchurCovariance:
     """Inverse of the normal matrix, block by block; see `schur_step` for the parameters.
 
     Times the residual variance it is the Cramer-Rao bound at the estimate.
@@ -97,31 +119,3 @@ def schur_covariance(N: Array, shared: NDArray[np.intp], own: NDArray[np.intp]) 
     cross = -S_inverse @ gain
     covariance_own = B_inverse - np.swapaxes(gain, 1, 2) @ cross
     return SchurCovariance(S_inverse, covariance_own, cross, min(smallest, smallest_shared))
-
-
-def solve_scaled(H: Array, rhs: Array) -> Array:
-    """Solve symmetric systems scaled to a unit diagonal; a singular one yields nan."""
-    scale = 1.0 / np.sqrt(np.abs(np.diagonal(H, axis1=-2, axis2=-1)) + _NOTHING)
-    scaled = H * scale[..., :, None] * scale[..., None, :]
-    try:
-        return scale[..., :, None] * np.linalg.solve(scaled, scale[..., :, None] * rhs)
-    except np.linalg.LinAlgError:
-        return np.full(rhs.shape, np.nan)
-
-
-def inverse_scaled(H: Array, reference: Array) -> tuple[Array, float]:
-    """Inverse of symmetric matrices, and their smallest eigenvalue relative to `reference`'s diagonal.
-
-    The inverse is nan and the eigenvalue 0 where a matrix is singular.
-    """
-    scale = 1.0 / np.sqrt(np.diagonal(reference, axis1=-2, axis2=-1) + _NOTHING)
-    outer = scale[..., :, None] * scale[..., None, :]
-    scaled = H * outer
-    if not np.isfinite(scaled).all():
-        return np.full_like(H, np.nan), 0.0
-    values, vectors = np.linalg.eigh(scaled)
-    smallest = float(values.min(initial=1.0))
-    if smallest < _ROUNDING:
-        return np.full_like(H, np.nan), 0.0
-    inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-    return inverse * outer, smallest

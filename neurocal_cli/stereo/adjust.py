@@ -1,22 +1,21 @@
-"""The last step for two cameras: both, the rig and all poses together on the whitened pixel error (3)."""
+"""Bundle adjustment of two cameras: both, the rig and all poses on the whitened reprojection error."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bundle_adjustment.adjust import FLOOR, OPTIONS
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.levenberg_marquardt import minimise
 from neurocal_cli.least_squares.schur_complement import schur_step
 from neurocal_cli.stereo.reprojection import Columns, Frames, RigState, Sightings, rig_normal_blocks
 
 __all__ = ["AdjustedRig", "adjust_rig"]
 
-_TOLERANCE = 1e-9  # a step that would lower the error by a smaller share is the last
-_FLAT_SHARE = 1e-6  # a rejected step that promised less than this share: the bottom
-_LARGEST_DAMPING = 1e10
-_FLOOR = 1e-13  # rms in normalised pixels that rounding alone accounts for
+_DAMPING = 1e-6  # each camera comes from its own adjustment, so the first step may be nearly undamped
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,7 +26,7 @@ class AdjustedRig:
     ----------
     state : RigState
     normal : (V, D, D) array
-        From `pixel_error.rig_normal_blocks`.
+        From `reprojection.rig_normal_blocks`.
     iterations : int
     converged : bool
     """
@@ -50,7 +49,7 @@ def adjust_rig(
     free: NDArray[np.bool_],
     max_iterations: int = 200,
 ) -> AdjustedRig:
-    """Minimise the pixel error of both cameras from a start that is already near.
+    """Minimise the reprojection error of both cameras from a start that is already near.
 
     Parameters
     ----------
@@ -62,29 +61,54 @@ def adjust_rig(
         Which of the cameras' and the rig's unknowns move; the poses of the views always do.
     max_iterations : int
     """
-    columns = Columns.of(start)
-    shared = np.flatnonzero(free)
-    floor = _FLOOR**2 * sum(seen.n_equations * seen.weight for seen in sightings)
-    state = start
-    normal, _ = rig_normal_blocks(frames, sightings, state, columns)
-    cost = float(normal[:, -1, -1].sum())
-    damping, growth, iterations, settled = 1e-6, 2.0, 0, cost <= floor
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        while not settled and iterations < max_iterations and damping < _LARGEST_DAMPING:
-            iterations += 1
-            by_shared, by_own, gain = schur_step(normal, shared, columns.pose, damping)
-            step = np.zeros(columns.n_shared)
-            step[shared] = by_shared
-            trial = state.moved(columns, step, by_own)
-            trial_normal, sensible = rig_normal_blocks(frames, sightings, trial, columns)
-            after = float(trial_normal[:, -1, -1].sum())
-            sensible = sensible and all(camera.entries[0, [0, 2]].min() > 0 for camera in trial.cameras)
-            if sensible and after < cost:
-                shrink = max(0.01, 1 - min(2 * (cost - after) / gain - 1, 2.0) ** 3)
-                settled = gain < _TOLERANCE * cost or after <= floor
-                state, normal, cost = trial, trial_normal, after
-                damping, growth = max(damping * shrink, 1e-14), 2.0
-            else:
-                settled = sensible and gain < _FLAT_SHARE * cost
-                damping, growth = damping * growth, 2 * growth
-    return AdjustedRig(state.settled(), normal, iterations, settled)
+    problem = _RigReprojection(frames, sightings, start, free)
+    options = replace(OPTIONS, damping=_DAMPING, max_iterations=max_iterations)
+    floor = FLOOR**2 * sum(seen.n_equations * seen.weight for seen in sightings)
+    outcome = minimise(problem, options, floor)
+    settled = bool(outcome.settled[0])
+    return AdjustedRig(problem.state.settled(), problem.normal, int(outcome.iterations[0]), settled)
+
+
+_Step = tuple[Array, Array]  # of what is shared (n_shared,) and of the views' poses (V, 6)
+_Trial = tuple[RigState, Array]  # a state and its normal matrices
+
+
+class _RigReprojection:
+    """The reprojection error of both cameras as `least_squares` sees it: one group."""
+
+    def __init__(
+        self,
+        frames: Frames,
+        sightings: tuple[Sightings, Sightings],
+        start: RigState,
+        free: NDArray[np.bool_],
+    ) -> None:
+        self.frames, self.sightings, self.state = frames, sightings, start
+        self.columns, self.shared = Columns.of(start), np.flatnonzero(free)
+        self.normal, _ = rig_normal_blocks(frames, sightings, start, self.columns)
+
+    @property
+    def cost(self) -> Array:
+        """(1,) sum of squares."""
+        return self.normal[:, -1, -1].sum(keepdims=True)
+
+    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
+        """Steps of what is shared and of the poses, and the gain that they promise."""
+        by_shared, by_own, promised = schur_step(
+            self.normal, self.shared, self.columns.pose, float(damping[0])
+        )
+        step = np.zeros(self.columns.n_shared)
+        step[self.shared] = by_shared
+        return (step, by_own), np.array([promised])
+
+    def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
+        """The state after a step, with all points in front of both cameras and none folded back."""
+        trial = self.state.moved(self.columns, *step)
+        normal, sensible = rig_normal_blocks(self.frames, self.sightings, trial, self.columns)
+        sensible = sensible and all(camera.entries[0, [0, 2]].min() > 0 for camera in trial.cameras)
+        return (trial, normal), normal[:, -1, -1].sum(keepdims=True), np.array([sensible])
+
+    def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
+        """Take it over."""
+        if better[0]:
+            self.state, self.normal = trial

@@ -1,4 +1,6 @@
-"""Levenberg-Marquardt on E_2D with gamma eliminated (variable projection, Golub and Pereyra 1973).
+"""Networks trained by Levenberg-Marquardt: E_2D with gamma eliminated (variable projection).
+
+Golub and Pereyra (1973) eliminate what is linear. The descent itself is `least_squares`'.
 
 The two layers are linear, so the error depends on the product W V alone: nine directions in which
 W and V compensate each other change nothing. With both layers free the step is therefore taken in
@@ -25,6 +27,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop
 from neurocal_cli.network import Patterns, optimal_gamma
 from neurocal_cli.training.task import Task, Trained
 
@@ -57,7 +60,10 @@ class LMOptions:
 
 
 _FLOOR = 1e-13  # rms error, in units of the normalised image, that rounding alone accounts for
-_LARGEST_DAMPING = 1e8  # no step of any length lowers E: the bottom is reached
+# Random starts are far from the minimum: lambda falls to a tenth at most, and a step is judged by what it
+# gained. test_convergence.py and test_starts.py hold the share of starts that arrive.
+_FAR = DescentOptions(shrink=0.1, least_damping=1e-12, largest_damping=1e8, by_promise=False, flat=0.0)
+_SOFTENED = 0.1  # share of the initial damping after the stiffness is taken away
 
 
 def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
@@ -88,14 +94,16 @@ def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
         patterns, product, free = replace(task.patterns, inputs=hidden), task.W, task.free_W
     else:
         raise InputError("the hidden weights must be either all free or all given")
-    descent = _Descent(patterns, free, options)
-    product, curve = descent.run(product)
+    networks = _Networks(_Normal(patterns, free), product, 0.5 * patterns.weights.sum(axis=1) * _FLOOR**2)
+    networks.train(options)
+    product = networks.product
     if task.free_V.all():
         W, V = _split(task.W, product)
     else:
         W, V = product, task.V
     gamma = optimal_gamma(patterns.inputs @ np.swapaxes(product, -1, -2), patterns.targets)
-    return Trained(W, V, gamma, descent.loss, descent.iterations, descent.settled, curve)
+    iterations, settled = networks.iterations, networks.settled
+    return Trained(W, V, gamma, networks.loss, iterations, settled, networks.curve(options.max_iterations))
 
 
 def _split(W: Array, product: Array) -> tuple[Array, Array]:
@@ -131,17 +139,16 @@ class _Normal:
         row, column = np.divmod(self.free, self.n_inputs)
         self.place = (3 * row[:, None] + row) * len(a) + inputs[column[:, None], column]
 
-    def __call__(self, product: Array, mu: Array, networks: NDArray[np.intp]) -> tuple[Array, Array, Array]:
+    def __call__(self, product: Array, mu: float, networks: NDArray[np.intp]) -> tuple[Array, Array, Array]:
         """E (K,), gradient (K, n) and matrix (K, n, n) of some networks, in their order."""
         # All of them, as in most steps: no copies of the patterns.
         rows = slice(None) if len(networks) == len(self.w) else networks
         d, w = self.dt[rows], self.w[rows]
-        m = mu[:, None]
         o = product @ self.Zt[rows]
-        norm = (o * o).sum(axis=1) + m
-        gamma = ((o * d).sum(axis=1) + m) / norm
+        norm = (o * o).sum(axis=1) + mu
+        gamma = ((o * d).sum(axis=1) + mu) / norm
         error = d - gamma[:, None] * o
-        loss = 0.5 * (w * ((error * error).sum(axis=1) + m * (1 - gamma) ** 2)).sum(axis=1)
+        loss = 0.5 * (w * ((error * error).sum(axis=1) + mu * (1 - gamma) ** 2)).sum(axis=1)
         wg = w * gamma
         gradient = -(error * wg[:, None]) @ self.Z[rows]
         # gamma^2 (I - o o^T / (o.o + mu)): what the elimination leaves of each pattern.
@@ -153,101 +160,96 @@ class _Normal:
         return loss, gradient.reshape(len(product), -1)[:, self.free], moments[:, self.place]
 
 
-class _Descent:
-    """State of the networks during training; networks that have settled are left alone."""
+_Trial = tuple[Array, Array, Array, Array]  # products, their loss, gradient and matrix
 
-    def __init__(self, patterns: Patterns, free: NDArray[np.bool_], options: LMOptions) -> None:
-        self.normal = _Normal(patterns, free)
-        self.options = options
-        G = len(patterns.weights)
-        self.floor = 0.5 * patterns.weights.sum(axis=1) * _FLOOR**2
-        self.stiffness = np.array(options.stiffness)
-        self.stage = np.zeros(G, dtype=np.intp)
-        self.damping = np.full(G, options.damping)
-        self.growth = np.full(G, 2.0)
+
+class _Networks:
+    """All networks of a stack, trained through one stiffness after the other."""
+
+    def __init__(self, normal: _Normal, product: Array, floor: Array) -> None:
+        G = len(product)
+        self.normal, self.product, self.floor = normal, product.copy(), floor
+        self.loss = np.zeros(G)
         self.iterations = np.zeros(G, dtype=np.int64)
         self.settled = np.zeros(G, dtype=bool)
-        self.loss = np.zeros(G)
+        self.history: list[tuple[NDArray[np.int64], NDArray[np.intp], Array]] = []
 
-    def run(self, product: Array) -> tuple[Array, Array]:
-        """Train; the products (G, 3, I) and the learning curve (K, G)."""
-        product = product.copy()
-        active = np.arange(len(product))
-        self.loss, self.gradient, self.matrix = self.normal(product, self.stiffness[self.stage], active)
-        curve = [self.loss.copy()]
+    def train(self, options: LMOptions) -> None:
+        """Descend with each stiffness in turn; a network that runs out of iterations stays where it is."""
+        networks, damping = np.arange(len(self.loss)), options.damping
+        for stage, mu in enumerate(options.stiffness):
+            last = stage == len(options.stiffness) - 1
+            tolerance = options.tolerance if last else max(options.release, options.tolerance)
+            settings = replace(_FAR, damping=damping, tolerance=tolerance)
+            ended = self._descend(_Stiffened(self, mu, networks), settings, options.max_iterations)
+            networks, damping = networks[ended], _SOFTENED * options.damping
+        self.settled[networks] = True
+
+    def _descend(self, problem: _Stiffened, settings: DescentOptions, most: int) -> NDArray[np.bool_]:
+        """Train some networks with one stiffness; which of them ended before the limit."""
+        networks, before = problem.networks, self.iterations[problem.networks]
+        self.history.append((before, networks, self.loss[networks]))
+        descent = LevenbergMarquardt(problem, settings, self.floor[networks], most - before)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            for _ in range(self.options.max_iterations):
-                active = self._step(product, active)
-                curve.append(self.loss.copy())
-                if not active.size:
-                    break
-        return product, np.array(curve)
+            while descent.active.size:
+                moving = networks[descent.active]
+                descent.step()
+                place = self.iterations[moving] + descent.iteration
+                self.history.append((place, moving, self.loss[moving]))
+        self.iterations[networks] += descent.outcome.iterations
+        return descent.outcome.stop != Stop.LIMIT
 
-    def _step(self, product: Array, active: NDArray[np.intp]) -> NDArray[np.intp]:
-        """One step of each active network; the ones still active."""
-        mu = self.stiffness[self.stage[active]]
-        step, predicted = self._solve(active)
-        trial = product[active]
-        trial.reshape(len(active), -1)[:, self.normal.free] += step
-        if len(self.normal.free) == trial[0].size:
-            # Without stiffness the scale is free, as gamma absorbs it: keep it at order 1.
-            size = np.sqrt((trial * trial).sum(axis=(1, 2)))
-            trial *= np.where(mu == 0, 2.0 / size, 1.0)[:, None, None]
-        loss, gradient, matrix = self.normal(trial, mu, active)
-        before = self.loss[active]
-        better = loss < before
-        gain = np.where(better, (before - loss) / before, 0.0)
-        self._keep(product, active, better, (trial, loss, gradient, matrix))
-        self._adapt(active, better, (before - loss) / predicted)
-        self.iterations[active] += 1
-        stuck = ~better & (self.damping[active] > _LARGEST_DAMPING)
-        done = (better & (gain < self.options.tolerance)) | stuck | (self.loss[active] <= self.floor[active])
-        release = (mu > 0) & (done | (better & (gain < self.options.release)))
-        self._release(product, active[release])
-        ended = done & ~release
-        self.settled[active[ended]] = True
-        return active[~ended]
+    def curve(self, most: int) -> Array:
+        """(K, G) loss of each network after each of its iterations; the last one stays."""
+        curve = np.full((most + 1, len(self.loss)), np.nan)
+        for iteration, networks, loss in self.history:
+            curve[iteration, networks] = loss
+        curve = curve[: int(self.iterations.max(initial=0)) + 1]
+        for row in range(1, len(curve)):
+            curve[row] = np.where(np.isnan(curve[row]), curve[row - 1], curve[row])
+        return curve
 
-    def _keep(
-        self,
-        product: Array,
-        active: NDArray[np.intp],
-        better: NDArray[np.bool_],
-        trial: tuple[Array, Array, Array, Array],
-    ) -> None:
-        """Accept the trial of the networks that it made better."""
-        kept = active
-        if not better.all():
-            kept = active[better]
-            trial = (trial[0][better], trial[1][better], trial[2][better], trial[3][better])
-        product[kept], self.loss[kept], self.gradient[kept], self.matrix[kept] = trial
 
-    def _solve(self, active: NDArray[np.intp]) -> tuple[Array, Array]:
+class _Stiffened:
+    """Some networks with one stiffness mu, as `least_squares` sees them; each is a group."""
+
+    def __init__(self, stack: _Networks, mu: float, networks: NDArray[np.intp]) -> None:
+        self.stack, self.normal, self.networks, self.mu = stack, stack.normal, networks, mu
+        state = self.normal(stack.product[networks], mu, networks)
+        stack.loss[networks], self.gradient, self.matrix = state
+
+    @property
+    def cost(self) -> Array:
+        """(G,) loss of these networks."""
+        return self.stack.loss[self.networks]
+
+    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
         """Damped step and the loss that it should take off."""
         H, g = self.matrix[active], self.gradient[active]  # copies
         diagonal = np.einsum("kii->ki", H)
-        # The second term keeps the matrix regular where the scale is free.
-        ridge = (self.damping[active] + 1e-14) * diagonal.mean(axis=1) + 1e-300
+        # The mean of the diagonal, not each entry of it, and a second term: where the scale is free nothing
+        # but the damping keeps the matrix regular.
+        ridge = (damping + 1e-14) * diagonal.mean(axis=1) + 1e-300
         diagonal += ridge[:, None]
         step = cast("Array", np.linalg.solve(H, -g[..., None])[..., 0])
         return step, 0.5 * (ridge[:, None] * step**2 - step * g).sum(axis=1)
 
-    def _adapt(self, active: NDArray[np.intp], better: NDArray[np.bool_], ratio: Array) -> None:
-        """Nielsen's rule: damping follows the ratio of real to predicted decrease."""
-        growth = self.growth[active]
-        gained = np.minimum(2 * ratio - 1, 2.0)
-        shrink = np.maximum(0.1, 1 - gained * gained * gained)
-        damping = self.damping[active] * np.where(better, shrink, growth)
-        self.damping[active] = np.minimum(np.maximum(damping, 1e-12), 1e12)
-        self.growth[active] = np.where(better, 2.0, 2 * growth)
+    def move(self, step: Array, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
+        """The products after a step; every product is a network."""
+        networks = self.networks[active]
+        trial = self.stack.product[networks]
+        trial.reshape(len(trial), -1)[:, self.normal.free] += step
+        if self.mu == 0 and len(self.normal.free) == trial[0].size:
+            # The scale is free, as gamma absorbs it: keep it at order 1.
+            trial *= (2.0 / np.sqrt((trial * trial).sum(axis=(1, 2))))[:, None, None]
+        loss, gradient, matrix = self.normal(trial, self.mu, networks)
+        return (trial, loss, gradient, matrix), loss, np.ones(len(trial), dtype=bool)
 
-    def _release(self, product: Array, networks: NDArray[np.intp]) -> None:
-        """Take these networks to the next, smaller stiffness."""
-        if not networks.size:
-            return
-        self.stage[networks] += 1
-        self.damping[networks] = 0.1 * self.options.damping
-        self.growth[networks] = 2.0
-        mu = self.stiffness[self.stage[networks]]
-        state = self.normal(product[networks], mu, networks)
-        self.loss[networks], self.gradient[networks], self.matrix[networks] = state
+    def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
+        """Take over the networks that became better."""
+        if not better.all():
+            active = active[better]
+            trial = (trial[0][better], trial[1][better], trial[2][better], trial[3][better])
+        networks = self.networks[active]
+        self.stack.product[networks], self.stack.loss[networks] = trial[0], trial[1]
+        self.gradient[active], self.matrix[active] = trial[2], trial[3]

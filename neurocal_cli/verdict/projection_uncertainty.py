@@ -18,11 +18,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.cross_validation import inverse
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.geometry import Array, cross_matrix
+from neurocal_cli.least_squares.leave_out import inverse_or_nan
 
 __all__ = ["ProjectionUncertainty", "image_grid", "projection_uncertainty"]
 
@@ -103,9 +103,9 @@ def _covariances(
     """Gain G (6, f), cov(e) (6, 6), S^-1 (f, f); world units, residuals of unit variance."""
     S = normal[:, shared[:, None], shared].sum(axis=0)
     if not free_poses:
-        return np.zeros((6, len(shared))), np.zeros((6, 6)), inverse(S)
+        return np.zeros((6, len(shared))), np.zeros((6, 6)), inverse_or_nan(S)
     V = views.n_views
-    B_inverse = inverse(normal[:, POSE, POSE])
+    B_inverse = inverse_or_nan(normal[:, POSE, POSE])
     C = normal[:, shared, POSE]
     S = S - (C @ B_inverse @ np.swapaxes(C, 1, 2)).sum(axis=0)
     M = np.zeros((V, 6, 6))
@@ -114,7 +114,7 @@ def _covariances(
     M[:, 3:, 3:] = views.scale[:, None, None] * np.eye(3)
     gain = -(M @ B_inverse @ np.swapaxes(C, 1, 2)).mean(axis=0)
     motion = (M @ B_inverse @ np.swapaxes(M, 1, 2)).sum(axis=0) / V**2
-    return gain, motion, inverse(S)
+    return gain, motion, inverse_or_nan(S)
 
 
 def _derivatives(camera: Camera, pixels: Array, scale: float) -> tuple[Array, Array, Array]:

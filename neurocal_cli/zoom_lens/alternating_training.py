@@ -21,10 +21,10 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.joint_training import NEARLY, Joint, JointLearner
 from neurocal_cli.zoom_lens.parameter_networks import LensNets, outputs_to_local
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData
-from neurocal_cli.zoom_lens.static_calibration import scaled_solve
 
 __all__ = ["train_alternating"]
 
@@ -97,7 +97,7 @@ def _turn(learner: JointLearner, nets: LensNets, shared: Array, rate: float) -> 
         weight = curvature[:, j] / rate
         A = (J.T * weight) @ J + np.diag(net.prior)
         rhs = J.T @ (weight * step[:, j]) - net.prior * net.weights
-        learnt.append(replace(net, weights=net.weights + scaled_solve(A[None], rhs[None, :, None])[0, :, 0]))
+        learnt.append(replace(net, weights=net.weights + solve_scaled(A, rhs[:, None], ROUNDING)[:, 0]))
     total = normal.H[:, L:, L:].sum(axis=0)
-    constants = rate * scaled_solve(total[None], pull[:, L:].sum(axis=0)[None, :, None])[0, :, 0]
+    constants = rate * solve_scaled(total, pull[:, L:].sum(axis=0)[:, None], ROUNDING)[:, 0]
     return replace(nets, nets=tuple(learnt)), shared + constants

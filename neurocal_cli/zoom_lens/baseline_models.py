@@ -9,11 +9,14 @@ rival misses nothing but the network.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
+from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.interpolation import (
     grid_axes,
     lookup_matrix,
@@ -23,14 +26,13 @@ from neurocal_cli.zoom_lens.interpolation import (
     thin_plate_matrix,
 )
 from neurocal_cli.zoom_lens.parameter_networks import local_to_outputs, outputs_to_local
+from neurocal_cli.zoom_lens.quadratic_error import QuadraticError
 from neurocal_cli.zoom_lens.setting_normals import Constants
-from neurocal_cli.zoom_lens.static_calibration import scaled_solve
 from neurocal_cli.zoom_lens.zoom_lens import TableRecord, ZoomLens
 
 __all__ = ["Rival", "rivals_of"]
 
 _MOST_DEGREE = 6
-_STEPS = 12
 
 # Local parameters (n, L) and constants at scaled controls (n, D).
 Rival = Callable[[Array], tuple[Array, Constants]]
@@ -82,7 +84,7 @@ def _polynomial(table: TableRecord, variance: float, scale: str, x: Array, power
     """Each parameter by itself, weighted by the variances of the static calibrations."""
     outputs, by_local = local_to_outputs(scale, table.local)
     L = outputs.shape[1]
-    inverse = scaled_solve(table.normal.H[:, :L, :L], np.tile(np.eye(L), (len(x), 1, 1)))
+    inverse = solve_scaled(table.normal.H[:, :L, :L], np.tile(np.eye(L), (len(x), 1, 1)), ROUNDING)
     spread = variance * np.einsum("sij,sjk,sik->si", by_local, inverse, by_local)
     Phi = monomials(x, powers)
     weight = 1 / np.sqrt(np.maximum(spread, 1e-300))
@@ -95,23 +97,55 @@ def _polynomial(table: TableRecord, variance: float, scale: str, x: Array, power
     return lambda to: (outputs_to_local(scale, monomials(to, powers) @ coefficients)[0], table.constants)
 
 
+@dataclass(frozen=True, eq=False)
+class _Polynomials:
+    """A polynomial of the controls for each output, as `quadratic_error` sees it.
+
+    Attributes
+    ----------
+    scale : str
+        Of alpha_u.
+    powers : (K, D) array
+    coefficients : (K, L) array
+    """
+
+    scale: str
+    powers: Array
+    coefficients: Array
+
+    @property
+    def weights(self) -> Array:
+        """(K L,) the coefficients."""
+        return self.coefficients.ravel()
+
+    @property
+    def prior(self) -> Array:
+        """(K L,) zeros: nothing is known of them."""
+        return np.zeros(self.coefficients.size)
+
+    def moved(self, step: Array) -> _Polynomials:
+        """After a step of the coefficients."""
+        return replace(self, coefficients=self.coefficients + step.reshape(self.coefficients.shape))
+
+    def local(self, x: Array) -> Array:
+        """(n, L) local parameters."""
+        return outputs_to_local(self.scale, monomials(x, self.powers) @ self.coefficients)[0]
+
+    def local_with_jacobians(self, x: Array) -> tuple[Array, list[Array]]:
+        """Local parameters, and their derivatives by all coefficients (n, L, K L)."""
+        Phi = monomials(x, self.powers)
+        local, by_output = outputs_to_local(self.scale, Phi @ self.coefficients)
+        J = Phi[:, None, :, None] * by_output[:, :, None]
+        return local, [J.reshape(*local.shape, -1)]
+
+
 def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Rival:
-    """All parameters and the constants together, by Gauss-Newton steps on the normal matrices."""
+    """All parameters and the constants together, on the settings' normal matrices."""
     table = lens.tables
-    Phi = monomials(x, powers)
     outputs, _ = local_to_outputs(scale, table.local)
-    S, L = outputs.shape
-    K, Q = Phi.shape[1], table.normal.H.shape[1] - L
-    c, shared = np.linalg.lstsq(Phi, outputs, rcond=None)[0], np.zeros(Q)
-    for _ in range(_STEPS):
-        local, by_output = outputs_to_local(scale, Phi @ c)
-        J = np.zeros((S, L + Q, K * L + Q))
-        J[:, :L, : K * L] = (Phi[:, None, :, None] * by_output[:, :, None]).reshape(S, L, K * L)
-        J[:, L:, K * L :] = np.eye(Q)
-        d = np.column_stack([local - table.local, np.tile(shared, (S, 1))])
-        pull = table.normal.g - (table.normal.H @ d[..., None])[..., 0]
-        N = np.einsum("sap,sab,sbq->pq", J, table.normal.H, J, optimize=True)
-        step = scaled_solve(N[None], np.einsum("sap,sa->p", J, pull)[None, :, None])[0, :, 0]
-        c, shared = c + step[: K * L].reshape(K, L), shared + step[K * L :]
-    constants = table.constants.moved(shared) if Q else table.constants
-    return lambda to: (outputs_to_local(scale, monomials(to, powers) @ c)[0], constants)
+    start = np.asarray(np.linalg.lstsq(monomials(x, powers), outputs, rcond=None)[0], dtype=float)
+    constants = np.zeros(table.normal.H.shape[1] - outputs.shape[1])
+    error = QuadraticError(x, table.local, table.normal, lens.variance)
+    found = error.minimum(_Polynomials(scale, powers, start), constants, DescentOptions())
+    moved = table.constants.moved(found.shared) if len(constants) else table.constants
+    return lambda to: (found.model.local(to), moved)

@@ -19,11 +19,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.mlfn import Topology
 from neurocal_cli.zoom_lens.network_training import Schedule, sparse_controls, train
 from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, ParameterNet, to_scale
 from neurocal_cli.zoom_lens.setting_normals import Normal
-from neurocal_cli.zoom_lens.static_calibration import scaled_solve
 
 __all__ = ["TOPOLOGIES", "Budget", "fit_committee", "suitable_topologies"]
 
@@ -157,9 +157,9 @@ def _given(
     pull = -(H[:, free[:, None], np.flatnonzero(held)] @ (values - local)[:, held, None])
     B = H[:, free[:, None], free]
     values = values.copy()
-    values[:, free] = local[:, free] + scaled_solve(B, pull)[..., 0]
+    values[:, free] = local[:, free] + solve_scaled(B, pull, ROUNDING)[..., 0]
     spread = np.zeros_like(local)
-    inverse = scaled_solve(B, np.tile(np.eye(len(free)), (len(local), 1, 1)))
+    inverse = solve_scaled(B, np.tile(np.eye(len(free)), (len(local), 1, 1)), ROUNDING)
     spread[:, free] = variance * np.diagonal(inverse, axis1=1, axis2=2)
     return values, spread
 

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.zoom_lens.joint_training import Joint, loosened
-from neurocal_cli.zoom_lens.static_calibration import Tables, scaled_solve
+from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
+from neurocal_cli.zoom_lens.joint_training import Joint
+from neurocal_cli.zoom_lens.quadratic_error import loosened
+from neurocal_cli.zoom_lens.static_calibration import Tables
 
 __all__ = ["LeftOut", "left_out_errors"]
 
@@ -58,9 +60,9 @@ def left_out_errors(x: Array, joint: Joint, tables: Tables, variance: float, sca
     remain = np.eye(L) - K
     out = np.asarray(np.linalg.solve(remain, error[..., None]), dtype=np.float64)
     spread_out = np.linalg.solve(remain, spread)
-    own = variance * scaled_solve(H, np.tile(np.eye(L), (S, 1, 1))) + np.diag(scatter)
+    own = variance * solve_scaled(H, np.tile(np.eye(L), (S, 1, 1)), ROUNDING) + np.diag(scatter)
     expected = np.asarray(spread_out + own)
-    surprise = (out * scaled_solve(expected, np.asarray(out))).sum(axis=(1, 2)) / L
+    surprise = (out * solve_scaled(expected, out, ROUNDING)).sum(axis=(1, 2)) / L
     squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
     counts = np.maximum(
         normal.H[:, 2, 2], 1.0

@@ -24,16 +24,20 @@ def grid_axes(x: Array) -> list[Array] | None:
 
 def lookup_matrix(axes: list[Array], x: Array) -> Array:
     """Linear (bilinear) interpolation in a grid; outside, the outermost cells go on."""
-    return _tensor([_linear(axis, column) for axis, column in zip(axes, x.T, strict=True)])
+    return _tensor([_spline(axis, column, 1) for axis, column in zip(axes, x.T, strict=True)])
 
 
 def spline_matrix(axes: list[Array], x: Array) -> Array:
-    """Cubic (bicubic) splines through a grid, without a knot at the second and last but one value."""
-    return _tensor([_cubic(axis, column) for axis, column in zip(axes, x.T, strict=True)])
+    """Cubic (bicubic) not-a-knot splines through a grid; polynomials through fewer than 4 values."""
+    return _tensor([_spline(axis, column, 3) for axis, column in zip(axes, x.T, strict=True)])
 
 
 def thin_plate_matrix(nodes: Array, x: Array) -> Array:
-    """Thin-plate splines through settings anywhere; cubic in one dimension."""
+    """Thin-plate splines through settings anywhere; cubic in one dimension.
+
+    By least squares of smallest norm, as settings of two controls may all be on one line; SciPy's
+    `RBFInterpolator` finds those singular.
+    """
 
     def kernel(a: Array, b: Array) -> Array:
         r2 = ((a[:, None] - b[None]) ** 2).sum(axis=-1)
@@ -69,23 +73,9 @@ def _tensor(matrices: list[Array]) -> Array:
     return product
 
 
-def _linear(axis: Array, x: Array) -> Array:
-    cell = np.clip(np.searchsorted(axis, x, side="right") - 1, 0, len(axis) - 2)
-    share = (x - axis[cell]) / (axis[cell + 1] - axis[cell])
-    weights = np.zeros((len(x), len(axis)))
-    weights[range(len(x)), cell] = 1 - share
-    weights[range(len(x)), cell + 1] = share
-    return weights
+def _spline(axis: Array, x: Array, degree: int) -> Array:
+    """(n, S) weights of the values at an axis in a spline at x; outside, the outermost piece goes on."""
+    from scipy.interpolate import make_interp_spline
 
-
-def _cubic(axis: Array, x: Array) -> Array:
-    """Weights of the not-a-knot spline; a polynomial through fewer than 5 values."""
-    low, width = axis[0], axis[-1] - axis[0]
-    knots = (axis[2:-2] - low) / width if len(axis) > 4 else np.zeros(0)
-
-    def basis(values: Array) -> Array:
-        t = (values - low) / width
-        powers = [t**k for k in range(min(len(axis), 4))]
-        return np.column_stack([*powers, *(np.maximum(t - knot, 0.0) ** 3 for knot in knots)])
-
-    return np.asarray(np.linalg.solve(basis(axis).T, basis(x).T).T)
+    spline = make_interp_spline(axis, np.eye(len(axis)), k=min(degree, len(axis) - 1))
+    return np.asarray(spline(x), dtype=float)

@@ -1,10 +1,10 @@
-"""Step 3: all networks and the constants together, on the pixel error over all settings.
+"""Step 3: all networks and the constants together, on the reprojection error over all settings.
 
     E = sum_s |r_s(p(x_s; w), q)|^2 / (2 sigma^2) + 1/2 sum_g a_g |w_g|^2
 
 with p the networks' outputs at setting s, which are weights of the calibrating net there, and q the
-constants. Levenberg-Marquardt over all weights at once. A setting enters through its normal matrix
-(`blocks`), so a step costs a millisecond; the matrices are renewed until nothing changes.
+constants. All weights move at once. A setting enters through its normal matrix (`quadratic_error`), so a
+step costs a millisecond; the matrices are renewed until nothing changes.
 """
 
 from __future__ import annotations
@@ -15,18 +15,21 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.zoom_lens.network_training import followed
+from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
+from neurocal_cli.zoom_lens.network_training import RULE, followed
 from neurocal_cli.zoom_lens.parameter_networks import LensNets
+from neurocal_cli.zoom_lens.quadratic_error import QuadraticError, gauss_newton, loosened
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData
-from neurocal_cli.zoom_lens.static_calibration import scaled_solve
 
-__all__ = ["Joint", "JointLearner", "gauss_newton", "loosened", "posterior", "train_joint"]
+__all__ = ["NEARLY", "Joint", "JointLearner", "posterior", "train_joint"]
 
 _ROUNDS = 16  # of normal matrices
-_STEPS = 25  # of Levenberg-Marquardt on one set of them
 _SETTLED = 0.5  # of 2 E, a quarter of a standard deviation: a round that gains less is the last
 NEARLY = 1e-3  # share of 2 E: what gains less than this in the last round has converged
-_SMALL = 0.02  # of 2 E: a step that gains less is the last on a set of matrices
+# On one set of matrices. A step that gains less than 0.02 of 2 E, a seventh of a standard deviation, is
+# the last.
+_OPTIONS = replace(RULE, least_damping=1e-12, largest_damping=1e8, negligible=0.02, max_iterations=25)
+_DAMPING = (1e-8, 1e-2)  # at the start on new matrices
 _FIRST = 4  # rounds in which the priors follow the data
 
 
@@ -53,28 +56,6 @@ class Joint:
     covariance: Array
     evidence: float
     converged: bool
-
-
-def loosened(normal: Normal, scatter: Array, variance: float) -> Normal:
-    """Normal matrices that allow local parameters a scatter from setting to setting.
-
-    Each setting's local parameters are the networks' plus an offset of variance `scatter` (L,), which
-    is eliminated.
-    """
-    if not scatter.any():
-        return normal
-    some = np.flatnonzero(scatter)
-    B = normal.H[:, some[:, None], some] + variance * np.diag(1 / scatter[some])
-    cross = normal.H[:, some]
-    gain = np.swapaxes(scaled_solve(B, cross), 1, 2)
-    pull = normal.g[:, some]
-    solved = scaled_solve(B, pull[..., None])[..., 0]
-    return replace(
-        normal,
-        H=normal.H - gain @ cross,
-        g=normal.g - (gain @ pull[..., None])[..., 0],
-        cost=normal.cost - (solved * pull).sum(axis=1),
-    )
 
 
 def train_joint(
@@ -131,56 +112,25 @@ class JointLearner:
         self.reference = self.nets.local(self.x)
         normal, self.constants = self.data.linearise(self.reference, self.constants)
         self.normal = loosened(normal, self.scatter, self.variance)
+        self.error = QuadraticError(self.x, self.reference, self.normal, self.variance)
         self.shared = np.zeros(self.data.n_shared)
         return self.cost(self.nets, self.shared)
 
-    def _offset(self, nets: LensNets, shared: Array) -> Array:
-        local = nets.local(self.x) - self.reference
-        return np.column_stack([local, np.broadcast_to(shared, (len(local), len(shared)))])
-
     def cost(self, nets: LensNets, shared: Array) -> float:
         """2 E on the present normal matrices, the constants a step `shared` from where they were."""
-        d, normal = self._offset(nets, shared), self.normal
-        Hd = (normal.H @ d[..., None])[..., 0]
-        fit = normal.cost.sum() + ((Hd - 2 * normal.g) * d).sum()
-        prior = sum(float((net.prior * net.weights**2).sum()) for net in nets.nets)
-        return float(fit / self.variance + prior)
+        return self.error.cost(nets, shared)
 
     def system(self) -> tuple[Array, Array]:
         """Gauss-Newton matrix and downhill direction of E over all weights and the constants."""
-        J = np.concatenate(self.nets.local_with_jacobians(self.x)[1], axis=2)
-        d = self._offset(self.nets, self.shared)
-        pull = (self.normal.g - (self.normal.H @ d[..., None])[..., 0]) / self.variance
-        L, P = J.shape[1:]
-        weights, prior = self.nets.weights, self.nets.prior
-        rhs = np.empty(P + pull.shape[1] - L)
-        rhs[:P] = J.reshape(-1, P).T @ pull[:, :L].ravel() - prior * weights
-        rhs[P:] = pull[:, L:].sum(axis=0)
-        return gauss_newton(J, self.normal.H / self.variance, prior), rhs
+        return self.error.system(self.nets, self.shared)
 
     def descend(self) -> float:
         """Levenberg-Marquardt on the present normal matrices; 2 E at the end."""
-        cost = self.cost(self.nets, self.shared)
-        P = len(self.nets.weights)
-        for _ in range(_STEPS):
-            N, rhs = self.system()
-            damped = N + self.damping * np.diag(np.diagonal(N))
-            step = scaled_solve(damped[None], rhs[None, :, None])[0, :, 0]
-            nets, shared = self.nets.moved(step[:P]), self.shared + step[P:]
-            after = self.cost(nets, shared)
-            if after < cost:
-                gained = cost - after
-                self.nets, self.shared, cost = nets, shared, after
-                self.damping = max(0.2 * self.damping, 1e-12)
-                if gained < _SMALL:
-                    break
-            else:
-                self.damping *= 5
-                if self.damping > 1e8:
-                    break
-        self.damping = float(np.clip(self.damping, 1e-8, 1e-2))
-        self.accept(self.nets, self.shared)
-        return cost
+        options = replace(_OPTIONS, damping=self.damping)
+        found = self.error.minimum(self.nets, self.shared, options)
+        self.damping = float(np.clip(found.damping, *_DAMPING))
+        self.accept(found.model, found.shared)
+        return found.cost
 
     def accept(self, nets: LensNets, shared: Array) -> None:
         """Take over networks and a step of the constants."""
@@ -211,23 +161,6 @@ class JointLearner:
         return Joint(self.nets, self.constants, cost, _inverse(N), float(evidence), converged)
 
 
-def gauss_newton(J: Array, H: Array, prior: Array) -> Array:
-    """Second derivatives of E (P + Q, P + Q), given those of the settings (S, L + Q, L + Q).
-
-    J (S, L, P) are the derivatives of the local parameters by the weights, prior (P,) the precisions
-    of the weights.
-    """
-    L, P = J.shape[1:]
-    Q = H.shape[1] - L
-    N, flat = np.empty((P + Q, P + Q)), J.reshape(-1, P)
-    N[:P, :P] = flat.T @ (H[:, :L, :L] @ J).reshape(-1, P)
-    N[:P, P:] = flat.T @ H[:, :L, L:].reshape(len(flat), Q)
-    N[P:, :P] = N[:P, P:].T
-    N[P:, P:] = H[:, L:, L:].sum(axis=0)
-    N[range(P), range(P)] += prior
-    return N
-
-
 def posterior(x: Array, nets: LensNets, normal: Normal, variance: float, scatter: Array) -> Array:
     """Covariance of all weights and the constants (P + Q, P + Q), from normal matrices of the settings."""
     J = np.concatenate(nets.local_with_jacobians(x)[1], axis=2)
@@ -235,4 +168,4 @@ def posterior(x: Array, nets: LensNets, normal: Normal, variance: float, scatter
 
 
 def _inverse(N: Array) -> Array:
-    return scaled_solve(N[None], np.eye(len(N))[None])[0]
+    return solve_scaled(N, np.eye(len(N)), ROUNDING)

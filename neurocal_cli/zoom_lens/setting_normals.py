@@ -1,4 +1,4 @@
-"""The pixel error of all settings through their normal matrices.
+"""The reprojection error of all settings through their normal matrices.
 
 At each setting the camera has local parameters, which change with the lens: alpha_u, alpha_v, u0, v0,
 t_z and the distortion coefficients; and all settings share the constants (zero-order terms), theta
@@ -21,11 +21,12 @@ from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camer
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
+from neurocal_cli.least_squares.schur_complement import eliminate
 from neurocal_cli.zoom_lens.settings import LensPoints
 
 __all__ = ["Constants", "Normal", "PixelData"]
 
-_POSE_STEPS = 12
+_POSE_STEPS = 12  # of views whose poses start where the last matrices left them
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +56,7 @@ class Constants:
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Second-order model of the pixel error of each setting.
+    """Second-order model of the reprojection error of each setting.
 
     Attributes
     ----------
@@ -66,13 +67,20 @@ class Normal:
     cost : (S,) array [px^2]
         Sum of squared residuals.
     sensible : bool
-        Whether all points lie in front of the camera and no lens folds back.
+        Whether all points lie in front of the camera and the distortion is monotonic there.
     """
 
     H: Array
     g: Array
     cost: Array
     sensible: bool
+
+    @property
+    def blocks(self) -> Array:
+        """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares, as Schur complements take it."""
+        g = self.g[..., None]
+        below = np.concatenate([np.swapaxes(g, 1, 2), self.cost[:, None, None]], axis=2)
+        return np.concatenate([np.concatenate([self.H, g], axis=2), below], axis=1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +130,7 @@ class PixelData:
         )
 
     def linearise(self, local: Array, constants: Constants) -> tuple[Normal, Constants]:
-        """Model the pixel error around local parameters (S, L) and constants.
+        """Model the reprojection error around local parameters (S, L) and constants.
 
         Returns
         -------
@@ -201,8 +209,7 @@ class PixelData:
         """Normal matrices over local parameters, theta and the residual, each view's pose eliminated."""
         V, K = len(N), N.shape[1] - 12
         keep = np.concatenate([camera_columns(K), [11 + K]])
-        B, cross = N[:, POSE, POSE], N[:, POSE][:, :, keep]
-        U = N[:, keep[:, None], keep] - np.swapaxes(cross, 1, 2) @ np.linalg.solve(B, cross)
+        U, _ = eliminate(N, keep, np.arange(POSE.start, POSE.stop))
         by_local, by_theta = self._entries_by_parameters(local, constants)
         C = np.zeros((V, 6 + K, 6 + K))
         C[:, :5, :4], C[:, 5 : 5 + K, 4 : 4 + K], C[:, :5, 4 + K] = by_local, np.eye(K), by_theta

@@ -2,7 +2,7 @@
 
 The static calibrations start from random weights and know nothing of each other. Their constants
 (zero-order terms) are then made one, and all local parameters and the constants go to the minimum of
-the pixel error over all settings: the best that any table of values at the settings can do.
+the reprojection error over all settings: the best that any table of values at the settings can do.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
+from neurocal_cli.least_squares.schur_complement import schur_covariance, schur_step
 from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData
@@ -24,8 +26,9 @@ from neurocal_cli.zoom_lens.settings import LensPoints, describe
 
 __all__ = ["StaticFit", "Tables", "calibrate_each", "common_tables", "fit_local", "local_covariance"]
 
-_MOST_STEPS = 200
-_SMALL = 1e-9  # a step that promises less than this share of the cost is the last
+_OPTIONS = DescentOptions(
+    damping=1e-3, largest_damping=1e12
+)  # the static calibrations are near, not at the minimum
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +164,7 @@ def first_constants(fit: StaticFit, lens: LensPoints, still: bool) -> Constants:
 def common_tables(
     data: PixelData, local: Array, constants: Constants, progress: Callable[[str, float], None] | None = None
 ) -> Tables:
-    """Minimise the pixel error over local parameters and constants together."""
+    """Minimise the reprojection error over local parameters and constants together."""
     return _minimise(data, local, constants, shared=True, progress=progress)
 
 
@@ -177,62 +180,63 @@ def _minimise(
     shared: bool,
     progress: Callable[[str, float], None] | None,
 ) -> Tables:
-    """Levenberg-Marquardt; the local parameters are eliminated setting by setting (Schur complement)."""
-    normal, constants = data.linearise(local, constants)
-    damping, growth, converged = 1e-3, 2.0, False
-    for step in range(_MOST_STEPS):
-        if progress is not None:
-            progress("common constants", step / (step + 10))
-        by_local, by_shared, promised = _solve(normal, local.shape[1], damping, shared)
-        trial = local + by_local
-        moved = constants.moved(by_shared) if shared else constants
-        there, moved = data.linearise(trial, moved)
-        before, after = float(normal.cost.sum()), float(there.cost.sum())
-        small = promised < _SMALL * before
-        if there.sensible and after < before:
-            local, constants, normal = trial, moved, there
-            damping, growth = max(damping * 0.2, 1e-12), 2.0
-        else:
-            damping, growth = damping * growth, 2 * growth
-        if small or damping > 1e12:
-            converged = small
-            break
-    return Tables(local, constants, normal, converged)
+    """The local parameters are eliminated setting by setting (Schur complement)."""
+    problem = _CommonTables(data, local, constants, shared, progress)
+    settled = bool(minimise(problem, _OPTIONS).settled[0])
+    return Tables(problem.local, problem.constants, problem.normal, settled)
 
 
-def _solve(normal: Normal, L: int, damping: float, shared: bool) -> tuple[Array, Array, float]:
-    """Steps of the local parameters (S, L) and of the shared ones (Q,), and the gain they promise."""
-    H, g = normal.H, normal.g
-    diagonal = np.diagonal(H, axis1=1, axis2=2)
-    B = H[:, :L, :L] + damping * diagonal[:, :L, None] * np.eye(L)
-    C, g_local = H[:, :L, L:], g[:, :L]
-    solved = scaled_solve(B, np.concatenate([C, g_local[..., None]], axis=2))
-    Q = C.shape[2]
-    step = np.zeros(Q)
-    if shared:
-        total = diagonal[:, L:].sum(axis=0)
-        S = H[:, L:, L:].sum(axis=0) + np.diag(damping * total)
-        S = S - (np.swapaxes(C, 1, 2) @ solved[..., :-1]).sum(axis=0)
-        rhs = g[:, L:].sum(axis=0) - (np.swapaxes(C, 1, 2) @ solved[..., -1:]).sum(axis=0)[:, 0]
-        step = scaled_solve(S[None], rhs[None, :, None])[0, :, 0]
-    local = solved[..., -1] - solved[..., :-1] @ step
-    return local, step, float((local * g_local).sum() + step @ g[:, L:].sum(axis=0))
+_Step = tuple[Array, Array]  # of the local parameters (S, L) and of the constants (Q,)
+_Trial = tuple[Array, Constants, Normal]
 
 
-def scaled_solve(H: Array, rhs: Array) -> Array:
-    """Solve symmetric systems (n, k, k), scaled to a unit diagonal and held off from singular."""
-    scale = 1 / np.sqrt(np.maximum(np.diagonal(H, axis1=1, axis2=2), 1e-300))
-    scaled = H * scale[:, :, None] * scale[:, None, :] + 1e-14 * np.eye(H.shape[1])
-    return np.asarray(np.linalg.solve(scaled, rhs * scale[..., None]) * scale[..., None])
+class _CommonTables:
+    """The reprojection error of all settings as `least_squares` sees it: one group."""
+
+    def __init__(
+        self,
+        data: PixelData,
+        local: Array,
+        constants: Constants,
+        shared: bool,
+        progress: Callable[[str, float], None] | None,
+    ) -> None:
+        self.data, self.local, self.shared, self.progress = data, local, shared, progress
+        self.normal, self.constants = data.linearise(local, constants)
+        self.tried = 0
+
+    @property
+    def cost(self) -> Array:
+        """(1,) sum of squares."""
+        return self.normal.cost.sum(keepdims=True)
+
+    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
+        """Steps of the local parameters and of the constants, and the gain that they promise."""
+        if self.progress is not None:
+            self.progress("common constants", self.tried / (self.tried + 10))
+        self.tried += 1
+        L, Q = self.local.shape[1], self.data.n_shared
+        moving = np.arange(L, L + Q) if self.shared else np.arange(0)
+        by_shared, by_local, promised = schur_step(
+            self.normal.blocks, moving, np.arange(L), float(damping[0])
+        )
+        return (by_local, by_shared), np.array([promised])
+
+    def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
+        """Where a step leads, with all points in front of the camera and none folded back."""
+        by_local, by_shared = step
+        local = self.local + by_local
+        constants = self.constants.moved(by_shared) if self.shared else self.constants
+        normal, constants = self.data.linearise(local, constants)
+        return (local, constants, normal), normal.cost.sum(keepdims=True), np.array([normal.sensible])
+
+    def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
+        """Take it over."""
+        if better[0]:
+            self.local, self.constants, self.normal = trial
 
 
 def local_covariance(normal: Normal, L: int, variance: float) -> tuple[Array, Array]:
     """Covariance of each setting's local parameters (S, L, L) and of the constants (Q, Q)."""
-    B, C = normal.H[:, :L, :L], normal.H[:, :L, L:]
-    eye = np.tile(np.eye(L), (len(B), 1, 1))
-    inverse = scaled_solve(B, eye)
-    gain = inverse @ C
-    S = normal.H[:, L:, L:].sum(axis=0) - (np.swapaxes(C, 1, 2) @ gain).sum(axis=0)
-    constants = scaled_solve(S[None], np.eye(len(S))[None])[0]
-    local = inverse + gain @ constants @ np.swapaxes(gain, 1, 2)
-    return variance * local, variance * constants
+    found = schur_covariance(normal.blocks, np.arange(L, normal.H.shape[1]), np.arange(L))
+    return variance * found.own, variance * found.shared

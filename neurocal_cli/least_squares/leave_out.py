@@ -1,0 +1,116 @@
+"""What a least-squares fit would be without some groups of its data, without fitting again.
+
+At the minimum the error of each group g is nearly a quadratic in the unknowns p that the groups share,
+
+    E_g(p + d) = c_g - 2 g_g . d + d^T S_g d,
+
+with the group's own unknowns eliminated from it (Schur complement). The minimum without any set F of
+groups, d = (S - S_F)^-1 (g - g_F) with S and g summed over all, and the error that it makes on the groups
+left out follow from these few small matrices: exactly where the problem is linear, to second order else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import unit_diagonal
+
+__all__ = ["Quadratics", "folds_of", "inverse_or_nan", "solve_or_nan"]
+
+_REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal; below, rounding has the say
+# What nothing determines is infinite or nan, and told so by the results.
+_quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratics:
+    """Errors of G groups as functions of the f unknowns that they share.
+
+    Attributes
+    ----------
+    S : (G, f, f) array
+    g : (G, f) array
+    cost : (G,) array
+    """
+
+    S: Array
+    g: Array
+    cost: Array
+
+    @_quietly
+    def at(self, step: Array) -> Array:
+        """(G,) error of each group after a step (f,), or a step of its own (G, f)."""
+        step = np.broadcast_to(step, self.g.shape)
+        square = (step * (self.S @ step[..., None])[..., 0]).sum(axis=-1)
+        return np.asarray(self.cost - 2 * (self.g * step).sum(axis=-1) + square)
+
+    def summed(self, member: Array) -> tuple[Array, Array]:
+        """S (F, f, f) and g (F, f) of sets of groups; member (F, G) is 1 where a group belongs to a set."""
+        return np.einsum("fg,gij->fij", member, self.S), member @ self.g
+
+    @_quietly
+    def steps(self, member: Array, restraint: tuple[Array, Array] | None = None) -> Array:
+        """Steps to the minimum over F sets of groups.
+
+        Parameters
+        ----------
+        member : (F, G) array
+            1 where a group belongs to the set, 0 elsewhere.
+        restraint : (f, f) array and (f,) array, optional
+            What is known besides: added to the matrix and to the right side.
+
+        Returns
+        -------
+        (F, f) array
+            nan where a set does not determine the unknowns.
+        """
+        S, g = self.summed(member)
+        return solve_or_nan(S, g) if restraint is None else solve_or_nan(S + restraint[0], g + restraint[1])
+
+    @_quietly
+    def held_out(self, fold: NDArray[np.intp], restraint: tuple[Array, Array] | None = None) -> Array:
+        """(G,) error of each group where the unknowns come from all that are not in its fold (G,)."""
+        member = (fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float)
+        return self.at(self.steps(1.0 - member, restraint)[fold])
+
+    @_quietly
+    def moves_without_each(self) -> Array:
+        """(G, f) how far the unknowns move when one group is left out."""
+        return solve_or_nan(self.S.sum(axis=0) - self.S, self.g.sum(axis=0) - self.g)
+
+    @_quietly
+    def cost_without_each(self) -> Array:
+        """(G,) error of all the others when one group is left out and they are fitted again."""
+        gained = ((self.g.sum(axis=0) - self.g) * self.moves_without_each()).sum(axis=-1)
+        return np.asarray(self.cost.sum() - self.cost - gained)
+
+
+def folds_of(n_groups: int, n_folds: int) -> NDArray[np.intp]:
+    """(G,) fold of each group, dealt out in turn; each its own where there are no more than folds."""
+    return np.arange(n_groups) % n_folds if n_groups > n_folds else np.arange(n_groups)
+
+
+@_quietly
+def solve_or_nan(S: Array, g: Array) -> Array:
+    """S^-1 g of a stack (..., f, f), (..., f); nan where S is singular to rounding."""
+    scaled, scale = unit_diagonal(S)
+    usable = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
+    step = np.full(g.shape, np.nan)
+    if g.shape[-1] == 0:
+        return np.zeros(g.shape)
+    if usable.any():
+        usable[usable] = np.linalg.eigvalsh(scaled[usable])[..., 0] > _REGULAR
+    if usable.any():
+        step[usable] = scale[usable] * np.linalg.solve(scaled[usable], (scale * g)[usable][..., None])[..., 0]
+    return step
+
+
+@_quietly
+def inverse_or_nan(S: Array) -> Array:
+    """S^-1 of a stack of symmetric matrices; nan where they are singular to rounding."""
+    f = S.shape[-1]
+    return solve_or_nan(np.repeat(S[..., None, :, :], f, axis=-3), np.broadcast_to(np.eye(f), S.shape))

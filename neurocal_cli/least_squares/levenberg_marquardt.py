@@ -1,0 +1,272 @@
+"""The one Levenberg-Marquardt of the package: it knows costs, steps and promises, and no cameras.
+
+Around a state p the sum of squares is nearly E(p + d) = c - 2 g.d + d.H d, with H = J^T J and
+g = J^T r. Far from the minimum that is trusted near p only, so each step is damped (Marquardt 1963):
+
+    (H + lambda D) d = g,  D = diag H,
+
+a Gauss-Newton step for small lambda and a short one straight down for large lambda. It promises a gain
+of 2 g.d - d.H d = d.(g + lambda D d). The ratio of the real gain to this promise says how well the
+model holds, and moves lambda (Nielsen 1999; Madsen, Nielsen and Tingleff 2004, section 3.2):
+
+    rho = (E(p) - E(p + d)) / (2 g.d - d.H d)
+    a step that lowers E is accepted:  lambda <- lambda max(shrink, 1 - (2 rho - 1)^3),  nu <- 2
+    any other is rejected:             lambda <- lambda nu,                              nu <- 2 nu
+
+Nielsen's smallest factor is 1/3; here it is an option, because starts that are already near have nothing
+to fear from a quick end of the damping. 2 rho - 1 is limited to 2: what gains far more than promised is
+no model either.
+
+Groups are problems side by side that share no unknowns, each with its own lambda, its own end, and no
+effect on the others; one problem is one group.
+
+Marquardt, An algorithm for least-squares estimation of nonlinear parameters, J. SIAM 11 (1963).
+Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05, DTU (1999).
+Madsen, Nielsen, Tingleff, Methods for non-linear least squares problems, 2nd ed., IMM, DTU (2004).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["DescentOptions", "LeastSquaresProblem", "LevenbergMarquardt", "Outcome", "Stop", "minimise"]
+
+Step = TypeVar("Step")
+Trial = TypeVar("Trial")
+
+
+class LeastSquaresProblem(Protocol[Step, Trial]):
+    """G sums of squares as the solver sees them: linearised where they are, and moved.
+
+    `active` (A,) are the groups that still descend, in ascending order; the others must stay as they are.
+    All arrays are of these groups. A problem of one group need not look at it.
+
+    Attributes
+    ----------
+    cost : (G,) array
+        The sums of squares at the start.
+    """
+
+    @property
+    def cost(self) -> Array:
+        """(G,) sums of squares."""
+        ...
+
+    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Step, Array]:
+        """Damped step from the present state, and the gain (A,) that it promises."""
+        ...
+
+    def move(self, step: Step, active: NDArray[np.intp]) -> tuple[Trial, Array, NDArray[np.bool_]]:
+        """Try a step: the trial, its cost (A,), and whether it is a sensible state at all (A,)."""
+        ...
+
+    def accept(self, trial: Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
+        """Take over the trial in the groups (A,) that it made better, and linearise there."""
+        ...
+
+
+@dataclass(frozen=True)
+class DescentOptions:
+    """How to descend and when to stop.
+
+    Parameters
+    ----------
+    damping : float
+        Initial lambda.
+    shrink : float
+        Smallest factor of lambda after an accepted step.
+    grow, accelerate : float
+        nu after an accepted step, and the factor of nu after each rejected one.
+    by_ratio : bool
+        Whether the factor after an accepted step follows rho, or is `shrink` always. The latter, with
+        `accelerate` 1, is the rule of Marquardt's paper: bold, for many random starts of which some may fail.
+    least_damping, largest_damping : float
+        lambda does not fall below the one; where it exceeds the other no step of any length helps.
+    tolerance : float
+        The last step is an accepted one with a gain of less than this share of the cost.
+    negligible : float
+        The same, as a gain in the cost's own unit.
+    by_promise : bool
+        Whether that gain is the promised one, or the real one. Near the minimum both are the same; far
+        from it a small real gain may be an accident, and a small promise a saddle.
+    flat : float
+        A rejected step that promised less than this share of the cost: only rounding stands against it,
+        the bottom is reached.
+    max_iterations : int
+    """
+
+    damping: float = 1e-4
+    shrink: float = 0.01
+    grow: float = 2.0
+    accelerate: float = 2.0
+    by_ratio: bool = True
+    least_damping: float = 1e-14
+    largest_damping: float = 1e10
+    tolerance: float = 1e-9
+    negligible: float = 0.0
+    by_promise: bool = True
+    flat: float = 1e-6
+    max_iterations: int = 200
+
+
+class Stop(IntEnum):
+    """How the descent of a group ended; `sentence` says it in words."""
+
+    LIMIT = 0
+    STUCK = 1
+    CONVERGED = 2
+    FLAT = 3
+    EXACT = 4
+
+    @property
+    def sentence(self) -> str:
+        """For people."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    Stop.LIMIT: "The limit of iterations was reached.",
+    Stop.STUCK: "No step of any length lowers the sum of squares.",
+    Stop.CONVERGED: "The last step gained next to nothing.",
+    Stop.FLAT: "The last step promised next to nothing and gained nothing.",
+    Stop.EXACT: "What is left of the sum of squares is rounding.",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """How the descent of each group ended; the state itself is the problem's.
+
+    Attributes
+    ----------
+    iterations : (G,) int array
+        Steps that were tried.
+    stop : (G,) int array
+        Values of `Stop`.
+    damping : (G,) array
+        lambda at the end.
+    """
+
+    iterations: NDArray[np.int64]
+    stop: NDArray[np.int8]
+    damping: Array
+
+    @property
+    def settled(self) -> NDArray[np.bool_]:
+        """(G,) whether each group reached a minimum."""
+        return np.asarray(self.stop >= Stop.CONVERGED)
+
+
+def minimise(
+    problem: LeastSquaresProblem[Any, Any], options: DescentOptions | None = None, floor: float | Array = 0.0
+) -> Outcome:
+    """Descend in all groups until each has stopped.
+
+    Parameters
+    ----------
+    problem : LeastSquaresProblem
+        At its start; at the minimum afterwards.
+    options : DescentOptions, optional
+    floor : float or (G,) array
+        Cost that rounding alone accounts for.
+    """
+    descent = LevenbergMarquardt(problem, options or DescentOptions(), floor)
+    descent.run()
+    return descent.outcome
+
+
+class LevenbergMarquardt:
+    """The descent itself, step by step, for those that do something in between.
+
+    Parameters
+    ----------
+    problem : LeastSquaresProblem
+    options : DescentOptions
+    floor : float or (G,) array
+    limit : (G,) int array, optional
+        Iterations of each group, instead of the options' `max_iterations`.
+
+    Attributes
+    ----------
+    active : (A,) int array
+        Groups that still descend.
+    cost, damping : (A,) arrays
+        Theirs.
+    outcome : Outcome
+        Of the groups that have stopped.
+    """
+
+    def __init__(
+        self,
+        problem: LeastSquaresProblem[Any, Any],
+        options: DescentOptions,
+        floor: float | Array = 0.0,
+        limit: NDArray[np.int64] | None = None,
+    ) -> None:
+        self.problem, self.options, self.cost = problem, options, problem.cost.copy()
+        G = len(self.cost)
+        self.active = np.arange(G)
+        self.damping, self.growth = np.full(G, options.damping), np.full(G, options.grow)
+        self.floor = np.zeros(G) + floor
+        self.limit = np.full(G, options.max_iterations) if limit is None else limit
+        self.iteration = 0
+        self.outcome = Outcome(np.zeros(G, dtype=np.int64), np.zeros(G, dtype=np.int8), np.zeros(G))
+        exact, out = self.cost <= self.floor, self.limit <= 0
+        if exact.any() or out.any():
+            self._retire(exact | out, np.where(exact, Stop.EXACT, Stop.LIMIT).astype(np.int8))
+
+    def run(self) -> None:
+        """Step until every group has stopped."""
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+            while self.active.size:
+                self.step()
+
+    def step(self) -> None:
+        """Try one step in each active group, and accept it where it lowers the cost."""
+        problem, options, active, before = self.problem, self.options, self.active, self.cost
+        step, promised = problem.solve(self.damping, active)
+        trial, after, sensible = problem.move(step, active)
+        better = sensible & (after < before)
+        problem.accept(trial, better, active)
+        del trial, step  # large arrays: gone before the next ones are made
+        self.iteration += 1
+        gained = before - after
+        shrink: float | Array = options.shrink
+        if options.by_ratio:
+            excess = np.minimum(2 * (gained / promised) - 1, 2.0)
+            shrink = np.maximum(shrink, 1 - excess * excess * excess)
+        self.damping = np.maximum(self.damping * np.where(better, shrink, self.growth), options.least_damping)
+        self.growth = np.where(better, options.grow, options.accelerate * self.growth)
+        self.cost = np.where(better, after, before)
+        gain = promised if options.by_promise else gained
+        converged = better & (gain < options.tolerance * before + options.negligible)
+        flat = sensible & ~better & (np.abs(promised) < options.flat * before)
+        exact = self.cost <= self.floor
+        settled = converged | flat | exact
+        stuck = ~better & (self.damping > options.largest_damping)
+        done = settled | stuck | (self.limit <= self.iteration)
+        if done.any():
+            stop = np.zeros(len(done), dtype=np.int8)
+            stop[stuck], stop[flat] = Stop.STUCK, Stop.FLAT
+            stop[converged], stop[exact] = Stop.CONVERGED, Stop.EXACT
+            self._retire(done, stop)
+
+    def renew(self) -> None:
+        """Take up the costs of a problem that has changed by itself; all groups must be active."""
+        self.cost = self.problem.cost.copy()
+
+    def _retire(self, done: NDArray[np.bool_], stop: NDArray[np.int8]) -> None:
+        """Leave the groups that have stopped alone from now on."""
+        ended, going = self.active[done], ~done
+        self.outcome.iterations[ended], self.outcome.stop[ended] = self.iteration, stop[done]
+        self.outcome.damping[ended] = self.damping[done]
+        self.active, self.cost, self.floor = self.active[going], self.cost[going], self.floor[going]
+        self.damping, self.growth = self.damping[going], self.growth[going]
+        self.limit = self.limit[going]

@@ -1,0 +1,83 @@
+"""Stacks of normal equations: solved, damped and inverted, always scaled to a unit diagonal."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["NOTHING", "ROUNDING", "damped_step", "inverse_scaled", "solve_scaled", "unit_diagonal"]
+
+NOTHING = 1e-300  # keeps an empty diagonal from dividing by 0
+ROUNDING = 1e-14  # a ridge that holds off a singular system and does not show in a regular one
+_ABSENT = 1e-30  # an eigenvalue this far below the diagonal is not there
+
+
+def unit_diagonal(H: Array) -> tuple[Array, Array]:
+    """Matrices (..., n, n) with rows and columns scaled to a unit diagonal, and the scales (..., n)."""
+    scale = 1.0 / np.sqrt(np.abs(np.diagonal(H, axis1=-2, axis2=-1)) + NOTHING)
+    return H * scale[..., :, None] * scale[..., None, :], scale
+
+
+def solve_scaled(H: Array, rhs: Array, ridge: float = 0.0) -> Array:
+    """Solve systems scaled to a unit diagonal; a singular one yields nan.
+
+    Parameters
+    ----------
+    H : (..., n, n) array
+    rhs : (..., n, m) array
+    ridge : float
+        Added to the unit diagonal: a little (`ROUNDING`) keeps what nothing determines from being infinite.
+    """
+    scaled, scale = unit_diagonal(H)
+    if ridge:
+        scaled += ridge * np.eye(H.shape[-1])
+    try:
+        return scale[..., :, None] * np.linalg.solve(scaled, scale[..., :, None] * rhs)
+    except np.linalg.LinAlgError:
+        if H.ndim > 2:  # one of many: it must not spoil the others
+            return np.stack([solve_scaled(one, right, ridge) for one, right in zip(H, rhs, strict=True)])
+        return np.full(rhs.shape, np.nan)
+
+
+def damped_step(H: Array, g: Array, damping: Array) -> tuple[Array, Array]:
+    """Marquardt's step (H + lambda diag H) d = g of each group, and what it promises to gain.
+
+    Parameters
+    ----------
+    H : (G, n, n) array
+        Gauss-Newton matrices J^T J; damped in place.
+    g : (G, n) array
+        J^T r with r = observed - predicted: downhill.
+    damping : (G,) array
+
+    Returns
+    -------
+    step : (G, n) array
+        nan where the system is singular.
+    promised : (G,) array
+        2 g.d - d.H d = d.(g + lambda diag(H) d), by which the sum of squares should fall.
+    """
+    places = range(H.shape[1])
+    ridge = damping[:, None] * (np.diagonal(H, axis1=1, axis2=2) + NOTHING)
+    H[:, places, places] += ridge
+    step = solve_scaled(H, g[..., None])[..., 0]
+    return step, (step * (g + ridge * step)).sum(axis=1)
+
+
+def inverse_scaled(H: Array, reference: Array) -> tuple[Array, float]:
+    """Inverse of symmetric matrices, and their smallest eigenvalue relative to `reference`'s diagonal.
+
+    The inverse is nan and the eigenvalue 0 where a matrix is singular.
+    """
+    scale = 1.0 / np.sqrt(np.diagonal(reference, axis1=-2, axis2=-1) + NOTHING)
+    outer = scale[..., :, None] * scale[..., None, :]
+    scaled = H * outer
+    if not np.isfinite(scaled).all():
+        return np.full_like(H, np.nan), 0.0
+    values, vectors = np.linalg.eigh(scaled)
+    smallest = float(values.min(initial=1.0))
+    if smallest < _ABSENT:
+        return np.full_like(H, np.nan), 0.0
+    inverse = (vectors / values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+    return inverse * outer, smallest

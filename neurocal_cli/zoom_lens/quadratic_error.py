@@ -1,0 +1,190 @@
+"""The reprojection error of all settings, on fixed normal matrices, of a model of the local parameters.
+
+    2 E = sum_s (c_s - 2 g_s . d_s + d_s . H_s d_s) / sigma^2 + sum_k a_k w_k^2,   d_s = (p(x_s; w) - p_s, q)
+
+with p_s where the matrices were made, w the model's weights, a_k the precisions of their priors, and q a
+step of the constants. A setting costs a few small products, however many points it has.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
+from neurocal_cli.least_squares.normal_equations import ROUNDING, damped_step, solve_scaled
+from neurocal_cli.zoom_lens.setting_normals import Normal
+
+__all__ = ["LocalModel", "QuadraticError", "gauss_newton", "loosened"]
+
+Model = TypeVar("Model", bound="LocalModel")
+
+
+class LocalModel(Protocol):
+    """Anything that gives local parameters at any controls: networks, polynomials."""
+
+    @property
+    def weights(self) -> Array:
+        """(P,) what is learnt."""
+        ...
+
+    @property
+    def prior(self) -> Array:
+        """(P,) precisions of the weights' priors about 0."""
+        ...
+
+    def moved(self: Model, step: Array) -> Model:
+        """After a step (P,) of the weights."""
+        ...
+
+    def local(self, x: Array) -> Array:
+        """(n, L) local parameters at scaled controls (n, D)."""
+        ...
+
+    def local_with_jacobians(self, x: Array) -> tuple[Array, list[Array]]:
+        """Local parameters and their derivatives by parts of the weights, (n, L, part) each."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum(Generic[Model]):
+    """What `QuadraticError.minimum` found.
+
+    Attributes
+    ----------
+    model : LocalModel
+    shared : (Q,) array
+        Step of the constants.
+    cost : float
+        2 E.
+    damping : float
+        lambda at the end.
+    """
+
+    model: Model
+    shared: Array
+    cost: float
+    damping: float
+
+
+@dataclass(frozen=True, eq=False)
+class QuadraticError:
+    """2 E of any model.
+
+    Attributes
+    ----------
+    x : (S, D) array
+        Scaled controls of the settings.
+    reference : (S, L) array
+        Local parameters that the normal matrices were made at.
+    normal : Normal
+    variance : float [px^2]
+        Of the noise of one coordinate.
+    """
+
+    x: Array
+    reference: Array
+    normal: Normal
+    variance: float
+
+    def _offset(self, local: Array, shared: Array) -> tuple[Array, Array]:
+        """Where the parameters are from the reference (S, L + Q), and H times that."""
+        d = np.column_stack([local - self.reference, np.broadcast_to(shared, (len(local), len(shared)))])
+        return d, (self.normal.H @ d[..., None])[..., 0]
+
+    def cost(self, model: LocalModel, shared: Array) -> float:
+        """2 E, the constants a step `shared` (Q,) from where they were."""
+        d, Hd = self._offset(model.local(self.x), shared)
+        fit = self.normal.cost.sum() + ((Hd - 2 * self.normal.g) * d).sum()
+        return float(fit / self.variance + (model.prior * model.weights**2).sum())
+
+    def system(self, model: LocalModel, shared: Array) -> tuple[Array, Array]:
+        """Gauss-Newton matrix and downhill direction of E over all weights and the constants."""
+        local, jacobians = model.local_with_jacobians(self.x)
+        J, prior = np.concatenate(jacobians, axis=2), model.prior
+        pull = (self.normal.g - self._offset(local, shared)[1]) / self.variance
+        L, P = J.shape[1:]
+        rhs = np.empty(P + pull.shape[1] - L)
+        rhs[:P] = J.reshape(-1, P).T @ pull[:, :L].ravel() - prior * model.weights
+        rhs[P:] = pull[:, L:].sum(axis=0)
+        return gauss_newton(J, self.normal.H / self.variance, prior), rhs
+
+    def minimum(self, model: Model, shared: Array, options: DescentOptions) -> Minimum[Model]:
+        """Where a model and a step of the constants lead from here."""
+        problem = _Problem(self, model, shared)
+        damping = float(minimise(problem, options).damping[0])
+        return Minimum(problem.model, problem.shared, float(problem.cost[0]), damping)
+
+
+class _Problem(Generic[Model]):
+    """2 E as `least_squares` sees it: one group."""
+
+    def __init__(self, error: QuadraticError, model: Model, shared: Array) -> None:
+        self.error, self.model, self.shared = error, model, shared
+        self.cost = np.array([error.cost(model, shared)])
+        self.N, self.downhill = error.system(model, shared)
+
+    def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Damped step of all weights and the constants, and what it promises."""
+        step, promised = damped_step(self.N[None].copy(), self.downhill[None], damping)
+        return step[0], promised
+
+    def move(
+        self, step: Array, active: NDArray[np.intp]
+    ) -> tuple[tuple[Model, Array, Array], Array, NDArray[np.bool_]]:
+        """The model after a step; any weights are sensible."""
+        P = len(step) - len(self.shared)
+        model, shared = self.model.moved(step[:P]), self.shared + step[P:]
+        cost = np.array([self.error.cost(model, shared)])
+        return (model, shared, cost), cost, np.ones(1, dtype=bool)
+
+    def accept(
+        self, trial: tuple[Model, Array, Array], better: NDArray[np.bool_], active: NDArray[np.intp]
+    ) -> None:
+        """Take it over."""
+        if better[0]:
+            self.model, self.shared, self.cost = trial
+            self.N, self.downhill = self.error.system(self.model, self.shared)
+
+
+def gauss_newton(J: Array, H: Array, prior: Array) -> Array:
+    """Second derivatives of E (P + Q, P + Q), given those of the settings (S, L + Q, L + Q).
+
+    J (S, L, P) are the derivatives of the local parameters by the weights, prior (P,) the precisions
+    of the weights.
+    """
+    L, P = J.shape[1:]
+    Q = H.shape[1] - L
+    N, flat = np.empty((P + Q, P + Q)), J.reshape(-1, P)
+    N[:P, :P] = flat.T @ (H[:, :L, :L] @ J).reshape(-1, P)
+    N[:P, P:] = flat.T @ H[:, :L, L:].reshape(len(flat), Q)
+    N[P:, :P] = N[:P, P:].T
+    N[P:, P:] = H[:, L:, L:].sum(axis=0)
+    N[range(P), range(P)] += prior
+    return N
+
+
+def loosened(normal: Normal, scatter: Array, variance: float) -> Normal:
+    """Normal matrices that allow local parameters a scatter from setting to setting.
+
+    Each setting's local parameters are the model's plus an offset of variance `scatter` (L,), which
+    is eliminated.
+    """
+    if not scatter.any():
+        return normal
+    some = np.flatnonzero(scatter)
+    B = normal.H[:, some[:, None], some] + variance * np.diag(1 / scatter[some])
+    cross = normal.H[:, some]
+    gain = np.swapaxes(solve_scaled(B, cross, ROUNDING), 1, 2)
+    pull = normal.g[:, some]
+    solved = solve_scaled(B, pull[..., None], ROUNDING)[..., 0]
+    return replace(
+        normal,
+        H=normal.H - gain @ cross,
+        g=normal.g - (gain @ pull[..., None])[..., 0],
+        cost=normal.cost - (solved * pull).sum(axis=1),
+    )
