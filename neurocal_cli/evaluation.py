@@ -92,7 +92,7 @@ def evaluate_camera(
 
     Parameters
     ----------
-    calibration : Calibration, or a camera without poses
+    calibration : Calibration, Camera or Intrinsics
         Of a camera without poses, the pose of every view is fitted.
     points : Correspondences, optional
         Default: the points that the camera was calibrated from.
