@@ -10,10 +10,10 @@ network, training                     the calibrating network and its trainers
 bundle_adjustment                     the reprojection error of all views, its minimum, its covariance
 initialisation                        from random weights to a camera
 distortion                            which distortion model the data support; undistortion
-calibrating, methods                  `calibrate`: the fit, without outliers, as a result
+pipeline, methods                     `calibrate`: the fit, without outliers, as a result
 verdict, evaluation, report           what a result is worth
 stereo, zoom_lens, plots              two cameras; a camera whose zoom and focus move; pictures
-simulation                            synthetic images and zoom lenses with their exact truth
+simulation                            synthetic images and zoom lenses with their exact truth; not installed
 io, detection                         files; points from images
 commands                              the command line
 ====================================  ==================================================================

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 
@@ -30,9 +31,9 @@ __all__ = [
 class StopReason(str, Enum):
     """Why training stopped; the value is the sentence to show."""
 
-    CONVERGED = "converged: the pixel error cannot be lowered further"
-    MAX_ITERATIONS = "stopped at the limit of iterations before the pixel error settled"
-    NO_AGREEMENT = "the starts were spent before two of them agreed"
+    CONVERGED = "converged: the reprojection error is at a minimum"
+    MAX_ITERATIONS = "stopped at the maximum number of iterations before the reprojection error settled"
+    NO_AGREEMENT = "no two of the random starts agreed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,8 +181,8 @@ class Calibration:
     points : Correspondences
         What it was calibrated from, without what was rejected.
     rejected : Rejected
-    verdict : Verdict or None
-        Of `judgement.judged`, where it was asked for.
+    judgement : Verdict or callable, optional
+        The verdict as a file has it, or what reaches it from this calibration; see `verdict`.
     lens_choice : dict of float by lens model [px]
         The models that ``distortion="auto"`` chose from and their rms error on data left out.
     covariance : (n, n) array
@@ -214,7 +215,15 @@ class Calibration:
     warnings: tuple[str, ...] = ()
     rejected: Rejected = field(default_factory=Rejected)
     lens_choice: Mapping[str, float] = field(default_factory=dict)
-    verdict: Verdict | None = None
+    judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """What the data say of this calibration beyond its error, reached when it is first read.
+
+        None where it has no points of its own to be judged by.
+        """
+        return self.judgement(self) if callable(self.judgement) else self.judgement
 
     @property
     def n_rejected(self) -> int:

@@ -114,12 +114,12 @@ def evaluate_camera(
     if isinstance(calibration, Calibration):
         points = calibration.points if points is None else points
         if not len(points):
-            raise InputError("the calibration holds no points of its own; give the points to judge it by")
+            raise InputError("the calibration has no points of its own; give the points to evaluate it on")
         warnings += _compare(calibration, points)
         seed = calibration.seed
         poses = {name: view.pose for name, view in calibration.views.items()}
     elif points is None:
-        raise InputError("intrinsic parameters hold no points; give the points to judge them by")
+        raise InputError("intrinsic parameters have no points; give the points to evaluate them on")
     fitted = np.array([name not in poses for name in points.view_names])
     if fitted.any():
         new_poses, problems = _fit_poses(calibration, points.select(fitted[points.view_index]), seed)
@@ -130,7 +130,9 @@ def evaluate_camera(
     residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
     if not in_front.all():
         n_behind = np.count_nonzero(~in_front)
-        warnings.append(f"{n_behind} of {len(points)} points lie behind the camera and are in no average")
+        warnings.append(
+            f"{n_behind} of {len(points)} points lie behind the camera and are left out of all averages"
+        )
     return _measure(residuals, points, fitted, tuple(warnings))
 
 
@@ -145,8 +147,8 @@ def _compare(calibration: Calibration, points: Correspondences) -> list[str]:
     if points.unit == calibration.unit or calibration.views.keys().isdisjoint(points.view_names):
         return []
     return [
-        f"the points are in {points.unit}, the poses of the calibration in {calibration.unit}; "
-        "the error means nothing unless the two are the same"
+        f"the points are in {points.unit}, but the poses of the calibration are in {calibration.unit}; "
+        "the error is wrong unless these are the same unit"
     ]
 
 
@@ -160,7 +162,7 @@ def _fit_poses(
     poses = {name: view.pose for name, view in fit.views.items()}
     warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
     if not fit.converged:
-        warnings.append(f"the poses of the new views did not settle: {fit.stop_reason}")
+        warnings.append(f"the poses of the new views did not converge: {fit.stop_reason}")
     return poses, warnings
 
 

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
-from plain_projection import project
+from support.plain_projection import project
 
 from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose
 from neurocal_cli.errors import InputError
@@ -503,8 +503,8 @@ def run(code: str) -> str:
 
 
 def test_numba_is_imported_only_by_the_compiled_kernel() -> None:
-    code = "import sys; from neurocal_cli.training import backprop, rule_in_blocks; print('numba' in sys.modules)"
-    assert run(code) == "False\n"
+    load = "import sys; from neurocal_cli.training import backprop, rule_in_blocks;"
+    assert run(f"{load} print('numba' in sys.modules)") == "False\n"
 
 
 def test_without_numba_training_goes_in_blocks() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from plain_projection import project
+from support.plain_projection import project
 
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
 from neurocal_cli.calibration import camera_of

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_calibration import made_calibration
+from support.made_calibration import made_calibration
+from support.real_data import RealFiles
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.calibration_yaml import write_calibration
 from neurocal_cli.io.camera_files import read_extrinsics, read_intrinsics
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 K = [[600.0, 0.5, 320.0], [0.0, 610.0, 240.0], [0.0, 0.0, 1.0]]
 FLAT = [x for row in K for x in row]
 
@@ -235,13 +234,14 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(tmp_path_factory, text, s
     assert message.isprintable()
 
 
-@pytest.mark.skipif(not DATA.exists(), reason="the real data is not beside the project")
-def test_real_camera_files_are_read():
-    opencv = read_intrinsics(DATA / "opencv_stereo" / "left_intrinsics.yml")
+def test_real_camera_files_are_read(real_files: RealFiles) -> None:
+    (path,) = real_files("opencv_stereo/left_intrinsics.yml")
+    opencv = read_intrinsics(path)
     assert opencv.intrinsics.alpha_u == 535.91573396163199
     assert opencv.distortion.coefficients[4] == 0.23839153080878486
     assert opencv.image_size == (640, 480)
-    boofcv = read_intrinsics(DATA / "sony_chess" / "intrinsic.yaml")
+    (path,) = real_files("sony_chess/intrinsic.yaml")
+    boofcv = read_intrinsics(path)
     assert (boofcv.intrinsics.alpha_v, boofcv.intrinsics.u0) == (698.6537946928421, 308.4551818095542)
     assert boofcv.distortion.coefficients.tolist() == [
         -0.25559248570886445,

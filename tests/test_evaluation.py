@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_calibration import CAMERA, made_calibration, made_points, pose_of, two_planes
-from plain_projection import project
+from support.made_calibration import CAMERA, made_calibration, made_points, pose_of, two_planes
+from support.plain_projection import project
 
 from neurocal_cli import Correspondences, NeurocalError, evaluate_camera
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from plain_projection import project
-from scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid, table_1
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from test_uncertainty import noisy, whitener
+from support.noise import noisy, whitener
+from support.plain_projection import project
+from support.scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid, table_1
 
 from neurocal_cli import Correspondences, Intrinsics, Pose
 from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix

@@ -6,7 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from bent import coefficients
+from support.distorted import coefficients
 
 from neurocal_cli import Calibration, Correspondences, calibrate, detect_points
 from neurocal_cli.board import Board, Plane

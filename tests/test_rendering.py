@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rendered import CONDITIONS, IMAGES, RECIPES, condition, picture
+from support.rendered import CONDITIONS, IMAGES, RECIPES, condition, picture
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera

@@ -7,9 +7,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from rendered import board_pose, condition
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
+from support.rendered import board_pose, condition
 
 from neurocal_cli.board import Plane
 from neurocal_cli.camera.camera import Camera

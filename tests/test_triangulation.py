@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs import KINDS, RigScene, random_rig
+from support.rigs import KINDS, RigScene, random_rig
 
 from neurocal_cli import Pose
 from neurocal_cli.camera.distortion import Distortion

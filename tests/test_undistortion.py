@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import random_flat_set
-from test_lens import LENSES
-from test_lens_calibration import bent
+from support.distorted import LENSES, through
+from support.real_data import RealFiles
+from support.scenes import random_flat_set
 
 from neurocal_cli import Correspondences, calibrate, undistort_image, undistort_points
 from neurocal_cli.camera.camera import Camera
@@ -79,7 +78,7 @@ def test_without_a_lens_points_stay() -> None:
 @pytest.mark.parametrize("model", ["k1k2", "plumb_bob", "fisheye"])
 def test_corrected_points_give_the_same_camera_without_distortion(model: str, skew: bool) -> None:
     flat = random_flat_set(np.random.default_rng(7), 12, skew, cols=11, rows=8, f=900, width=1000)
-    points = Correspondences(flat.world, bent(flat, model, LENSES[model]), flat.view, flat.image_size)
+    points = through(flat, model, LENSES[model]).points()
     cam = Camera(flat.intrinsics, Distortion(model, LENSES[model]), flat.image_size)
     found = calibrate(undistort_points(points, cam), distortion="none")
     assert found.intrinsics.values() == pytest.approx(flat.intrinsics.values(), rel=1e-6)
@@ -88,7 +87,7 @@ def test_corrected_points_give_the_same_camera_without_distortion(model: str, sk
 
 def test_a_zoomed_camera_is_that_of_the_corrected_points() -> None:
     flat = random_flat_set(np.random.default_rng(7), 8, False, cols=11, rows=8, f=900, width=1000)
-    points = Correspondences(flat.world, bent(flat, "k1k2", LENSES["k1k2"]), flat.view, flat.image_size)
+    points = through(flat, "k1k2", LENSES["k1k2"]).points()
     cam = Camera(flat.intrinsics, Distortion("k1k2", LENSES["k1k2"]), flat.image_size)
     found = calibrate(undistort_points(points, cam, alpha=0.0), distortion="none")
     assert pytest.approx(undistorted_camera(cam, 0.0).A, rel=1e-6, abs=1e-8) == found.intrinsics.A
@@ -324,18 +323,16 @@ def test_any_lens_gives_a_picture_or_a_reason(seed: int) -> None:
 # Photographs
 
 
-def test_a_photograph_has_straight_edges_afterwards() -> None:
+def test_a_photograph_has_straight_edges_afterwards(real_files: RealFiles) -> None:
     from neurocal_cli import Board, detect_points, read_image
 
-    path = Path(__file__).resolve().parents[2] / "shared" / "data" / "opencv_stereo"
-    if not path.is_dir():
-        pytest.skip("the photographs are not beside the project")
+    (path,) = real_files("opencv_stereo/left02.jpg")
     cam = Camera(
         Intrinsics(533.93, 533.89, 342.6, 233.37),
         Distortion("plumb_bob", [-0.256, -0.150, 0.00117, -0.0002, 0.543]),
         SIZE,
     )
-    image = read_image(str(path / "left02.jpg")).grey
+    image = read_image(str(path)).grey
     rms = []
     for picture in (image, undistort_image(image, cam)):
         found = detect_points(picture, Board.single(9, 6, 25.0))

@@ -16,6 +16,7 @@ from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
 
 __all__ = ["parameter_covariance", "parameter_warnings", "pose_std"]
 
+# What users are warned of; no result depends on it.
 # A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
 _POOR = 0.05
 _POOR_THETA = 0.02  # rad
@@ -98,8 +99,8 @@ def _poor(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:
     if not poor:
         return ()
     return (
-        f"badly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
-        "the target more, or give what is known (--no-skew, --type 2)",
+        f"poorly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
+        "the target more, or give known parameters (--no-skew, --type 2)",
     )
 
 
@@ -111,4 +112,4 @@ def _noise_coefficients(lens: Distortion, std: Mapping[str, float]) -> tuple[str
     ]
     if not noise:
         return ()
-    return (f"not told from 0: {', '.join(noise)}; a simpler --distortion would do",)
+    return (f"not significantly different from 0: {', '.join(noise)}; choose a simpler --distortion",)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.problem import Known
+from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
@@ -14,10 +14,10 @@ from neurocal_cli.geometry import Array
 __all__ = ["in_pixels", "normalised", "translations", "translations_normalised"]
 
 
-def in_pixels(views: Views, known: Known, state: CameraState) -> CameraState:
+def in_pixels(problem: Problem, state: CameraState) -> CameraState:
     """Take a normalised state into pixels and world units; given entries come back exactly as given."""
-    entries = known.matrix(state.entries[0], views)[ENTRIES]
-    return replace(state, entries=entries[None], t=translations(views, state))
+    entries = problem.matrix(state.entries[0])[ENTRIES]
+    return replace(state, entries=entries[None], t=translations(problem.views, state))
 
 
 def normalised(state: CameraState, views: Views) -> CameraState:

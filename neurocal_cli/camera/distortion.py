@@ -86,7 +86,9 @@ class Distortion:
         names = coefficient_names(self.model)
         values = np.array(self.coefficients, dtype=float).ravel()
         if values[len(names) :].any() or not np.isfinite(values).all():
-            raise InputError(f"the lens model {self.model} has {len(names)} finite coefficients")
+            raise InputError(
+                f"the distortion model {self.model} needs {len(names)} finite coefficients; correct them"
+            )
         padded = np.zeros(len(names))
         padded[: len(values)] = values[: len(names)]
         padded.setflags(write=False)

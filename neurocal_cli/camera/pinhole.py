@@ -197,14 +197,16 @@ def decompose(P: Array, world: Array | None = None) -> tuple[Intrinsics, Pose]:
     lengths = np.linalg.norm(M, axis=1, keepdims=True)
     if not lengths.min() > 0 or np.linalg.cond(M / lengths) > 1e14:
         raise DegenerateGeometryError(
-            "the projection matrix is singular: it is no camera with a focal length"
+            "the projection matrix is singular, so it has no focal length; check the points"
         )
     if world is None:
         sign = np.sign(np.linalg.det(M))
     else:
         depth = world @ P[2, :3] + P[2, 3]
         if depth.min() < 0 < depth.max():
-            raise DegenerateGeometryError("the points lie on both sides of the camera")
+            raise DegenerateGeometryError(
+                "the points lie on both sides of the camera; check that each pixel belongs to its point"
+            )
         sign = np.sign(depth.sum())
     if sign * np.linalg.det(M) < 0:
         raise DegenerateGeometryError(

@@ -43,7 +43,7 @@ _LARGEST_DAMPING = 1e8
 _SINGULAR = 1e-10  # eigenvalue of a normal matrix with unit diagonal
 _UNBENT = 1e-6  # share of what a lens moves points by that bends their lines: all go through the centre
 _UNTOLD = (
-    "the straight lines do not tell the lens; give points on lines all over the image, or use "
+    "the straight lines do not determine the distortion; give points on lines all over the image, or use "
     "--distortion none"
 )
 
@@ -93,7 +93,7 @@ class PlumbLine:
         if lost.any():
             row = int(np.argmax(lost))
             raise DegenerateGeometryError(
-                f"{points.place(row)}: the lens that the straight lines show cannot have seen anything at "
+                f"{points.place(row)}: the distortion that the straight lines show maps nothing to the pixel "
                 f"({points.pixels[row, 0]:g}, {points.pixels[row, 1]:g}); check this point, or use another "
                 "--distortion"
             )
@@ -118,8 +118,8 @@ def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> Plum
     equations = len(lines.row) - 2 * len(lines)
     if equations < _FEWEST_EQUATIONS:
         raise DegenerateGeometryError(
-            f"plumb-line needs straight lines of {FEWEST_ON_LINE} known points or more, and finds "
-            f"{len(lines) or 'none'}; give more points of each board, or use --distortion k1k2"
+            f"plumb-line finds too few straight lines of {FEWEST_ON_LINE} or more known points "
+            f"({len(lines) or 'none'}); give more points of each board, or use --distortion k1k2"
         )
     middle, scale = _frame(points)
     start = (np.asarray(centre) - middle) / scale if centre is not None else np.zeros(2)

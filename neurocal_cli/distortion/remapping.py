@@ -53,7 +53,8 @@ class Remapping:
     ) -> None:
         if max(size) > _LONGEST:
             raise InputError(
-                f"images of {size[0]} x {size[1]} px cannot be corrected: a side has at most {_LONGEST} px; "
+                f"images of {size[0]} x {size[1]} px cannot be undistorted: a side has at most {_LONGEST} "
+                "px; "
                 "cut them into parts"
             )
         self.camera, self.new, self.size = camera, new, size
@@ -77,8 +78,8 @@ class Remapping:
         height, width = image.shape[:2]
         if (width, height) != self.size:
             raise InputError(
-                f"has {width} x {height} px, the camera's images have {self.size[0]} x {self.size[1]}; give "
-                "images as the camera took them"
+                f"has {width} x {height} px, but the camera is for {self.size[0]} x {self.size[1]} px; give "
+                "original images of this camera"
             )
         whole: NDArray[Any] = np.ascontiguousarray(image)
         corrected = np.empty_like(image, order="C")
@@ -123,7 +124,7 @@ def undistort_image(
     image : (height, width) or (height, width, channels) uint8 or uint16 array
     camera : Camera or Calibration
     alpha : float, optional
-        See `undistortion.new_camera`; None keeps the camera's own matrix.
+        See `undistortion.new_matrix`; None keeps the camera's own matrix.
     interpolation : {"nearest", "linear", "cubic", "lanczos"}
 
     Returns

@@ -56,7 +56,7 @@ def undistorted_camera(
     if alpha is not None:
         if size is None:
             raise InputError(
-                "alpha needs the size of the images, which neither the camera nor the points tell; add "
+                "alpha needs the size of the images, which neither the camera nor the points have; add "
                 "image_size"
             )
         intrinsics = new_matrix(camera, size, alpha)
@@ -116,11 +116,11 @@ def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsic
     width, height = size
     corner = np.array([width - 1, height - 1], dtype=float)
     if not 0 <= alpha <= 1 or min(size) < 2:
-        raise InputError("alpha must lie between 0 and 1, and the image have more than one pixel a side")
+        raise InputError("alpha must be from 0 to 1, and the image must have more than one pixel a side")
     low, high = _inner(camera, corner)
     if not ((low < high).all() and _is_inside(camera, corner, low, high)):
         raise InputError(
-            "the lens leaves no rectangle of the image that is seen in full; check that the camera belongs "
+            "the undistorted image has no rectangle of valid pixels; check that the camera belongs "
             "to images of this size, or leave out alpha"
         )
     inner = corner / (high - low)
@@ -201,7 +201,7 @@ def undistort_points(
         row = int(np.argmax(lost))
         u, v = points.pixels[row]
         raise InputError(
-            f"{points.place(row)}: the lens cannot have seen anything at the pixel ({u:g}, {v:g}); correct "
+            f"{points.place(row)}: the distortion maps nothing to the pixel ({u:g}, {v:g}); correct "
             "or remove the row, and check that the camera belongs to these points"
         )
     undistorted = replace(points, pixels=pixels)

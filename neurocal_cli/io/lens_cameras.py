@@ -76,7 +76,7 @@ def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> Len
     parts = [_listed(table) if _FILES in table.labels else _tabled(table) for table in tables]
     sizes = set().union(*(part.sizes for part in parts))
     if len(sizes) > 1:
-        raise InputError(f"{tables[0].source}: the cameras' image_size differs; those of one lens have one")
+        raise InputError(f"{tables[0].source}: the cameras differ in image_size; give cameras of one lens")
     model, coefficients = _common_model(parts, tables[0].source)
     shared = [name for name in parts[0].columns if all(name in part.columns for part in parts)]
     columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in shared}
@@ -122,7 +122,9 @@ def _common_model(parts: Sequence[_Rows], source: str) -> tuple[str, Array]:
     rows = [row for part in parts for row in part.coefficients]
     if "fisheye" in models:
         if set(models) != {"fisheye"}:
-            raise InputError(f"{source}: some cameras are fisheyes and some are not; give those of one lens")
+            raise InputError(
+                f"{source}: some cameras are fisheyes and some are not; give cameras of one lens"
+            )
         return "fisheye", np.array(rows)
     padded = np.zeros((len(rows), len(MODELS[_NESTED[-1]])))
     for k, row in enumerate(rows):
@@ -154,5 +156,8 @@ def require_setting(tables: Sequence[Table]) -> tuple[str, ...]:
                 "there is no column zoom or focus; name the setting of each row in one or both", table.source
             )
         if found != names[0]:
-            raise FormatError(f"has not the same of zoom and focus as {tables[0].source}", table.source)
+            raise FormatError(
+                f"must have the same columns of zoom and focus as {tables[0].source}; add or remove one",
+                table.source,
+            )
     return tuple(name for name in CONTROLS if name in names[0])

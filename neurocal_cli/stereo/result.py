@@ -86,7 +86,7 @@ class _RigAssembly:
         if not inverse.smallest > _SINGULAR:
             raise DegenerateGeometryError(
                 "the points do not determine the rig and both cameras (the normal matrix is singular); "
-                "spread them in depth, or give more of the cameras (--no-skew, --left-intrinsics, "
+                "spread them in depth, or give known parameters (--no-skew, --left-intrinsics, "
                 "--right-intrinsics)"
             )
         n_equations = sum(seen.n_equations for seen in problem.sightings)
@@ -188,6 +188,7 @@ class _RigAssembly:
             converged=reason == StopReason.CONVERGED.value,
             stop_reason=reason,
             network=_network(given.network, intrinsics, views, rmse, self.adjusted.iterations),
+            judgement=None,
             **changes,
         )
 

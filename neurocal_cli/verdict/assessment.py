@@ -2,11 +2,11 @@
 
 Everything follows from the calibration and its points, so a file can be judged as well as a result:
 
-* the error on data left out (`leave_out`);
+* the error on data left out (`cross_validation`);
 * the precision of the points themselves: what every view leaves when it has a camera of its own, a
   free network (`outlier_views.free_networks`); a common camera that leaves more contradicts the data;
 * how far two halves of the data disagree, in units of their reported uncertainty;
-* whether residuals of neighbours are alike (`whiteness`);
+* whether residuals of neighbours are correlated (`residual_correlation`);
 * how much of the image and how many directions the points cover (`coverage`);
 * how far projected pixels would move with other noise (`projection_uncertainty`).
 """
@@ -14,13 +14,13 @@ Everything follows from the calibration and its points, so a file can be judged 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.cross_validation import disagreement, held_out
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
-from neurocal_cli.bundle_adjustment.problem import Known
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState, predicted_pixels
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import normalised
@@ -36,14 +36,14 @@ from neurocal_cli.verdict.projection_uncertainty import (
 from neurocal_cli.verdict.repeated_views import repeated_views, scaled_views
 from neurocal_cli.verdict.rules import Verdict, reach_verdict
 
-__all__ = ["judge", "judged"]
+__all__ = ["assess", "gather_evidence"]
 
 _STEPS = 5  # a file's digits, and poses that were given, may lie off the minimum
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
 
-def judge(calibration: Calibration) -> Evidence:
+def gather_evidence(calibration: Calibration) -> Evidence:
     """Measure how good a calibration is.
 
     Parameters
@@ -51,17 +51,17 @@ def judge(calibration: Calibration) -> Evidence:
     calibration : Calibration
         With its points.
     """
-    return _Court(calibration).evidence()
+    return _AtMinimum(calibration).evidence()
 
 
-def judged(calibration: Calibration) -> Verdict | None:
+def assess(calibration: Calibration) -> Verdict | None:
     """Good, usable or poor, with the reasons; None for a calibration that holds no points of its own."""
     if not calibration.views or set(calibration.points.view_names) != set(calibration.views):
         return None
-    return reach_verdict(calibration, judge(calibration))
+    return reach_verdict(calibration, gather_evidence(calibration))
 
 
-class _Court:
+class _AtMinimum:
     """A calibration taken back into normalised units, at its minimum."""
 
     def __init__(self, calibration: Calibration) -> None:
@@ -77,8 +77,7 @@ class _Court:
         )
         predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
         self.views = weighed(self.points, self.points.pixels - predicted)
-        self.known = _known(calibration)
-        self.free = self.known.free_camera
+        self.free = _free(calibration)
         self.free_poses = not all(view.fixed for view in views)
         state = normalised(self.given, self.views)
         adjusted = adjust(self.views.batches, state, self.free, self.free_poses, _STEPS)
@@ -146,14 +145,10 @@ class _Court:
         )  # fmt: skip
 
 
-def _known(calibration: Calibration) -> Known:
-    """What was estimated: the rest is fixed."""
+def _free(calibration: Calibration) -> NDArray[np.bool_]:
+    """(5 + K,) which of A's entries and of the distortion coefficients were estimated from these points."""
     fixed = set(calibration.fixed)
+    coefficients = coefficient_names(calibration.distortion_model)
     if calibration.straight_lines is not None:
-        fixed |= set(coefficient_names(calibration.distortion_model))
-    free = np.array([name not in fixed for name in _ORDER])
-    lens = calibration.camera.distortion
-    free_lens = calibration.distortion_model != "none"
-    return Known(
-        calibration.type, calibration.K[ENTRIES], free, None, frozenset(fixed), None, lens, free_lens
-    )
+        fixed |= set(coefficients)
+    return np.array([name not in fixed for name in (*_ORDER, *coefficients)])

@@ -65,7 +65,7 @@ def camera_at(
         trainer=lens.training,
         seed=lens.seed,
         converged=lens.converged,
-        stop_reason=f"given by a lens at {describe(lens.controls, np.asarray(setting, dtype=float))}",
+        stop_reason=f"from a zoom lens at {describe(lens.controls, np.asarray(setting, dtype=float))}",
         rmse_px=float("nan"),
         max_px=float("nan"),
         distortion_model=lens.model,

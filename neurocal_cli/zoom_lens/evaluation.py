@@ -84,7 +84,9 @@ def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
     setting = points.point_setting
     behind = int(np.isnan(squares).sum())
     if behind:
-        warnings.append(f"{behind} of {len(squares)} points lie behind the camera and are in no average")
+        warnings.append(
+            f"{behind} of {len(squares)} points lie behind the camera and are left out of all averages"
+        )
     rivals = {}
     for name, rival in rivals_of(lens).items():
         rivals[name] = _rival_error(lens, points, *rival(x), constants)
@@ -105,14 +107,13 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
     if missing:
         raise InputError(
             f"{source}: there is no column {missing[0]}, which this lens was calibrated over; name the "
-            "setting of "
-            "each point"
+            "setting of each point"
         )
     here, there = points.points.image_size, lens.image_size
     if here is not None and there is not None and here != there:
         raise InputError(
             f"{source}: the points' image_size {here[0]} x {here[1]} differs from the lens's "
-            f"{there[0]} x {there[1]}"
+            f"{there[0]} x {there[1]}; give points of images of the lens's size"
         )
     columns = dict(zip(points.controls, points.settings[points.point_setting].T, strict=True))
     # Every point counts the same, as in any reprojection error.
@@ -125,7 +126,7 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
         warnings.append(
             f"{int(outside.sum())} of {len(outside)} settings lie outside the calibrated range, the "
             f"first at {first}: "
-            "what the networks say there is a guess"
+            "the networks extrapolate there"
         )
     return matched, warnings
 
