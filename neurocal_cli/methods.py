@@ -104,7 +104,7 @@ def calibrate(
     """
     _check_options(method, trainer, distortion, outliers, starts, seed)
     given = None if intrinsics is None else camera_of(intrinsics)
-    lens = Distortion() if given is None else given.distortion
+    known, lens = (given.intrinsics, given.distortion) if given else (None, Distortion())
     type_3 = isinstance(type, (int, np.integer)) and type == 3
     if not type_3:
         lens = Distortion() if distortion in _FOUND else Distortion(distortion)
@@ -115,9 +115,7 @@ def calibrate(
     way = distortion if distortion in _FOUND and not type_3 else ""
     options = options_for(trainer, starts, seed, distortion=way, backprop=backprop, progress=progress)
     try:
-        problem = problem_for(
-            points, type, image_center, given.intrinsics if given else None, extrinsics, skew, lens
-        )
+        problem = problem_for(points, type, image_center, known, extrinsics, skew, lens)
         if outliers == "reject":
             solution, rejected = fit_robustly(problem, options)
         else:

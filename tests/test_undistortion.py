@@ -79,7 +79,7 @@ def test_without_a_lens_points_stay() -> None:
 def test_corrected_points_give_the_same_camera_without_distortion(model: str, skew: bool) -> None:
     flat = random_flat_set(np.random.default_rng(7), 12, skew, cols=11, rows=8, f=900, width=1000)
     points = through(flat, model, LENSES[model]).points()
-    cam = Camera(flat.intrinsics, model, np.array(LENSES[model]), flat.image_size)
+    cam = Camera(flat.intrinsics, Distortion(model, LENSES[model]), flat.image_size)
     found = calibrate(undistort_points(points, cam), distortion="none")
     assert found.intrinsics.values() == pytest.approx(flat.intrinsics.values(), rel=1e-6)
     assert found.rmse_px < 1e-6
@@ -88,7 +88,7 @@ def test_corrected_points_give_the_same_camera_without_distortion(model: str, sk
 def test_a_zoomed_camera_is_that_of_the_corrected_points() -> None:
     flat = random_flat_set(np.random.default_rng(7), 8, False, cols=11, rows=8, f=900, width=1000)
     points = through(flat, "k1k2", LENSES["k1k2"]).points()
-    cam = Camera(flat.intrinsics, "k1k2", np.array(LENSES["k1k2"]), flat.image_size)
+    cam = Camera(flat.intrinsics, Distortion("k1k2", LENSES["k1k2"]), flat.image_size)
     found = calibrate(undistort_points(points, cam, alpha=0.0), distortion="none")
     assert pytest.approx(undistorted_camera(cam, 0.0).A, rel=1e-6, abs=1e-8) == found.intrinsics.A
 

@@ -124,7 +124,7 @@ def undistort_image(
     image : (height, width) or (height, width, channels) uint8 or uint16 array
     camera : Camera or Calibration
     alpha : float, optional
-        See `undistortion.new_camera`; None keeps the camera's own matrix.
+        See `undistortion.new_matrix`; None keeps the camera's own matrix.
     interpolation : {"nearest", "linear", "cubic", "lanczos"}
 
     Returns

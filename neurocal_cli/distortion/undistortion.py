@@ -26,8 +26,7 @@ from neurocal_cli.points import Correspondences
 
 __all__ = ["new_matrix", "sources", "undistort_pixels", "undistort_points", "undistorted_camera"]
 
-# With these, no pixel of an image at alpha 0 comes from more than 0.02 px outside
-# (tests/test_undistortion.py).
+# With these, no pixel at alpha 0 comes from more than 0.02 px outside; tests/test_undistortion.py repeats it.
 _BORDER = 401  # pixels looked at along each side of the image
 _GRID = 41  # and inside, along each axis
 _HALF_PIXEL = 0.5
