@@ -14,7 +14,7 @@ from neurocal_cli.verdict.assessment import _Court
 FLAT = Path(__file__).resolve().parents[1] / "sample_data" / "flat.csv"
 
 
-@pytest.mark.parametrize(("distortion", "within"), [("none", 1e-5), ("plumb_bob", 0.003)])
+@pytest.mark.parametrize(("distortion", "within"), [("none", 1e-5), ("plumb_bob", 0.006)])
 def test_free_networks_are_at_the_minimum(distortion: str, within: float) -> None:
     court = _Court(calibrate(read_points(FLAT), skew=False, distortion=distortion, outliers="keep"))
     state, views = court.state, court.views

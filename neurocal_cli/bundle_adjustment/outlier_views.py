@@ -30,8 +30,8 @@ _FEWEST = 4  # views, of which the others must outvote one
 _MOVES = 2.5  # standard deviations of any shared parameter that leaving a view out must move
 _ODD = 25.0  # times what noise, and what the others contradict each other by
 _STEPS = 60
-# Of a free camera. A flat view through a lens has a long valley, where 60 steps end up to 0.6 % above the
-# minimum's rms error; one step and what its quadratic leaves end within 0.2 %: `test_free_networks`.
+# Of a free camera. A flat view through a lens has a long valley: 60 steps end up to 0.6 % above the rms error
+# of hundreds, one step and the minimum of its quadratic within 0.5 % of it: `test_free_networks`.
 _FREE_STEPS = 1
 _UNSEEN = 1e-9  # added to a unit diagonal: directions that the points do not tell are not followed
 _SAME_PLANE = 1e-3
