@@ -6,7 +6,8 @@ the text can be indented to become a part of another file.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from operator import add
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from neurocal_cli.geometry import Array, rotation_to_euler
 from neurocal_cli.io.camera_info import camera_info_lines
 from neurocal_cli.io.rejected_yaml import rejected_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
-from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import flow, flows, mapping, number, quoted, text
 from neurocal_cli.points import Correspondences
 
 __all__ = ["FORMAT", "calibration_lines"]
@@ -101,28 +102,38 @@ def _view_lines(cal: Calibration) -> Iterator[str]:
     if not views:
         yield "views: []"
         return
-    rotations = np.stack([view.pose.R for view in views])
-    translations = np.stack([view.pose.t for view in views])
-    values = np.hstack([rotation_to_euler(rotations), translations]).tolist()
-    projections = cal.K @ np.concatenate([rotations, translations[:, :, None]], axis=2)
+    R, t = np.stack([view.pose.R for view in views]), np.stack([view.pose.t for view in views])
+    P = cal.K @ np.concatenate([R, t[:, :, None]], axis=2)
+    pose = _estimates(np.hstack([rotation_to_euler(R), t]), [view.std for view in views])
+    error = flows(np.array([view.rmse_px for view in views], dtype=float))
     yield "views:"
-    for (name, view), pose, P in zip(cal.views.items(), values, projections, strict=True):
-        entries = {key: _estimate(key, value, view.std) for key, value in zip(POSE_NAMES, pose, strict=True)}
+    for name, view, entries, matrix, rmse, rotation in zip(
+        cal.views, views, pose, flows(P), error, flows(R), strict=True
+    ):
         yield f"  - name: {text(name)}"
-        yield f"    rotation: {mapping(**{key: entries[key] for key in POSE_NAMES[:3]})}"
-        yield f"    translation: {mapping(**{key: entries[key] for key in POSE_NAMES[3:]})}"
-        yield f"    projection_matrix: {flow(P)}"
-        yield f"    rmse_px: {number(view.rmse_px)}"
+        yield f"    rotation: {{{', '.join(entries[:3])}}}"
+        yield f"    translation: {{{', '.join(entries[3:])}}}"
+        yield f"    projection_matrix: {matrix}"
+        yield f"    rmse_px: {rmse}"
         yield f"    n_points: {view.n_points}"
-        yield f"    R: {flow(view.pose.R)}"  # the angles give it back but for the last bit
+        yield f"    R: {rotation}"  # the angles give it back but for the last bit
         if view.fixed:
             yield "    fixed: true"
 
 
-def _estimate(name: str, value: float, std: Mapping[str, float]) -> str:
-    if name in std:
-        return mapping(value=number(value), std=number(std[name]))
-    return mapping(value=number(value))
+def _estimates(values: Array, stds: Sequence[Mapping[str, float]]) -> Iterator[list[str]]:
+    """Entries ``R_x: {value: ..., std: ...}`` of each view's pose; values (V, 6)."""
+    width = len(POSE_NAMES)
+    value = flows(values.ravel())
+    std = flows(np.array([[std.get(name, np.nan) for name in POSE_NAMES] for std in stds]).ravel())
+    for k, known in enumerate(stds):
+        row = zip(
+            POSE_NAMES, value[k * width : (k + 1) * width], std[k * width : (k + 1) * width], strict=True
+        )
+        yield [
+            f"{name}: {{value: {v}, std: {s}}}" if name in known else f"{name}: {{value: {v}}}"
+            for name, v, s in row
+        ]
 
 
 def _network_lines(network: NetworkRecord | None) -> Iterator[str]:
@@ -153,21 +164,20 @@ def _straight_lines(found: StraightLines) -> str:
 
 def _matrix_lines(name: str, matrices: Mapping[str, Array]) -> Iterator[str]:
     yield f"  {name}:" if matrices else f"  {name}: {{}}"
-    for view, matrix in matrices.items():
-        yield f"    {text(view)}: {flow(matrix)}"
+    texts = flows(np.array(list(matrices.values())))
+    yield from (f"    {text(view)}: {matrix}" for view, matrix in zip(matrices, texts, strict=True))
 
 
 def _observation_lines(points: Correspondences) -> Iterator[str]:
     columns = ["view", "X", "Y", "Z", "u", "v"]
     blocks = [points.world, points.pixels]
-    names = [quoted(name) for name in points.view_names]
-    heads = [f"    - [{names[k]}, " for k in points.view_index.tolist()]
+    heads = [f"    - [{quoted(name)}, " for name in points.view_names]
+    heads = [heads[k] for k in points.view_index.tolist()]
     if points.point is not None:
         columns.insert(1, "point")
-        heads = [
-            f"{head}{quoted(str(p))}, "
-            for head, p in zip(heads, np.asarray(points.point).tolist(), strict=True)
-        ]
+        labels = np.asarray(points.point).tolist()
+        ids = {label: f"{quoted(str(label))}, " for label in set(labels)}
+        heads = [head + ids[label] for head, label in zip(heads, labels, strict=True)]
     if points.covariance is not None:
         columns += ["suu", "suv", "svv"]
         blocks.append(points.covariance)
@@ -179,5 +189,5 @@ def _observation_lines(points: Correspondences) -> Iterator[str]:
     yield "    rows:" if heads else "    rows: []"
     if not heads:
         return
-    numbers = flow(np.hstack(blocks))[2:-2].split("], [")
-    yield "\n".join([f"{head}{row}]" for head, row in zip(heads, numbers, strict=True)])
+    numbers = flow(np.hstack(blocks))[2:-1].split(", [")
+    yield "\n".join(map(add, heads, numbers))
