@@ -119,5 +119,5 @@ def seen_from_behind(views: Views, state: CameraState) -> list[str]:
         return []
     # The centroid lies along t: on which side of the plane is the camera?
     side = ((state.R @ normal[..., None])[..., 0] * state.t).sum(axis=1)
-    behind = (side < 0) != (np.median(np.sign(side)) < 0)
+    behind = (side < 0) != (np.sign(side).sum() < 0)
     return [views.names[k] for k in np.flatnonzero(behind)]

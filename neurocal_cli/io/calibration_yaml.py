@@ -5,14 +5,14 @@ The file is a ROS camera_info file with a block ``neurocal``; numbers read back 
 
 from __future__ import annotations
 
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.io.calibration_text import calibration_lines
-from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.files import write_whole
-from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_tree import read_yaml
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 __all__ = ["format_calibration", "read_calibration", "write_calibration"]
 
@@ -43,5 +43,10 @@ def read_calibration(path: str | Path) -> Calibration:
     FormatError
         The file cannot be read, is no YAML, or a key is missing or wrong.
     """
+    # Parsing YAML takes 20 ms to load, which a command that only writes does not wait for.
+    from neurocal_cli.io.calibration_tree import calibration_from_field
+    from neurocal_cli.io.tree_fields import Field
+    from neurocal_cli.io.yaml_tree import read_yaml
+
     tree, source = read_yaml(path)
     return calibration_from_field(Field(tree, source))
