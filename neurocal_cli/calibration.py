@@ -144,7 +144,7 @@ class Verdict:
     advice : tuple of str
         What to do next.
     measures : dict of float
-        What it rests on (`judgement.Evidence`); nan for what cannot be told.
+        What it rests on (`verdict.evidence.Evidence`); nan for what cannot be told.
     """
 
     word: str
@@ -169,7 +169,7 @@ class Calibration:
         What it was calibrated from, without what was rejected.
     rejected : Rejected
     verdict : Verdict or None
-        Of `judgement.judged`, where it was asked for.
+        Of `verdict.assessment.judged`; None before it.
     lens_choice : dict of float by lens model [px]
         The models that ``distortion="auto"`` chose from and their rms error on data left out.
     covariance : (n, n) array

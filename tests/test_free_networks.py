@@ -9,14 +9,14 @@ from neurocal_cli import calibrate, read_points
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
-from neurocal_cli.verdict.assessment import _Court
+from neurocal_cli.verdict.assessment import _AtMinimum
 
 FLAT = Path(__file__).resolve().parents[1] / "sample_data" / "flat.csv"
 
 
 @pytest.mark.parametrize(("distortion", "within"), [("none", 1e-5), ("plumb_bob", 0.006)])
 def test_free_networks_are_at_the_minimum(distortion: str, within: float) -> None:
-    court = _Court(calibrate(read_points(FLAT), skew=False, distortion=distortion, outliers="keep"))
+    court = _AtMinimum(calibrate(read_points(FLAT), skew=False, distortion=distortion, outliers="keep"))
     state, views = court.state, court.views
     own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.lens, state.k)
     free = np.arange(5 + len(state.k)) < 5
@@ -26,10 +26,10 @@ def test_free_networks_are_at_the_minimum(distortion: str, within: float) -> Non
 
 def test_views_that_the_camera_fits_exactly_leave_nothing() -> None:
     points = read_points(FLAT)
-    court = _Court(calibrate(points, skew=False, distortion="none", outliers="keep"))
+    court = _AtMinimum(calibrate(points, skew=False, distortion="none", outliers="keep"))
     predicted, _ = court.seen.predict(points.world, points.view_index)
     exact = type(points)(points.world, predicted, view=points.view, image_size=points.image_size)
-    court = _Court(calibrate(exact, skew=False, distortion="none", outliers="keep"))
+    court = _AtMinimum(calibrate(exact, skew=False, distortion="none", outliers="keep"))
     left = free_networks(court.views, court.state)
     assert (left >= 0).all()
     assert left.sum() < 1e-20

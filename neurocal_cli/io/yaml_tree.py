@@ -42,7 +42,7 @@ _WORDS: dict[str, Any] = {
     **dict.fromkeys((".nan", ".NaN", ".NAN"), float("nan")),
 }
 
-# The table as `calibration_text` writes it, at any depth of indentation.
+# The table as `calibration_yaml` writes it, at any depth of indentation.
 _ROWS = re.compile(
     r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n((?:\1  - \[[^\n]*\]\n)+)", re.MULTILINE
 )

@@ -2,11 +2,11 @@
 
 Everything follows from the calibration and its points, so a file can be judged as well as a result:
 
-* the error on data left out (`leave_out`);
+* the error on data left out (`cross_validation`);
 * the precision of the points themselves: what every view leaves when it has a camera of its own, a
   free network (`outlier_views.free_networks`); a common camera that leaves more contradicts the data;
 * how far two halves of the data disagree, in units of their reported uncertainty;
-* whether residuals of neighbours are alike (`whiteness`);
+* whether residuals of neighbours are alike (`residual_correlation`);
 * how much of the image and how many directions the points cover (`coverage`);
 * how far projected pixels would move with other noise (`projection_uncertainty`).
 """
@@ -24,6 +24,7 @@ from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import Seen, normalised
+from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion_models import Lens, coefficient_names
 from neurocal_cli.verdict.coverage import cover
@@ -38,7 +39,7 @@ from neurocal_cli.verdict.rules import Verdict, reach_verdict
 
 __all__ = ["judge", "judged"]
 
-_STEPS = 5  # a file's digits, and poses that were given, may lie off the minimum
+_STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
@@ -51,7 +52,7 @@ def judge(calibration: Calibration) -> Evidence:
     calibration : Calibration
         With its points.
     """
-    return _Court(calibration).evidence()
+    return _AtMinimum(calibration).evidence()
 
 
 def judged(calibration: Calibration) -> Verdict | None:
@@ -61,7 +62,7 @@ def judged(calibration: Calibration) -> Verdict | None:
     return reach_verdict(calibration, judge(calibration))
 
 
-class _Court:
+class _AtMinimum:
     """A calibration taken back into normalised units, at its minimum."""
 
     def __init__(self, calibration: Calibration) -> None:
@@ -73,8 +74,7 @@ class _Court:
             np.stack([view.pose.R for view in views]),
             np.stack([view.pose.t for view in views]),
         )
-        predicted, _ = self.seen.predict(self.points.world, self.points.view_index)
-        self.views = weighed(self.points, self.points.pixels - predicted)
+        self.views = self._arranged()
         self.known = _known(calibration)
         self.free = self.known.free_camera
         self.free_poses = not all(view.fixed for view in views)
@@ -84,6 +84,12 @@ class _Court:
         self.cost = float(self.normal[:, -1, -1].sum())
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
         self.spare = max(self.views.n_equations - self.unknowns, 1)
+
+    def _arranged(self) -> Views:
+        if self.points.covariance is None:
+            return arrange(self.points)
+        predicted, _ = self.seen.predict(self.points.world, self.points.view_index)
+        return weighed(self.points, self.points.pixels - predicted)
 
     def evidence(self) -> Evidence:
         views, free, poses = self.views, self.free, self.free_poses
