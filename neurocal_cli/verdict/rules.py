@@ -25,7 +25,7 @@ class _Limit:
         return int(value > self.good) + int(value > self.poor)
 
 
-# The limits part good scenes, which must be good, from some 60 kinds of wrong data, which must not:
+# The limits part good scenes, which must be good, from some 50 kinds of wrong data, which must not:
 # `test_wrong_inputs` repeats that on made data, `test_judgement` on photographs.
 _ERROR = _Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
 _CONTRADICTION = _Limit(1.6, 2.3)
