@@ -18,7 +18,7 @@ def main() -> None:
         warnings.simplefilter("ignore")
     # A command makes few reference cycles and ends soon. Looking for them every 700 objects took 5 % of the
     # time on 1000 views; looking once more at the exit, through every module, took 25 ms of any command.
-    gc.set_threshold(100_000, 20, 20)
+    gc.set_threshold(300_000, 20, 20)
     atexit.register(gc.freeze)
     try:
         from neurocal_cli.commands import neurocal
