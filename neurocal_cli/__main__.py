@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import sys
 import warnings
 
@@ -14,6 +16,10 @@ def main() -> None:
         # Warnings of the libraries below are for their developers; what a user should know is in
         # the result's own warnings.
         warnings.simplefilter("ignore")
+    # A command makes few reference cycles and ends soon. Looking for them every 700 objects took 5 % of the
+    # time on 1000 views; looking once more at the exit, through every module, took 25 ms of any command.
+    gc.set_threshold(300_000, 20, 20)
+    atexit.register(gc.freeze)
     try:
         from neurocal_cli.commands import neurocal
 

@@ -157,7 +157,7 @@ class Verdict:
     advice : tuple of str
         What to do next.
     measures : dict of float
-        What it rests on (`judgement.Evidence`); nan for what cannot be told.
+        What it rests on (`verdict.evidence.Evidence`); nan for what cannot be told.
     """
 
     word: str

@@ -12,10 +12,8 @@ from hypothesis.extra.numpy import arrays
 
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.io.points_csv import POINTS, format_points, read_points, write_points
-from neurocal_cli.io.table import parse_table
-from neurocal_cli.io.table_careful import read_carefully
-from neurocal_cli.io.table_fast import read_fast
-from neurocal_cli.io.table_layout import find_layout
+from neurocal_cli.io.table import parse_table, read_in_bulk, read_line_by_line
+from neurocal_cli.io.table_header import find_layout
 from neurocal_cli.points import Correspondences
 
 CONTRACT = """\
@@ -326,10 +324,10 @@ def test_the_fast_reader_agrees_with_the_careful_one_or_steps_aside(data):
         layout = find_layout(data, "t.csv", POINTS)
     except NeurocalError:
         return
-    fast = read_fast(data, layout, POINTS)
+    fast = read_in_bulk(data, "t.csv", POINTS, layout)
     if fast is None:
         return
-    careful = read_carefully(data, layout, POINTS, "t.csv")  # must not raise
+    careful = read_line_by_line(data, "t.csv", POINTS, layout)  # must not raise
     for name, column in careful.numbers.items():
         assert fast.numbers[name].tobytes() == column.tobytes()
     for name, column in careful.labels.items():
@@ -342,14 +340,14 @@ def test_the_fast_reader_takes_every_plain_file():
     for separator in (",", ";", "\t", " "):
         data = CONTRACT.replace(",", separator).encode()
         layout = find_layout(data, "t.csv", POINTS)
-        assert read_fast(data, layout, POINTS) is not None
+        assert read_in_bulk(data, "t.csv", POINTS, layout) is not None
 
 
 def test_labels_longer_than_those_at_both_ends_are_not_cut_off():
     short, long = "a,1,2,3,4,5\n", "a-rather-long-name,1,2,3,4,5\n"
     data = ("view,X,Y,Z,u,v\n" + short * 8000 + long + short * 8000).encode()
     layout = find_layout(data, "t.csv", POINTS)
-    fast = read_fast(data, layout, POINTS)
+    fast = read_in_bulk(data, "t.csv", POINTS, layout)
     assert fast.labels["view"][8000] == "a-rather-long-name"
 
 

@@ -10,7 +10,7 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, 
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
-from neurocal_cli.io.calibration_text import FORMAT
+from neurocal_cli.io.calibration_yaml import FORMAT
 from neurocal_cli.io.distortion_names import own_length
 from neurocal_cli.io.rejected_yaml import read_rejected
 from neurocal_cli.io.tree_fields import Field

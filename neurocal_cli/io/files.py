@@ -7,15 +7,16 @@ sees half of it and a failure leaves the former content untouched.
 from __future__ import annotations
 
 import os
-import secrets
 import stat
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 __all__ = ["decode", "one_line", "read_blocks", "read_bytes", "read_text", "write_chunks", "write_whole"]
 
@@ -239,7 +240,7 @@ def _status(path: str | Path) -> os.stat_result | None:
 
 
 def _replace(target: str, chunks: Iterable[str | bytes], former: os.stat_result | None) -> None:
-    temporary = os.path.join(os.path.dirname(target), f".neurocal-{secrets.token_hex(8)}.tmp")
+    temporary = os.path.join(os.path.dirname(target), f".neurocal-{os.urandom(8).hex()}.tmp")
     try:
         # os.open applies the umask to 0o666, as for any new file.
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)

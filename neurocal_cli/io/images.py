@@ -29,7 +29,7 @@ __all__ = [
     "read_picture",
 ]
 
-MOST_PIXELS = 200_000_000  # larger than any camera's; what a file claims beyond is refused
+MOST_PIXELS = 200_000_000  # larger than any camera's; a file that states more is refused
 
 _TURNS = {
     2: "mirrored left to right",

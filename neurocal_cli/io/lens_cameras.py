@@ -17,7 +17,7 @@ from neurocal_cli.io.table import Schema, Table, parse_table
 from neurocal_cli.zoom_lens.fit_cameras import LensCameras
 from neurocal_cli.zoom_lens.settings import CONTROLS
 
-__all__ = ["names_cameras", "note_unknown", "read_cameras", "require_setting"]
+__all__ = ["names_cameras", "read_cameras", "require_setting"]
 
 _PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 _FILES = "camera"
@@ -71,7 +71,7 @@ def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> Len
     """
     tables = [parse_table(data, source, _schema(data)) for data, source in contents]
     for table in tables:
-        note_unknown(table, notes)
+        table.note_unknown(notes)
     require_setting(tables)
     parts = [_listed(table) if _FILES in table.labels else _tabled(table) for table in tables]
     sizes = set().union(*(part.sizes for part in parts))
@@ -132,13 +132,6 @@ def _common_model(parts: Sequence[_Rows], source: str) -> tuple[str, Array]:
     used = int(np.flatnonzero(padded.any(axis=0)).max(initial=-1)) + 1
     model = next(name for name in _NESTED if len(MODELS[name]) >= used)
     return model, padded[:, : len(MODELS[model])]
-
-
-def note_unknown(table: Table, notes: list[str]) -> None:
-    """Name the columns that are kept out."""
-    if table.unknown:
-        names = ", ".join(repr(name[:40]) for name in table.unknown)
-        notes.append(f"{table.source}: column{'s' * (len(table.unknown) > 1)} not used: {names}")
 
 
 def require_setting(tables: Sequence[Table]) -> tuple[str, ...]:

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.table import Schema
-from neurocal_cli.io.table_stream import stream_table
+from neurocal_cli.io.table import Schema, stream_table
 
 __all__ = ["MATCHES", "Matches", "read_matches"]
 
@@ -60,9 +59,8 @@ def read_matches(path: str | Path, notes: list[str] | None = None) -> Iterator[M
         The file cannot be read, or a line of it is wrong; the message names the line.
     """
     for k, table in enumerate(stream_table(path, MATCHES)):
-        if k == 0 and table.unknown and notes is not None:
-            names = ", ".join(repr(name[:40]) for name in table.unknown)
-            notes.append(f"{table.source}: column{'s' * (len(table.unknown) > 1)} not used: {names}")
+        if k == 0 and notes is not None:
+            table.note_unknown(notes)
         pixels = table.stack(MATCHES.required)
         sensible = np.abs(pixels).max(axis=1) <= _LARGEST
         if not sensible.all():

@@ -36,7 +36,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
         Tables that contradict each other or themselves.
     """
     for table in tables:
-        _note_unknown(table, notes)
+        table.note_unknown(notes)
     _check_settings(tables, notes)
     return _single(tables[0]) if len(tables) == 1 else _joined(tables, notes)
 
@@ -129,12 +129,6 @@ def _agreed(key: str, tables: list[Table]) -> Any:
 
 def _plain(value: Any) -> str:
     return " ".join(map(str, value)) if isinstance(value, tuple) else str(value)
-
-
-def _note_unknown(table: Table, notes: list[str]) -> None:
-    if table.unknown:
-        names = ", ".join(repr(name[:40]) for name in table.unknown)
-        notes.append(f"{table.source}: column{'s' * (len(table.unknown) > 1)} not used: {names}")
 
 
 def _check_settings(tables: list[Table], notes: list[str]) -> None:

@@ -12,7 +12,7 @@ __all__ = ["read_verdict", "verdict_lines"]
 
 
 def verdict_lines(verdict: Verdict | None) -> Iterator[str]:
-    """Lines of the block ``verdict``; none where it was not asked for."""
+    """Lines of the block ``verdict``; none where there is no verdict."""
     if verdict is None:
         return
     yield "verdict:"

@@ -24,6 +24,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_p
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.verdict.coverage import cover
@@ -38,7 +39,7 @@ from neurocal_cli.verdict.rules import Verdict, reach_verdict
 
 __all__ = ["assess", "gather_evidence"]
 
-_STEPS = 5  # a file's digits, and poses that were given, may lie off the minimum
+_STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
@@ -75,8 +76,7 @@ class _AtMinimum:
             self.camera.distortion.model,
             self.camera.distortion.coefficients,
         )
-        predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
-        self.views = weighed(self.points, self.points.pixels - predicted)
+        self.views = self._arranged()
         self.free = _free(calibration)
         self.free_poses = not all(view.fixed for view in views)
         state = normalised(self.given, self.views)
@@ -85,6 +85,12 @@ class _AtMinimum:
         self.cost = float(self.normal[:, -1, -1].sum())
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
         self.spare = max(self.views.n_equations - self.unknowns, 1)
+
+    def _arranged(self) -> Views:
+        if self.points.covariance is None:
+            return arrange(self.points)
+        predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
+        return weighed(self.points, self.points.pixels - predicted)
 
     def evidence(self) -> Evidence:
         views, free, poses = self.views, self.free, self.free_poses

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
 __all__ = ["repeated_views", "scaled_views"]
@@ -11,18 +12,22 @@ __all__ = ["repeated_views", "scaled_views"]
 _SAME = 1e-3  # px
 _SCALED = 1.2  # times the distance of neighbouring points in the other views
 _MOST_POINTS = 400  # of a view that are looked at
+# Medians are quantiles here: `np.median` imports numpy.ma, 10 ms of a command.
 
 
 def repeated_views(points: Correspondences) -> tuple[str, ...]:
     """Views with the very pixels of an earlier view, and views with rows given twice."""
-    order = np.argsort(points.view_index, kind="stable")
-    counts = np.bincount(points.view_index)
+    table = np.round(np.column_stack([points.pixels / _SAME, points.world]), 6)
+    order = np.lexsort((*table.T, points.view_index))
+    table, view = table[order], points.view_index[order]
+    again = (table[1:] == table[:-1]).all(axis=1) & (view[1:] == view[:-1])
+    doubled = np.bincount(view[1:][again], minlength=points.n_views) > 0
     found, known = [], set()
-    for name, rows in zip(points.view_names, np.split(order, np.cumsum(counts)[:-1]), strict=True):
-        table = np.round(np.column_stack([points.pixels[rows] / _SAME, points.world[rows]]), 6)
-        table = table[np.lexsort(table.T)]
-        key = np.round(table[:, :2]).tobytes()
-        if key in known or (len(table) > 1 and (np.diff(table, axis=0) == 0).all(axis=1).any()):
+    for name, pixels, twice in zip(
+        points.view_names, _by_view(points, np.round(table[:, :2])), doubled, strict=True
+    ):
+        key = pixels.tobytes()
+        if key in known or twice:
             found.append(name)
         known.add(key)
     return tuple(found)
@@ -33,13 +38,27 @@ def scaled_views(points: Correspondences) -> tuple[str, ...]:
     if points.n_views < 2:
         return ()
     order = np.argsort(points.view_index, kind="stable")
-    counts = np.bincount(points.view_index)
-    steps = []
-    for rows in np.split(order, np.cumsum(counts)[:-1]):
-        world = points.world[rows[:_MOST_POINTS]]
-        gap = np.linalg.norm(world[:, None] - world[None], axis=-1)
-        gap[gap == 0] = np.inf
-        steps.append(float(np.median(gap.min(axis=1))))
-    ratio = np.array(steps) / np.median(steps)
+    steps: dict[bytes, float] = {}  # of the same target points, which most views share
+    keys = []
+    for world in _by_view(points, points.world[order]):
+        world = world[:_MOST_POINTS]
+        key = world.tobytes()
+        if key not in steps:
+            steps[key] = _step(world)
+        keys.append(key)
+    step = np.array([steps[key] for key in keys])
+    ratio = step / np.quantile(step, 0.5)
     off = (ratio > _SCALED) | (ratio < 1 / _SCALED)
     return tuple(np.array(points.view_names)[off].tolist())
+
+
+def _step(world: Array) -> float:
+    """Median distance of a point's nearest neighbour."""
+    squares = ((world[:, None] - world[None]) ** 2).sum(axis=-1)
+    squares[squares == 0] = np.inf
+    return float(np.quantile(np.sqrt(squares.min(axis=1)), 0.5))
+
+
+def _by_view(points: Correspondences, rows: Array) -> list[Array]:
+    """Rows that are sorted by view, one array for each view."""
+    return np.split(rows, np.cumsum(np.bincount(points.view_index))[:-1])

@@ -14,9 +14,10 @@ from support.distorted import through
 from support.plain_projection import project
 from support.scenes import random_flat_set, table_1
 
-from neurocal_cli import Correspondences, calibrate, read_points
+from neurocal_cli import Correspondences, calibrate, read_points, write_points
 
 VIEWS = [13, 100, 1000]
+GIVEN = ["--distortion", "plumb_bob", "--outliers", "keep"]
 
 
 PLUMB_BOB = [-0.2, 0.05, 0.001, -0.001, 0.02]
@@ -109,4 +110,29 @@ def test_a_whole_process(benchmark: BenchmarkFixture, tmp_path: Path, command: l
     full = [sys.executable, *(part.replace("{tmp}", str(tmp_path)) for part in command)]
     benchmark.pedantic(
         lambda: subprocess.run(full, cwd=root, check=True, capture_output=True), rounds=10, warmup_rounds=2
+    )
+
+
+@pytest.mark.benchmark(group="whole commands on flat views")
+@pytest.mark.parametrize("n_views", VIEWS)
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["-m", "neurocal_cli", "calibrate", "{points}", "--no-skew", *GIVEN, "-o", "{tmp}/camera.yaml"],
+        ["-m", "neurocal_cli", "calibrate", "{points}", "-o", "{tmp}/camera.yaml"],
+        ["tests/benchmarks/opencv_script.py", "{points}", "{tmp}/opencv.yaml"],
+    ],
+    ids=["calibrate", "calibrate with defaults", "opencv script"],
+)
+def test_a_whole_command(
+    benchmark: BenchmarkFixture, tmp_path: Path, n_views: int, command: list[str]
+) -> None:
+    points = tmp_path / "points.csv"
+    write_points(flat_points(n_views, "plumb_bob"), points)
+    root = Path(__file__).resolve().parents[2]
+    full = [part.replace("{tmp}", str(tmp_path)).replace("{points}", str(points)) for part in command]
+    benchmark.pedantic(
+        lambda: subprocess.run([sys.executable, *full], cwd=root, check=True, capture_output=True),
+        rounds=5,
+        warmup_rounds=1,
     )

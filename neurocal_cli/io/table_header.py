@@ -1,22 +1,17 @@
-"""How a table is laid out: its metadata, its separator and the names of its columns."""
+"""What a table says above its rows: its metadata, its separator and the names of its columns."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from neurocal_cli.errors import FormatError
-from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import one_line
 
 __all__ = [
-    "Columns",
     "Layout",
     "Metadata",
     "Schema",
@@ -84,22 +79,34 @@ class Metadata:
         if match is None:
             return
         key, text = match[1], match[2].strip(" \t,;")  # spreadsheets pad lines with separators
-        value = _METADATA_READERS[key](text)
+        read, hint = _VALUES[key]
+        value = read(text)
         if value is None:
-            raise FormatError(f"{key} is {text[:40]!r}; {_METADATA_HINTS[key]}", source, number)
+            raise FormatError(f"{key} is {text[:40]!r}; write {hint}", source, number)
         if getattr(self, key) not in (None, value):
             raise FormatError(f"{key} is given twice and differs; keep one", source, number)
         setattr(self, key, value)
 
 
-@dataclass(frozen=True)
-class Columns:
-    """What a reader found below the header; see `table.Table`."""
+def _size(text: str) -> tuple[int, int] | None:
+    words = re.split(r"[ \t,]+", text)
+    if len(words) != 2 or not all(re.fullmatch("[0-9]{1,9}", word) and int(word) for word in words):
+        return None
+    return int(words[0]), int(words[1])
 
-    numbers: dict[str, Array]
-    labels: dict[str, NDArray[Any]]
-    lines: NDArray[np.int64]
-    metadata: Metadata
+
+def _centre(text: str) -> tuple[float, float] | None:
+    words = re.split(r"[ \t,]+", text)
+    if len(words) != 2 or not all(is_number(word) and math.isfinite(float(word)) for word in words):
+        return None
+    return float(words[0]), float(words[1])
+
+
+_VALUES: dict[str, tuple[Callable[[str], Any], str]] = {
+    "image_size": (_size, "two whole numbers as in `# image_size: 640 480`"),
+    "image_center": (_centre, "two numbers as in `# image_center: 320 240`"),
+    "unit": (lambda text: text or None, "a name as in `# unit: mm`"),
+}
 
 
 @dataclass(frozen=True)
@@ -152,9 +159,7 @@ def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
             comments.append(line)
         elif line:
             separator = _find_separator(line)
-            fields = split_fields(line, separator)
-            if fields is None:
-                raise FormatError('a quote (") is not closed; close it', source, number)
+            fields = split_fields(line, separator, source, number)
             if all(is_number(text) for text in fields):
                 names = _headerless_names(fields, comments, source, number, schema)
                 return Layout(separator, names, start, number - 1, metadata)
@@ -169,22 +174,22 @@ def find_layout(data: bytes, source: str, schema: Schema) -> Layout:
     )
 
 
-def split_fields(line: str, separator: str | None) -> list[str] | None:
-    """Split a line at its separators, outside quotes; None where a quote is not closed.
+def split_fields(line: str, separator: str | None, source: str, number: int) -> list[str]:
+    """Split a line at its separators, outside quotes.
 
-    Blanks around a field are dropped, unless they are inside quotes; ``""`` in quotes is a quote.
+    Blanks around a field are dropped, unless they are inside quotes; ``""`` in quotes is a quote. The
+    csv module would read on in the next line where a quote is not closed, and keep blanks after one.
+
+    Raises
+    ------
+    FormatError
+        A quote that is not closed.
     """
     line = line.strip(" \t") if separator != "\t" else line.strip(" ")
     if '"' not in line:
-        return (
-            re.split(r"[ \t]+", line)
-            if separator is None
-            else [s.strip(" \t") for s in line.split(separator)]
-        )
-    return _split_quoted(line, separator)
-
-
-def _split_quoted(line: str, separator: str | None) -> list[str] | None:
+        if separator is None:
+            return re.split(r"[ \t]+", line)
+        return [text.strip(" \t") for text in line.split(separator)]
     end = r"[ \t]+" if separator is None else re.escape(separator)
     plain = r"[^ \t]*" if separator is None else f"[^{re.escape(separator)}]*"
     token = re.compile(rf'[ \t]*?(?:"((?:[^"]|"")*)"[ \t]*?|({plain}))(?:({end})|$)')
@@ -193,7 +198,7 @@ def _split_quoted(line: str, separator: str | None) -> list[str] | None:
     while True:
         match = token.match(line, position)
         if match is None or (match[2] or "").startswith('"'):
-            return None
+            raise FormatError('a quote (") is not closed; close it', source, number)
         fields.append(match[2].strip(" \t") if match[1] is None else match[1].replace('""', '"'))
         if match[3] is None:
             return fields
@@ -260,35 +265,3 @@ def _check_names(names: list[str], source: str, number: int, schema: Schema) -> 
         source,
         number,
     )
-
-
-def _read_size(text: str) -> tuple[int, int] | None:
-    words = re.split(r"[ \t,]+", text)
-    if len(words) != 2 or not all(re.fullmatch("[0-9]{1,9}", word) for word in words):
-        return None
-    width, height = int(words[0]), int(words[1])
-    return (width, height) if width > 0 and height > 0 else None
-
-
-def _read_center(text: str) -> tuple[float, float] | None:
-    words = re.split(r"[ \t,]+", text)
-    if len(words) != 2 or not all(is_number(word) for word in words):
-        return None
-    u0, v0 = float(words[0]), float(words[1])
-    return (u0, v0) if math.isfinite(u0) and math.isfinite(v0) else None
-
-
-def _read_unit(text: str) -> str | None:
-    return text or None
-
-
-_METADATA_READERS: dict[str, Any] = {
-    "image_size": _read_size,
-    "image_center": _read_center,
-    "unit": _read_unit,
-}
-_METADATA_HINTS = {
-    "image_size": "write two whole numbers as in `# image_size: 640 480`",
-    "image_center": "write two numbers as in `# image_center: 320 240`",
-    "unit": "write a name as in `# unit: mm`",
-}
