@@ -168,10 +168,10 @@ def test_small_pieces_of_large_boards_are_refused_at_once() -> None:
     sheets = tuple(Plane(name, 40, 30, 5.0, (0.0, 0.0, z)) for name, z in (("a", 0.0), ("b", 40.0)))
     pieces = [flat_grid(3, 3), Grid(flat_grid(4, 3).pixels + 200.0, 0)]
     for board in (Board.single(40, 30, 5.0), Board(sheets)):
-        start = time.monotonic()
+        start = time.process_time()
         with pytest.raises(NoBoardError, match="it is ambiguous which"):
             identify(board, pieces, EMPTY)
-        assert time.monotonic() - start < 5
+        assert time.process_time() - start < 5
 
 
 def test_a_piece_beside_a_bigger_board_is_not_taken_but_a_board_before_it_is() -> None:

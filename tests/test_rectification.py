@@ -41,6 +41,8 @@ def bent(rig: Rig) -> Rig:
 @pytest.mark.parametrize("name", POSES)
 def test_opencv_says_the_same(name: str, alpha: float | None, rig: Rig) -> None:
     cv2 = pytest.importorskip("cv2")
+    if alpha is not None and int(cv2.__version__.split(".")[0]) < 5:
+        pytest.skip("before version 5 OpenCV lets images end a pixel further out")
     for one, tolerance in (
         (replace(rig, pose=POSES[name]), 1e-4),
         (replace(bent(rig), pose=POSES[name]), 3.0),

@@ -27,8 +27,8 @@ _MOVES = 2.5  # standard deviations of any shared parameter that leaving a view 
 _OUTLIER = 25.0  # times what noise, and what the others contradict each other by
 _STEPS = 60
 # Of a free camera, from the common one. A flat view under distortion has a long valley: 60 steps end up to
-# 0.6 % above the rms error of hundreds, one step and the minimum of its quadratic within 0.5 % of it where the
-# common camera is right; tests/test_free_networks.py repeats it.
+# 0.6 % above the rms error of hundreds, one step and the minimum of its quadratic within 0.5 % of it where
+# the common camera is right; tests/test_free_networks.py repeats it.
 _FREE_STEPS = 1
 _UNSEEN = 1e-9  # added to a unit diagonal: directions that the points do not tell are not followed
 _SAME_PLANE = 1e-3
