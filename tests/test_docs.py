@@ -1,0 +1,131 @@
+"""README.md and docs/: what they show runs, is complete and links to something."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from consoles import PAGES, ROOT, agrees, blocks, run_page
+from reference import pages
+
+import neurocal_cli
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+MANY_BLOCKS = [page for page in PAGES if any(blocks(page.read_text(encoding="utf-8")))]
+
+
+def name(page: Path) -> str:
+    return page.relative_to(ROOT).as_posix()
+
+
+def test_the_first_two_blocks_are_one_command_each() -> None:
+    first, second = re.findall(r"```(\w*)\n(.*?)```", README, flags=re.DOTALL)[:2]
+    for language, text in (first, second):
+        assert language == "sh"
+        assert len(text.splitlines()) == 1
+        assert text.startswith("python3 -m venv .venv && .venv/bin/pip install")
+    assert "neurocal calibrate sample_data/points.csv --type 2" in first[1]
+    assert "pytest" in second[1]
+
+
+def test_the_readme_is_short_and_shows_a_picture() -> None:
+    assert len(README.splitlines()) <= 200
+    assert README.index("![") < README.index("```")
+
+
+@pytest.mark.parametrize("page", MANY_BLOCKS, ids=name)
+def test_what_a_page_shows_runs_and_prints_that(page: Path, tmp_path: Path) -> None:
+    for shown, printed in run_page(page.read_text(encoding="utf-8"), tmp_path):
+        assert agrees(shown.output, printed), (
+            f"$ {shown.command}\n{printed}\n`python docs/tools/consoles.py` rewrites it"
+        )
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed"),
+    [
+        ("rms 0.363 px\n", "rms 0.364 px\n"),
+        ("a  1.00\nb 20.0\n", "a 1.00\nb  19.97\n"),
+        ("first\n...\n", "first\nsecond\n"),
+        ("first\n...\nlast\n", "first\nsecond\nlast\n"),
+        ("-0.0000 px\n", "+0.0000 px\n"),
+        ("", ""),
+    ],
+)
+def test_a_console_may_differ_by_rounding_and_by_lines_left_out(shown: str, printed: str) -> None:
+    assert agrees(shown, printed)
+
+
+@pytest.mark.parametrize(
+    ("shown", "printed"),
+    [
+        ("rms 0.363 px\n", "rms 0.366 px\n"),
+        ("first\n", "first\nsecond\n"),
+        ("first\n...\nlast\n", "first\nlast\nsecond\n"),
+        ("second\n...\n", "first\nsecond\n"),
+        ("verdict: good\n", "verdict: poor\n"),
+        ("12.0 px\n", "px 12.0\n"),
+    ],
+)
+def test_a_console_may_not_differ_otherwise(shown: str, printed: str) -> None:
+    assert not agrees(shown, printed)
+
+
+def test_the_reference_pages_are_those_of_the_program() -> None:
+    committed = {path: (ROOT / "docs" / path).read_text(encoding="utf-8") for path in pages()}
+    assert committed == pages(), "run `python docs/tools/reference.py` and commit the result"
+
+
+def test_each_command_has_a_page_and_is_in_the_menu_and_in_the_readme() -> None:
+    menu = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    made = {path for path in pages() if path.startswith("commands/")}
+    assert made == {name(path)[5:] for path in (ROOT / "docs" / "commands").glob("*.md")}
+    for path in made:
+        assert f" {path}\n" in menu
+    for page in (ROOT / "man").glob("neurocal-*.1"):
+        words = page.stem.replace("-", " ")
+        assert f"commands/{page.stem.partition('-')[2]}.md" in made
+        assert words in README
+
+
+def test_each_public_name_is_in_the_python_reference() -> None:
+    assert set(
+        re.findall(r"^::: neurocal_cli\.(\w+)$", pages()["reference/api.md"], flags=re.MULTILINE)
+    ) == set(neurocal_cli.__all__)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    for target in re.findall(r"\]\(([^)#\s]+)", text):
+        assert target.startswith("http") or (page.parent / target).exists(), target
+
+
+def test_pictures_have_a_script() -> None:
+    pictures = ROOT / "docs" / "pictures"
+    scripts = "".join(path.read_text(encoding="utf-8") for path in pictures.glob("*.py"))
+    for path in pictures.iterdir():
+        if path.suffix in (".svg", ".png"):
+            assert f'"{path.name}"' in scripts
+            assert path.stat().st_size < 400_000
+
+
+@pytest.mark.slow
+def test_the_scripts_of_the_pictures_run(tmp_path: Path) -> None:
+    shutil.copytree(ROOT / "docs" / "pictures", tmp_path / "docs" / "pictures")
+    (tmp_path / "sample_data").symlink_to(ROOT / "sample_data")
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    for script in sorted((tmp_path / "docs" / "pictures").glob("*.py")):
+        subprocess.run([sys.executable, script], check=True, env=environment)
+
+
+def test_the_site_builds(tmp_path: Path) -> None:
+    pytest.importorskip("mkdocs")
+    words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")]
+    subprocess.run(words, cwd=ROOT, check=True)
+    assert (tmp_path / "site" / "commands" / "calibrate.html").exists()
