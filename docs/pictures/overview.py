@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import matplotlib
 import numpy as np
 from style import BLUE, INK, ORANGE, SAMPLES, figure, save
 
@@ -16,23 +17,21 @@ from neurocal_cli import (
 )
 
 REPEATS = 60
+matplotlib.rcParams.update({"font.size": 11.5, "axes.titlesize": 13})
 
 
 def main() -> None:
-    made = figure(4.3, 7.6)
-    seen, residuals, trust = (made.add_subplot(spot) for spot in _places(made))
+    made = figure(4.4, 7.2, layout=None)
+    places = ((0.03, 0.05, 0.5, 0.83), (0.57, 0.545, 0.29, 0.355), (0.57, 0.06, 0.29, 0.355))
+    seen, residuals, trust = (made.add_axes(place) for place in places)
     _draw_board(seen)
     points = read_points(str(SAMPLES / "flat.csv"))
     found = calibrate(points, distortion="none", skew=False)
     _draw_residuals(residuals, points, found)
     bar = _draw_trust(trust, found)
-    made.colorbar(bar, ax=trust, label="std [px]", shrink=0.9, ticks=[0, 0.02, 0.04, 0.06, 0.08])
+    scale = made.add_axes((0.872, 0.07, 0.016, 0.335))
+    made.colorbar(bar, cax=scale, ticks=[0, 0.02, 0.04, 0.06, 0.08]).set_label("std [px]", labelpad=2)
     save(made, "overview.png", dpi=150)
-
-
-def _places(made):
-    grid = made.add_gridspec(2, 2, width_ratios=(1.2, 1))
-    return grid[:, 0], grid[0, 1], grid[1, 1]
 
 
 def _draw_board(axes) -> None:
@@ -50,7 +49,7 @@ def _draw_board(axes) -> None:
             markeredgewidth=0.5,
         )
     axes.set(xlim=(83, 362), ylim=(283, 13), xticks=[], yticks=[])
-    axes.set_title(f"{len(found.pixels)} mid-points of edges, found and named")
+    axes.set_title(f"{len(found.pixels)} mid-points of edges")
     axes.spines[:].set_visible(False)
 
 
@@ -76,7 +75,7 @@ def _draw_residuals(axes, points: Correspondences, found: Calibration) -> None:
         width=0.006,
     )
     axes.set(xlim=(0, 639), ylim=(479, 0), aspect="equal", xticks=[], yticks=[])
-    axes.set_title(f"residuals, 200 times: rms {found.rmse_px:.3f} px")
+    axes.set_title(f"residuals x 200: rms {found.rmse_px:.2f} px")
     axes.spines[:].set_visible(True)
 
 
@@ -103,7 +102,7 @@ def _draw_trust(axes, found: Calibration):
     axes.plot(*found.points.pixels.T, ".", color="white", markersize=0.8, alpha=0.7)
     axes.plot(found.K[0, 2], found.K[1, 2], "+", color=INK, markersize=9)
     axes.set(xlim=(0, 639), ylim=(479, 0), aspect="equal", xticks=[], yticks=[])
-    axes.set_title("how far pixels can be trusted")
+    axes.set_title("trust in predicted pixels")
     return drawn
 
 
