@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from consoles import PAGES, ROOT, agrees, blocks, run_page
+from consoles import PAGES, ROOT, agrees, blocks, prepare, run, run_page
 from reference import pages
 
 import neurocal_cli
@@ -54,6 +54,7 @@ def test_what_a_page_shows_runs_and_prints_that(page: Path, tmp_path: Path) -> N
         ("first\n...\n", "first\nsecond\n"),
         ("first\n...\nlast\n", "first\nsecond\nlast\n"),
         ("-0.0000 px\n", "+0.0000 px\n"),
+        ("89 iterations, after 3 common steps\n", "100 iterations, after 5 common steps\n"),
         ("", ""),
     ],
 )
@@ -104,6 +105,72 @@ def test_links_lead_somewhere(page: Path) -> None:
     text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
     for target in re.findall(r"\]\(([^)#\s]+)", text):
         assert target.startswith("http") or (page.parent / target).exists(), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_files_of_the_project_that_a_page_names_are_there(page: Path) -> None:
+    text = page.read_text(encoding="utf-8")
+    for path in re.findall(r"\b((?:neurocal_cli|tests|docs/tools)/[\w/]+\.py)", text):
+        assert (ROOT / path).exists(), path
+
+
+def test_the_architecture_page_is_of_this_package() -> None:
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    package = ROOT / "neurocal_cli"
+    layers = re.findall(r"`(\w+)`", text[text.index("| packages |") : text.index("Four rules")])
+    there = {
+        path.stem for path in package.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()
+    }
+    assert set(layers) >= there - {"__init__", "__main__"}
+    assert set(layers) - {"calibrate"} <= there
+    way = re.findall(r"^\| `([\w/]+\.py)` \|", text, flags=re.MULTILINE)
+    assert 1 < len(way) <= 8
+    modules = re.findall(r"^\| `[^|]+ \| `([\w.]+)` \| ", text, flags=re.MULTILINE)
+    for path in (*way, *(module.replace(".", "/") + ".py" for module in modules)):
+        assert (package / path).exists(), path
+
+
+STAND_INS = """
+neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 -o points.csv
+neurocal calibrate points.csv --distortion k1 -o camera.yaml
+for name in moved other_points; do cp points.csv $name.csv; done
+for n in 1 2 3 4 5 6; do
+    for kind in png jpg; do cp sample_data/board0$n.png left0$n.$kind; done
+done
+cp sample_data/board01.png frame.png
+echo 'planes: [{name: floor, cols: 9, rows: 6, square: 25.0}]' > corner.yaml
+for side in left right; do
+    for name in $side more_$side; do cp sample_data/stereo_$side.csv $name.csv; done
+    neurocal calibrate $side.csv -o $side.yaml
+done
+neurocal stereo left.csv right.csv -o rig.yaml
+cp sample_data/matches.csv matches.csv
+neurocal lens fit sample_data/zoom.csv --distortion none -o lens.yaml
+cat > cameras.csv <<'END'
+zoom,alpha_u,alpha_v,u0,v0
+24,1201,1200,960,541
+35,1749,1748,961,540
+50,2503,2499,962,540
+70,3498,3497,963,538
+END
+"""
+
+
+@pytest.mark.slow
+def test_the_examples_of_the_help_run(tmp_path: Path) -> None:
+    """In a folder that has files of the names that they use."""
+    start = tmp_path / "start"
+    start.mkdir()
+    environment = prepare(start)
+    made = run(["sh", "-euc", STAND_INS], start, environment)
+    assert made.returncode == 0, made.stdout
+    texts = [text.partition("## Examples")[2] for text in pages().values()]
+    examples = dict.fromkeys(line for text in texts for line in text.splitlines() if "neurocal " in line)
+    for number, example in enumerate(examples):
+        folder = tmp_path / str(number)
+        shutil.copytree(start, folder, symlinks=True)
+        ended = run(["sh", "-euc", example], folder, environment)
+        assert ended.returncode == 0, f"$ {example}\n{ended.stdout}"
 
 
 def test_pictures_have_a_script() -> None:

@@ -23,7 +23,7 @@ def main() -> None:
         "squares 5 % too long in X": _with(good, world=good.world * [1.05, 1, 1]),
         "zoom moved between views": _with(good, pixels=zoomed),
     }
-    made = figure(4.0)
+    made = figure(3.7)
     axes = made.subplots()
     names = ("error left out\n/ error on all", "common camera\n/ own cameras", "two halves\ndisagree [std]")
     limits = (1.3, 1.6, np.sqrt(6.0))
@@ -45,7 +45,7 @@ def main() -> None:
     axes.set(
         yticks=range(3),
         yticklabels=names,
-        ylim=(4.55, -0.55),
+        ylim=(4.3, -0.55),
         xscale="log",
         xlim=(0.1, 40),
         xticks=[0.1, 0.3, 1, 3, 10, 30],
