@@ -131,13 +131,19 @@ def test_the_architecture_page_is_of_this_package() -> None:
 
 
 STAND_INS = """
-neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 -o points.csv
+cp sample_data/flat.csv points.csv
+cp points.csv moved.csv
+cp points.csv other_points.csv
 neurocal calibrate points.csv --distortion k1 -o camera.yaml
-for name in moved other_points; do cp points.csv $name.csv; done
-for n in 1 2 3 4 5 6; do
-    for kind in png jpg; do cp sample_data/board0$n.png left0$n.$kind; done
-done
-cp sample_data/board01.png frame.png
+cat > larger.py <<'END'
+import cv2
+for n in range(1, 7):
+    image = cv2.imread(f"sample_data/board0{n}.png")
+    image = cv2.copyMakeBorder(image, 90, 90, 120, 120, cv2.BORDER_REPLICATE)
+    for name in (f"left0{n}.png", f"left0{n}.jpg", "frame.png"):
+        cv2.imwrite(name, image)
+END
+python larger.py
 echo 'planes: [{name: floor, cols: 9, rows: 6, square: 25.0}]' > corner.yaml
 for side in left right; do
     for name in $side more_$side; do cp sample_data/stereo_$side.csv $name.csv; done

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import pytest
 from wrong_inputs import FLAT, FOLDED, flat, folded, outcome
+from wrong_inputs_table import words
 
 from neurocal_cli import calibrate
 from neurocal_cli.verdict.assessment import judged
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "wrong-inputs.md"
-ROWS = dict(
-    re.findall(
-        r"^\| ([^|]+?) \| (refused|poor|usable) \|", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE
-    )
-)
+ROWS = words()
 
 
 @pytest.mark.parametrize("seed", range(3))
