@@ -123,7 +123,7 @@ def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> N
     expected = {
         "c_cut.png": "cut off",
         "d_empty.png": "is empty",
-        "e_text.png": "is no image",
+        "e_text.png": "is not a readable image",
         "f_bomb.png": "60000 x 60000 px",
         "g_tiny.png": "no board detected",
         "h_black.pgm": "no board detected",
@@ -227,9 +227,7 @@ def test_planes_that_are_missing_and_rejected_points_are_noted(
     board = Board((Plane("a", 9, 6, 25.0), Plane("b", 4, 4, 25.0)))
     found = detect_points(read_image(folder / "board01.png").grey, Board.single(9, 6, 25.0))
     named = replace(found, located=(replace(found.located[0], plane=board.planes[0]),))
-    assert list(batch._remarks(named, board)) == [
-        "no points of b: not detected, or ambiguous"
-    ]
+    assert list(batch._remarks(named, board)) == ["no points of b: not detected, or ambiguous"]
 
 
 @pytest.mark.parametrize(

@@ -83,7 +83,7 @@ def test_a_part_of_the_board_is_placed_by_the_ends_that_are_seen_or_refused(name
 
 
 def test_a_part_that_could_be_anywhere_is_refused() -> None:
-    with pytest.raises(NoBoardError, match="detected 5 x 4 of 9 x 6 inner vertices, but it is ambiguous which"):
+    with pytest.raises(NoBoardError, match="detected 5 x 4 of 9 x 6 inner vertices, but it is ambiguous"):
         identify(Board.single(9, 6, 25), [flat_grid(5, 4)], EMPTY)
 
 
