@@ -106,7 +106,7 @@ def test_a_piece_of_a_bigger_board_is_refused_though_it_has_the_size() -> None:
     seen = picture("base", 0)
     whole = seen_grid(seen.truth.planes[0], True)
     piece = Grid(whole.pixels[:4, :6], whole.dark)
-    with pytest.raises(NoBoardError, match="the pattern goes on beyond 6 x 4"):
+    with pytest.raises(NoBoardError, match="the pattern continues beyond 6 x 4"):
         identify(Board.single(6, 4, 25), [piece], seen.image)
 
 
