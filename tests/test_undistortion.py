@@ -205,7 +205,7 @@ def test_alpha_needs_a_size_and_a_sensible_lens() -> None:
         undistortion(replace(camera("k1"), image_size=None), 0.5, None)
     with pytest.raises(InputError, match="between 0 and 1"):
         undistortion(camera("k1"), 2.0, SIZE)
-    with pytest.raises(InputError, match="leaves no rectangle"):
+    with pytest.raises(InputError, match="no rectangle of valid pixels"):
         undistortion(Camera(Intrinsics(100, 100, 9000, 240), "k1", np.array([-0.3])), 0.0, SIZE)
 
 
