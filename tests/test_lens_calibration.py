@@ -182,7 +182,7 @@ def test_a_lens_that_folds_inside_the_image_is_refused() -> None:
         pixels.append(bent(centred, "k1", [-3.2]))
         names += [f"v{k}"] * len(near)
     points = Correspondences(np.concatenate(worlds), np.concatenate(pixels), names, (352, 240))
-    with pytest.raises(DegenerateGeometryError, match="is not monotonic .* inside the image"):
+    with pytest.raises(DegenerateGeometryError, match=r"is not monotonic .* inside the image"):
         calibrate(points, distortion="k1")
 
 

@@ -95,7 +95,7 @@ def test_a_lens_that_does_not_fold_is_the_same_to_the_last_bit(model: str, seed:
 def test_points_that_deny_every_lens_without_a_fold_are_refused() -> None:
     # A true k1k2 and plenty of points: k1 alone follows them only with a fold.
     points = noisy("k1k2", 130)
-    with pytest.raises(DegenerateGeometryError, match="k1 is not monotonic .* inside the image"):
+    with pytest.raises(DegenerateGeometryError, match=r"k1 is not monotonic .* inside the image"):
         calibrate(points, distortion="k1", skew=False)
 
 
