@@ -78,7 +78,7 @@ def test_noise_free_views_give_the_lens_back(model: str) -> None:
 
 def test_coefficients_that_depend_on_each_other_are_refused() -> None:
     _, points = flat_points("rational")
-    with pytest.raises(DegenerateGeometryError, match="all coefficients of the rational lens"):
+    with pytest.raises(DegenerateGeometryError, match="all coefficients of the distortion model rational"):
         calibrate(points, distortion="rational")
 
 
@@ -157,7 +157,7 @@ def test_a_lens_that_could_not_have_seen_a_pixel_is_refused() -> None:
         distortion_model = "k1"
         distortion = np.array([-3.0])
 
-    with pytest.raises(InputError, match="cannot have seen"):
+    with pytest.raises(InputError, match="maps nothing to"):
         calibrate(points, type=3, intrinsics=Camera())
 
 
@@ -181,7 +181,7 @@ def test_a_lens_that_folds_inside_the_image_is_refused() -> None:
 
 def test_a_lens_of_type_3_cannot_be_chosen() -> None:
     scene = table_1()
-    with pytest.raises(UsageError, match="takes the lens of the given camera"):
+    with pytest.raises(UsageError, match="uses the distortion of the given camera"):
         calibrate(scene.points(), type=3, intrinsics=scene.intrinsics, distortion="k1")
 
 
@@ -192,7 +192,7 @@ def test_coefficients_that_are_noise_are_named() -> None:
 
 
 def test_too_many_coefficients_are_refused() -> None:
-    with pytest.raises(InputError, match="k1k2 has 2"):
+    with pytest.raises(InputError, match="k1k2 needs 2"):
         Distortion("k1k2", np.array([0.1, 0.2, 0.3]))
 
 

@@ -33,7 +33,10 @@ def another_size(board: Board, grid: Grid, ends: Sequence[End]) -> str:
         if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends:
             return f"the pattern continues beyond {wanted} inner vertices; give the size of the whole board"
     have = "board has" if len(board.planes) == 1 else "planes of the board have"
-    return f"detected {_size(shape)} inner vertices, but the {have} {wanted}; give the size of this board"
+    return (
+        f"detected {_size(shape)} inner vertices, but the {have} {wanted}; give the size of the board in the "
+        "image"
+    )
 
 
 def several_ways(board: Board, grids: Sequence[Grid], rms: float) -> str:
