@@ -375,12 +375,12 @@ _DETECTED: dict[str, Correspondences] = {}
 
 def detected(pattern: str, cols: int, rows: int, square: float) -> Correspondences:
     if pattern not in _DETECTED:
-        from neurocal_cli.detection.batch import Task, examine_all
+        from neurocal_cli.detection.batch import DetectionOptions, detect_files
         from neurocal_cli.detection.detect import gather
 
         board = Board.single(cols, rows, square)
         paths = sorted(str(path) for path in DATA.glob(pattern))
-        outcomes = examine_all(paths, Task(board, "midpoints", None, False, True), 1)
+        outcomes = detect_files(paths, DetectionOptions(board, "midpoints", None, False, True), 1)
         found = {f"v{n}": o.detection for n, o in enumerate(outcomes) if o.detection is not None}
         _DETECTED[pattern] = gather(found, board.unit)
     return _DETECTED[pattern]

@@ -20,14 +20,14 @@ from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.io.images import Image, encode_png, read_image
 
-__all__ = ["Outcome", "Task", "default_jobs", "examine", "examine_all", "keep_memory"]
+__all__ = ["DetectionOptions", "Outcome", "default_jobs", "detect_file", "detect_files", "keep_memory"]
 
 _WORTH_A_PROCESS = 4  # images; fewer are done before another process has started
 _KEPT = 31 << 20  # bytes; glibc learns nothing from blocks of 32 MiB and more
 
 
 @dataclass(frozen=True)
-class Task:
+class DetectionOptions:
     """What to look for in the images.
 
     Attributes
@@ -78,7 +78,7 @@ def default_jobs(images: int) -> int:
     return max(1, min(cores, images // _WORTH_A_PROCESS))
 
 
-def examine_all(paths: Sequence[str], task: Task, jobs: int = 1) -> Iterator[Outcome]:
+def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1) -> Iterator[Outcome]:
     """Examine image files; yields their outcomes in the order of the paths.
 
     Parameters
@@ -92,50 +92,50 @@ def examine_all(paths: Sequence[str], task: Task, jobs: int = 1) -> Iterator[Out
     if jobs <= 1:
         keep_memory()
         for path in paths:
-            yield examine(path, task)
+            yield detect_file(path, options)
         return
     # Started afresh: a fork of a process whose libraries have threads may hang.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, _begin)
+    pool = ProcessPoolExecutor(jobs, context, _start_worker)
     try:
-        yield from pool.map(examine, paths, [task] * len(paths))
+        yield from pool.map(detect_file, paths, [options] * len(paths))
     except BrokenProcessPool as error:
         raise NeurocalError("a process was stopped, perhaps for want of memory; use --jobs 1") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def examine(path: str, task: Task) -> Outcome:
+def detect_file(path: str, options: DetectionOptions) -> Outcome:
     """Examine one image file; whatever is wrong with it becomes the outcome's problem."""
     try:
         image = read_image(path)
     except NeurocalError as error:
         return Outcome(path, problem=str(error))
     try:
-        return _detected(path, image, task)
+        return _detected(path, image, options)
     except NeurocalError as error:
         problem = str(error)
     except MemoryError:
         problem = "not enough memory; scale the image down"
     except Exception as error:  # one image must not cost the user all the others
-        if task.strict:
+        if options.strict:
             raise
         problem = f"internal error: {type(error).__name__}: {error}; run with NEUROCAL_DEBUG=1 to see where"
     return Outcome(path, problem=f"{image.source}: {problem}", notes=image.notes)
 
 
-def _detected(path: str, image: Image, task: Task) -> Outcome:
-    grids = find_grids(image.grey, wanted_sizes(task.board))
+def _detected(path: str, image: Image, options: DetectionOptions) -> Outcome:
+    grids = find_grids(image.grey, wanted_sizes(options.board))
     overlay: bytes | None = None
     try:
-        found = detect_points(image.grey, task.board, task.points, task.gamma, grids)
+        found = detect_points(image.grey, options.board, options.points, options.gamma, grids)
     except NeurocalError as error:
-        if task.overlay:
+        if options.overlay:
             overlay = encode_png(draw_failure(image.grey, grids, str(error)))
         return Outcome(path, None, f"{image.source}: {error}", image.notes, overlay)
-    if task.overlay:
+    if options.overlay:
         overlay = encode_png(draw_detection(image.grey, found))
-    return Outcome(path, found, "", (*image.notes, *_remarks(found, task.board)), overlay)
+    return Outcome(path, found, "", (*image.notes, *_remarks(found, options.board)), overlay)
 
 
 def _remarks(found: Detection, board: Board) -> Iterator[str]:
@@ -158,7 +158,7 @@ def keep_memory() -> None:
     np.empty(_KEPT, dtype=np.uint8)
 
 
-def _begin() -> None:
+def _start_worker() -> None:
     """Make a process one of many: an interrupt is its parent's to handle, and each has one core."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)

@@ -13,7 +13,7 @@ from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Located, identify
-from neurocal_cli.detection.identity.words import NoBoardError
+from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array

@@ -13,13 +13,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.board import Board, Fitted, fit_all_vertices, fit_board
-from neurocal_cli.detection.fitting.box import sharp_profile
-from neurocal_cli.detection.fitting.edges import OFFSET, TILT
-from neurocal_cli.detection.fitting.newton import BLUR
-from neurocal_cli.detection.fitting.profile import response
-from neurocal_cli.detection.fitting.robust import median
-from neurocal_cli.detection.fitting.vertices import FIRST, SECOND
+from neurocal_cli.detection.fitting.batched_newton import BLUR
+from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
+from neurocal_cli.detection.fitting.edge_profile import response
+from neurocal_cli.detection.fitting.grid_fit import GridFit, GridImage, fit_grid, fit_grid_vertices
+from neurocal_cli.detection.fitting.map_fit import median
+from neurocal_cli.detection.fitting.pixel_box import sharp_profile
+from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.geometry import Array
 
@@ -57,20 +57,20 @@ def measure(
     light = image if gamma is None else _linear(image, gamma)
     whole = np.issubdtype(light.dtype, np.integer)
     floor = _ROUNDING if whole else (_EXACT * float(np.abs(light).max())) ** 2 + _TINY
-    board = Board.of(light, grid, floor)
-    if len(board.edges.index) == 0:
+    grid_image = GridImage.of(light, grid, floor)
+    if len(grid_image.edges.index) == 0:
         return _nothing(grid)
-    fitted = fit_board(board)
+    fitted = fit_grid(grid_image)
     vertices = np.full(grid.pixels.shape, np.nan)
     seen = grid.seen
     vertices[seen] = fitted.map.map.at(np.argwhere(seen)[:, ::-1].astype(float))
     if points == "vertices":
-        return _vertices(board, fitted, vertices)
-    pixels, covariance = _midpoints(board, fitted)
+        return _vertices(grid_image, fitted, vertices)
+    pixels, covariance = _midpoints(grid_image, fitted)
     good = fitted.good
     return Measured(
-        kind=np.where(board.edges.vertical, EDGE_V, EDGE_H)[good].astype(np.int64),
-        index=board.edges.index[good],
+        kind=np.where(grid_image.edges.vertical, EDGE_V, EDGE_H)[good].astype(np.int64),
+        index=grid_image.edges.index[good],
         pixels=pixels[good],
         covariance=covariance[good],
         across=fitted.lines.normal[good],
@@ -87,16 +87,16 @@ def _nothing(grid: Grid) -> Measured:
     return Measured(index[:, 0], index, none.reshape(0, 2), none.reshape(0, 3), None, vertices, 0, 0.0)
 
 
-def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
+def _midpoints(grid_image: GridImage, fitted: GridFit) -> tuple[Array, Array]:
     """Pixels (E, 2) and covariances (E, 3): along the edges from the map, across from the edges."""
     lines, fit, mapped = fitted.lines, fitted.fit, fitted.map
-    centre = board.edges.centre
+    centre = grid_image.edges.centre
     s = ((mapped.map.at(centre) - lines.middle) * lines.tangent).sum(axis=1)
     d = fit.values[:, OFFSET] + fit.values[:, TILT] * s / (0.5 * lines.length)
     d += 0.5 * lines.curvature * s * s - mapped.shift[0]
     pixels = lines.middle + s[:, None] * lines.tangent + d[:, None] * lines.normal
     along = mapped.map.variance(centre, lines.tangent) * mapped.excess
-    across = fit.covariance[:, OFFSET, OFFSET] * fit.unsettled * min(mapped.excess, 1.0)
+    across = fit.covariance[:, OFFSET, OFFSET] * fit.variance_growth * min(mapped.excess, 1.0)
     across += mapped.shift_variance[0] + fitted.unevenness
     (tu, tv), (nu, nv) = lines.tangent.T, lines.normal.T
     covariance = np.stack(
@@ -110,30 +110,30 @@ def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
     return pixels, covariance
 
 
-def _polarity(fitted: Fitted) -> float:
+def _polarity(fitted: GridFit) -> float:
     """How far towards the dark side [px] the middle between the levels lies from the undisturbed edge."""
     z = np.linspace(-_FAR, _FAR, _PLACES)[None]
     sigma = median(fitted.fit.values[:, BLUR])
     half = None if fitted.shape.half is None else fitted.shape.half[:1]
     edge = sharp_profile(z, np.array([[sigma]]), fitted.shape.tails[:1], half)[0]
-    light = response(edge, fitted.shape.bend)[0][0]
+    light = response(edge, fitted.shape.nonlinearity)[0][0]
     after = max(int(np.argmax(light > 0)), 1)
     share = light[after] / (light[after] - light[after - 1])
     zero = z[0, after] - share * (z[0, 1] - z[0, 0])
     return -float(fitted.map.shift[0]) - float(zero) * sigma
 
 
-def _vertices(board: Board, fitted: Fitted, vertices: Array) -> Measured:
-    fit, (first, second), good = fit_all_vertices(board, fitted)
+def _vertices(grid_image: GridImage, fitted: GridFit, vertices: Array) -> Measured:
+    fit, (first, second), good = fit_grid_vertices(grid_image, fitted)
     # Where the two lines cross: n1 . p = offset1, n2 . p = offset2.
     inverse = np.linalg.inv(np.stack([first.normal, second.normal], axis=1))
     offsets = fit.values[:, [FIRST, SECOND]]
     pixels = first.middle + (inverse @ offsets[:, :, None])[:, :, 0]
-    spread = fit.covariance[:, [[FIRST], [SECOND]], [FIRST, SECOND]] * fit.unsettled[:, None, None]
+    spread = fit.covariance[:, [[FIRST], [SECOND]], [FIRST, SECOND]] * fit.variance_growth[:, None, None]
     spread = inverse @ spread @ inverse.swapaxes(1, 2)
     uneven = fitted.unevenness
     covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
-    index = np.argwhere(board.grid.seen)[:, ::-1]
+    index = np.argwhere(grid_image.grid.seen)[:, ::-1]
     vertices[tuple(index[:, ::-1].T)] = np.where(good[:, None], pixels, np.nan)
     return Measured(
         kind=np.full(int(good.sum()), VERTEX, dtype=np.int64),

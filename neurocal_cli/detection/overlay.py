@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurocal_cli.detection.detect import Detection, label
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Located
-from neurocal_cli.detection.residuals import residuals
+from neurocal_cli.detection.plane_residuals import plane_residuals
 from neurocal_cli.geometry import Array
 
 __all__ = ["draw_detection", "draw_failure"]
@@ -55,8 +55,8 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     picture : (height, width, 3) uint8 array
         Red, green, blue.
     """
-    misses = [residuals(measured) for measured in detection.measured]
-    lengths = np.concatenate([np.hypot(*miss.T) for miss in misses])
+    residuals = [plane_residuals(measured) for measured in detection.measured]
+    lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals])
     square = min(_square(one.grid) for one in detection.located)
     scale = _enlargement(lengths, square)
     lines = [
@@ -65,8 +65,8 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
         _legend(detection),
     ]
     canvas = _Canvas(grey, lines)
-    for located, measured, miss in zip(detection.located, detection.measured, misses, strict=True):
-        _draw_points(canvas, measured, label(located, measured).kind, miss * scale)
+    for located, measured, residual in zip(detection.located, detection.measured, residuals, strict=True):
+        _draw_points(canvas, measured, label(located, measured).kind, residual * scale)
         _draw_frame(canvas, located, measured)
     return canvas.picture
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.detection.finding.grow import Lattice, signs
-from neurocal_cli.detection.finding.levels import Level, sampled
+from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
 
-__all__ = ["edges_seen", "has_block", "is_smooth"]
+__all__ = ["edges_visible", "has_block", "is_smooth"]
 
 _ASIDE = 0.16  # squares; to either side of an edge, half-way between two vertices
 _LEAST_EDGE = 0.3  # of the contrast, across an edge
@@ -36,36 +36,41 @@ def is_smooth(level: Level, lattice: Lattice) -> bool:
 
 def roughness(level: Level, lattice: Lattice) -> float:
     """How far vertices are from where their neighbours put them, over what is tolerated."""
-    row, col, at = lattice.known
-    off = at.in_squares(lattice.pixels[row, col] - at.points) / np.maximum(at.spread, 1.0)[:, None]
+    row, col, predicted = lattice.known
+    off = (
+        predicted.in_squares(lattice.pixels[row, col] - predicted.points)
+        / np.maximum(predicted.spread, 1.0)[:, None]
+    )
     contrast = max(median(lattice.contrast), 1e-3)
-    tolerated = _OFF + (_OFF_PX + _OFF_NOISE * level.noise / contrast) / max(median(at.width), 1.0)
+    tolerated = _OFF + (_OFF_PX + _OFF_NOISE * level.noise / contrast) / max(median(predicted.width), 1.0)
     return float(np.sqrt((off**2).mean())) / tolerated
 
 
-def edges_seen(level: Level, lattice: Lattice) -> bool:
+def edges_visible(level: Level, lattice: Lattice) -> bool:
     """Whether dark and bright are told apart across the edges between neighbouring vertices."""
-    row, col, at = lattice.known
+    row, col, predicted = lattice.known
     pixels, contrast = lattice.pixels, lattice.contrast
     c, r = np.full_like(pixels, np.nan), np.full_like(pixels, np.nan)
-    c[row, col], r[row, col] = at.c, at.r
+    c[row, col], r[row, col] = predicted.c, predicted.r
     held = [
-        _held(level, pixels, r, contrast, lattice.dark),
+        _edges_with_contrast(level, pixels, r, contrast, lattice.dark),
         # With rows and columns exchanged, the squares on either side are too.
-        _held(level, pixels.transpose(1, 0, 2), c.transpose(1, 0, 2), contrast.T, lattice.dark),
+        _edges_with_contrast(
+            level, pixels.transpose(1, 0, 2), c.transpose(1, 0, 2), contrast.T, lattice.dark
+        ),
     ]
     return float(np.concatenate(held).mean()) >= _EDGES
 
 
-def _held(level: Level, pixels: Array, ways: Array, contrast: Array, dark: int) -> Array:
+def _edges_with_contrast(level: Level, pixels: Array, steps: Array, contrast: Array, dark: int) -> Array:
     """Whether each edge along a row is seen; ways (rows, cols, 2) lead from row to row."""
     known = np.isfinite(pixels[..., 0])
     row, col = np.nonzero(known[:, :-1] & known[:, 1:])
     start, end = pixels[row, col], pixels[row, col + 1]
-    across = 0.5 * (ways[row, col] + ways[row, col + 1])
+    across = 0.5 * (steps[row, col] + steps[row, col + 1])
     middle = 0.5 * (start + end)
     sides = np.stack([middle + _ASIDE * across, middle - _ASIDE * across], axis=1)
-    value = sampled(level.smooth, sides)
+    value = interpolate(level.smooth, sides)
     rise = (value[:, 1] - value[:, 0]) * signs(row, col, dark)
     usual = np.minimum(contrast[row, col], contrast[row, col + 1])
     return np.asarray(rise > _LEAST_EDGE * usual)

@@ -9,24 +9,24 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.levels import Level, sampled
-from neurocal_cli.detection.finding.predict import Expected, expected
-from neurocal_cli.detection.finding.refine import settle
-from neurocal_cli.detection.finding.verify import look
+from neurocal_cli.detection.finding.levels import Level, interpolate
+from neurocal_cli.detection.finding.predict import PredictedVertices, predict_vertices
+from neurocal_cli.detection.finding.subpixel import refine_saddles
+from neurocal_cli.detection.finding.vertex_check import check_vertices
 from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
 
 __all__ = [
     "Lattice",
-    "cleaned",
+    "check_lattice",
     "cropped",
-    "framed",
+    "derivative_sigma",
     "frontier",
-    "grown",
-    "judged",
+    "grow",
+    "in_whole_square",
+    "padded",
+    "remove_outliers",
     "signs",
-    "smoothing",
-    "squared",
 ]
 
 Index = NDArray[np.intp]
@@ -65,10 +65,10 @@ class Lattice:
         return np.isfinite(self.pixels[..., 0])
 
     @cached_property
-    def known(self) -> tuple[Index, Index, Expected]:
+    def known(self) -> tuple[Index, Index, PredictedVertices]:
         """Rows and columns (N,) of the known vertices, and where their neighbours put them."""
         row, col = np.nonzero(self.seen)
-        return row, col, expected(self.pixels, row, col)
+        return row, col, predict_vertices(self.pixels, row, col)
 
     def with_contrast(self, contrast: Array) -> Lattice:
         """The same vertices, with contrasts (rows, cols) that have been looked at again."""
@@ -92,22 +92,22 @@ def signs(row: Index, col: Index, dark: int) -> Array:
     return np.where((row + col + dark) % 2 == 0, 1.0, -1.0)
 
 
-def smoothing(width: float) -> float:
+def derivative_sigma(width: float) -> float:
     """Smoothing of derivatives for squares of a width, a few values only [px]."""
     return min(max(round(0.15 * width / 0.25) * 0.25, 0.75), 2.0)
 
 
-def grown(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) -> Lattice:
+def grow(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) -> Lattice:
     """Add vertices between and, unless told otherwise, around the known ones until none fits any more.
 
     With a reach of 2, one vertex in a row may be hidden and the next still be found.
     """
-    sigma, start = smoothing(lattice.width), lattice
+    sigma, start = derivative_sigma(lattice.width), lattice
     tried: set[tuple[int, int, int]] = set()
     top, left = 0, 0  # how far its vertices have moved
     for _ in range(_LAYERS):
         if outwards:
-            lattice, shift = framed(lattice)
+            lattice, shift = padded(lattice)
             top, left = top + shift[0], left + shift[1]
         row, col, support = _frontier(lattice.seen, reach)
         # A place is looked at again only when it has more neighbours than before.
@@ -118,11 +118,11 @@ def grown(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1)
         tried.update(keys)
         if len(fresh) < len(keys):
             row, col = row[fresh], col[fresh]
-        lattice = _layer(level, lattice, row, col, sigma, reach)
+        lattice = _grow_layer(level, lattice, row, col, sigma, reach)
     return cropped(lattice if lattice.seen.sum() > start.seen.sum() else start)
 
 
-def framed(lattice: Lattice) -> tuple[Lattice, tuple[int, int]]:
+def padded(lattice: Lattice) -> tuple[Lattice, tuple[int, int]]:
     """Give a lattice room of one place on every side; how far its vertices moved."""
     rows, cols = lattice.contrast.shape
     seen = lattice.seen
@@ -179,43 +179,45 @@ def _frontier(seen: NDArray[np.bool_], reach: int) -> tuple[Index, Index, NDArra
     return row, col, around[row, col]
 
 
-def _layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: float, reach: int) -> Lattice:
+def _grow_layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: float, reach: int) -> Lattice:
     """Look for vertices at places of a lattice."""
-    at = expected(lattice.pixels, row, col)
-    worth = (at.spread < _MOST_SPREAD * reach) & (at.area > 4) & _inside(level, at.points)
+    predicted = predict_vertices(lattice.pixels, row, col)
+    worth = (
+        (predicted.spread < _MOST_SPREAD * reach) & (predicted.area > 4) & _inside(level, predicted.points)
+    )
     if not worth.all():
-        row, col, at = row[worth], col[worth], at[worth]
+        row, col, predicted = row[worth], col[worth], predicted[worth]
     if not len(row):
         return lattice
     dark = signs(row, col, lattice.dark)
-    points = settle(level.image, _searched(level, at, dark), sigma)
+    points = refine_saddles(level.image, _steepest_nearby(level, predicted, dark), sigma)
     good = np.isfinite(points[:, 0])
-    points = np.where(good[:, None], points, at.points)
-    good &= _off(at, points) < _tolerance(at)
-    sight = look(level, points, at, dark)
-    good &= sight.like & (sight.contrast > _WEAKEST * _usual(lattice)[row, col])
+    points = np.where(good[:, None], points, predicted.points)
+    good &= _off(predicted, points) < _tolerance(predicted)
+    check = check_vertices(level, points, predicted, dark)
+    good &= check.is_vertex & (check.contrast > _WEAKEST * _usual_contrast(lattice)[row, col])
     row, col = row[good], col[good]
     pixels, contrast = lattice.pixels.copy(), lattice.contrast.copy()
-    pixels[row, col], contrast[row, col] = points[good], sight.contrast[good]
+    pixels[row, col], contrast[row, col] = points[good], check.contrast[good]
     return Lattice(pixels, contrast, lattice.dark)
 
 
-def _usual(lattice: Lattice) -> Array:
+def _usual_contrast(lattice: Lattice) -> Array:
     """(rows, cols) mean contrast of the known vertices at most two away, the nearer ones counting more."""
     seen = lattice.seen
     known = np.where(seen, lattice.contrast, 0.0)
     return np.asarray(_around(_around(known)) / np.maximum(_around(_around(seen)), 1))
 
 
-def _off(at: Expected, points: Array) -> Array:
+def _off(predicted: PredictedVertices, points: Array) -> Array:
     """(N,) how far points are from where they are expected, along the farther way [squares]."""
-    away = np.abs(at.in_squares(points - at.points))
+    away = np.abs(predicted.in_squares(points - predicted.points))
     return np.maximum(away[:, 0], away[:, 1])
 
 
-def _tolerance(at: Expected) -> Array:
+def _tolerance(predicted: PredictedVertices) -> Array:
     """How far a vertex may be from where it is expected; (N,) [squares]."""
-    return np.asarray(_OFF + _OFF_SPREAD * at.spread + _OFF_PX / np.maximum(at.width, 1e-3))
+    return np.asarray(_OFF + _OFF_SPREAD * predicted.spread + _OFF_PX / np.maximum(predicted.width, 1e-3))
 
 
 def _inside(level: Level, points: Array) -> NDArray[np.bool_]:
@@ -228,12 +230,12 @@ _SHARES = np.stack(np.meshgrid(*[np.linspace(-_SEARCHED, _SEARCHED, _STEPS)] * 2
 _PRIOR = 1 - 0.4 * np.abs(_SHARES).max(axis=1) / _SEARCHED
 
 
-def _searched(level: Level, at: Expected, dark: Array) -> Array:
+def _steepest_nearby(level: Level, predicted: PredictedVertices, dark: Array) -> Array:
     """Places near the expected ones where a saddle of the right colours is steepest; (N, 2) [px]."""
-    places = at.around(_SHARES, at.points)
+    places = predicted.around(_SHARES, predicted.points)
     maps = places.astype(np.float32)
-    uu, uv, vv = (sampled(x, maps) for x in level.curvature)
-    (c_u, c_v), (r_u, r_v) = -dark * at.c.T, at.r.T
+    uu, uv, vv = (interpolate(x, maps) for x in level.curvature)
+    (c_u, c_v), (r_u, r_v) = -dark * predicted.c.T, predicted.r.T
     steepness = (c_u * r_u)[:, None] * uu
     steepness += (c_v * r_v)[:, None] * vv
     steepness += (c_u * r_v + c_v * r_u)[:, None] * uv
@@ -241,37 +243,42 @@ def _searched(level: Level, at: Expected, dark: Array) -> Array:
     return np.asarray(places[np.arange(len(places)), steepness.argmax(axis=1)])
 
 
-def judged(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
+def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
     """The lattice with its vertices' contrasts, and which of them look right and are where they should be."""
-    row, col, at = lattice.known
+    row, col, predicted = lattice.known
     points = lattice.pixels[row, col]
-    sight = look(level, points, at, signs(row, col, lattice.dark))
+    check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
     contrast = lattice.contrast.copy()
-    contrast[row, col] = sight.contrast
+    contrast[row, col] = check.contrast
     result = lattice.with_contrast(contrast)
-    right = sight.like & (_off(at, points) < _tolerance(at)) & (at.area > 4) & (at.spread < 2 * _MOST_SPREAD)
-    right &= sight.contrast > _WEAKEST * _usual(result)[row, col]
+    right = (
+        check.is_vertex
+        & (_off(predicted, points) < _tolerance(predicted))
+        & (predicted.area > 4)
+        & (predicted.spread < 2 * _MOST_SPREAD)
+    )
+    right &= check.contrast > _WEAKEST * _usual_contrast(result)[row, col]
     good = np.zeros(contrast.shape, dtype=bool)
     good[row, col] = right
     return result, good
 
 
-def cleaned(level: Level, lattice: Lattice) -> Lattice:
+def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
     """Take out vertices that look wrong or are not where their neighbours put them."""
     for _ in range(_ROUNDS):
-        row, col, at = lattice.known
+        row, col, predicted = lattice.known
         if not len(row):
             break
         pixels, contrast, seen = lattice.pixels, lattice.contrast.copy(), lattice.seen
         points = pixels[row, col]
-        off = _off(at, points) / _tolerance(at)
-        off = np.where((at.area > 0) & (at.spread < 2 * _MOST_SPREAD), off, np.inf)
-        sight = look(level, points, at, signs(row, col, lattice.dark))
+        off = _off(predicted, points) / _tolerance(predicted)
+        off = np.where((predicted.area > 0) & (predicted.spread < 2 * _MOST_SPREAD), off, np.inf)
+        check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
         # One that closes no square has little that speaks for it.
-        closes = squared(seen)[row, col]
-        plain = sight.like & (closes | ((sight.even > _EVEN_ALONE) & (off < _OFF_ALONE)))
+        closes = in_whole_square(seen)[row, col]
+        plain = check.is_vertex & (closes | ((check.evenness > _EVEN_ALONE) & (off < _OFF_ALONE)))
         off = np.where(plain, off, np.inf)
-        contrast[row, col] = sight.contrast
+        contrast[row, col] = check.contrast
         if not (off > 1).any():
             lattice = lattice.with_contrast(contrast)
             break
@@ -284,18 +291,18 @@ def cleaned(level: Level, lattice: Lattice) -> Lattice:
     return cropped(lattice)
 
 
-def squared(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def in_whole_square(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which vertices are corners of a square with four known corners."""
     whole = seen[:-1, :-1] & seen[:-1, 1:] & seen[1:, :-1] & seen[1:, 1:]
-    squared = np.zeros_like(seen)
+    in_whole_square = np.zeros_like(seen)
     for part in (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]):
-        squared[part] |= whole
-    return squared
+        in_whole_square[part] |= whole
+    return in_whole_square
 
 
 def _largest_around(values: Array) -> Array:
     """Maximum over the 3 x 3 places around each."""
-    framed = np.zeros((values.shape[0] + 2, values.shape[1] + 2))
-    framed[1:-1, 1:-1] = values
-    rows = np.maximum(np.maximum(framed[:-2], framed[1:-1]), framed[2:])
+    padded = np.zeros((values.shape[0] + 2, values.shape[1] + 2))
+    padded[1:-1, 1:-1] = values
+    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
     return np.asarray(np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:]))

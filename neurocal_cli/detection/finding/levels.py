@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["Level", "levels_of", "sampled"]
+__all__ = ["Level", "interpolate", "levels_of"]
 
 Image = NDArray[np.float32]
 
@@ -107,7 +107,7 @@ def _grey(image: NDArray[np.generic]) -> Image:
     return np.asarray(np.nan_to_num(scaled), dtype=np.float32)
 
 
-def sampled(image: Image, points: NDArray[np.floating]) -> Array:
+def interpolate(image: Image, points: NDArray[np.floating]) -> Array:
     """Interpolate an image at points of any shape (..., 2) [px]; outside the border goes on."""
     flat = points.reshape(-1, points.shape[-2], 2) if points.ndim > 2 else points.reshape(-1, 1, 2)
     maps = flat.astype(np.float32, copy=False)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.finding.grow import Lattice
 from neurocal_cli.geometry import Array
 
-__all__ = ["merged"]
+__all__ = ["merge_lattices"]
 
 _NEAR = 4.0  # squares; of one lattice from the other, to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; farthest from whole numbers, median and worst
@@ -18,7 +18,7 @@ _TURNS = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))
 Index = NDArray[np.intp]
 
 
-def merged(lattices: list[Lattice]) -> list[Lattice]:
+def merge_lattices(lattices: list[Lattice]) -> list[Lattice]:
     """Put lattices together whose coordinates agree where each, continued, meets the other."""
     result = sorted(lattices, key=lambda x: -int(x.seen.sum()))
     first = 0

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["Expected", "expected"]
+__all__ = ["PredictedVertices", "predict_vertices"]
 
 _REACH = 3  # squares
 _WIDTH = 1.4  # squares; of the weights
@@ -32,7 +32,7 @@ _FIRST, _ONES = np.eye(6)[0], np.ones(len(_c))
 
 
 @dataclass(frozen=True, eq=False)
-class Expected:
+class PredictedVertices:
     """Expected vertices.
 
     Attributes
@@ -45,22 +45,22 @@ class Expected:
     """
 
     points: Array
-    ways: Array
+    steps: Array
     spread: Array
 
-    def __getitem__(self, which: NDArray[np.generic]) -> Expected:
+    def __getitem__(self, which: NDArray[np.generic]) -> PredictedVertices:
         """Some of them."""
-        return Expected(self.points[which], self.ways[which], self.spread[which])
+        return PredictedVertices(self.points[which], self.steps[which], self.spread[which])
 
     @property
     def c(self) -> Array:
         """(N, 2) ways along a row [px]."""
-        return self.ways[:, 0]
+        return self.steps[:, 0]
 
     @property
     def r(self) -> Array:
         """(N, 2) ways along a column [px]."""
-        return self.ways[:, 1]
+        return self.steps[:, 1]
 
     @cached_property
     def area(self) -> Array:
@@ -70,13 +70,13 @@ class Expected:
     @property
     def width(self) -> Array:
         """(N,) distance between opposite sides of a square, the smaller one [px]."""
-        length = np.hypot(self.ways[..., 0], self.ways[..., 1])
+        length = np.hypot(self.steps[..., 0], self.steps[..., 1])
         longest = np.maximum(length[:, 0], length[:, 1])
         return np.asarray(np.abs(self.area) / np.maximum(longest, 1e-9))
 
     def around(self, shares: Array, points: Array) -> Array:
         """Places (N, K, 2) around points (N, 2), at shares (K, 2) of `c` and `r`."""
-        return np.asarray(points[:, None] + shares @ self.ways)
+        return np.asarray(points[:, None] + shares @ self.steps)
 
     def in_squares(self, away: Array) -> Array:
         """Pixel offsets (N, 2) as shares of `c` and `r`."""
@@ -96,7 +96,7 @@ def _window(width: int) -> NDArray[np.intp]:
     return (size[:, None] * width + size).ravel()
 
 
-def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Expected:
+def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> PredictedVertices:
     """Expect vertices where their neighbours put them, whether they are known or not.
 
     Parameters
@@ -106,13 +106,13 @@ def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Exp
     row, col : (N,) int arrays
     """
     rows, cols = pixels.shape[:2]
-    framed = np.zeros((3, rows + 2 * _REACH, cols + 2 * _REACH))
-    inner = framed[:, _REACH:-_REACH, _REACH:-_REACH]
+    padded = np.zeros((3, rows + 2 * _REACH, cols + 2 * _REACH))
+    inner = padded[:, _REACH:-_REACH, _REACH:-_REACH]
     seen = ~np.isnan(pixels[..., 0])
     np.copyto(inner[:2], pixels.transpose(2, 0, 1), where=seen)
     inner[2] = seen
-    width = framed.shape[2]
-    near = framed.reshape(3, -1).take((row * width + col)[:, None] + _window(width), axis=1)
+    width = padded.shape[2]
+    near = padded.reshape(3, -1).take((row * width + col)[:, None] + _window(width), axis=1)
     known = near[2]
     sums = known @ _PRODUCTS
     normal = sums[:, :-1].reshape(-1, 6, 6) + _HELD_BACK
@@ -125,4 +125,4 @@ def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Exp
     right[:, :, :2] = (offset @ _RIGHT).transpose(1, 2, 0)
     right[:, :, 2] = _FIRST
     solution = np.linalg.solve(normal, right)
-    return Expected(solution[:, 0, :2] + origin.T, solution[:, 1:3, :2], np.sqrt(solution[:, 0, 2]))
+    return PredictedVertices(solution[:, 0, :2] + origin.T, solution[:, 1:3, :2], np.sqrt(solution[:, 0, 2]))

@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.levels import Level, sampled
-from neurocal_cli.detection.finding.refine import settle
+from neurocal_cli.detection.finding.levels import Level, interpolate
+from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 
 __all__ = ["Saddles", "find_saddles"]
@@ -69,15 +69,15 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     covered : (height, width) uint8 array, optional
         Non-zero where not to look.
     """
-    points = _strongest(level, covered)
-    points = settle(level.image, points, 1.0, rounds=2)
+    points = _steepest_pixels(level, covered)
+    points = refine_saddles(level.image, points, 1.0, rounds=2)
     points = points[np.isfinite(points[:, 0])]
-    curved, sharp = _curved(level, points)
+    curved, sharp = _ports_from_curvature(level, points)
     points, curved = points[sharp], curved[sharp]
     if not len(points):
         return Saddles(np.zeros((0, 2)), np.zeros((0, 4)), np.zeros(0))
     noise = level.noise
-    rings = [_ring(sampled(level.smooth, points + (r * _DIRECTIONS)[:, None]), noise) for r in _RADII]
+    rings = [_ring(interpolate(level.smooth, points + (r * _DIRECTIONS)[:, None]), noise) for r in _RADII]
     (ports, contrast, good), (ports_small, contrast_small, good_small) = rings
     # Where squares are small, rings reach into the next ones: trust a ring that agrees with a
     # smaller one, and curvature where none does.
@@ -91,7 +91,7 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     return Saddles(points[kept], ports[kept], contrast[kept])
 
 
-def _curved(level: Level, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+def _ports_from_curvature(level: Level, points: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Ports from the second derivatives, and whether both principal curvatures stand out from noise."""
     u, v = np.rint(points.T).astype(np.intp)
     uu, uv, vv = (x[v, u].astype(float) for x in level.curvature)
@@ -117,7 +117,7 @@ _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 _NEXT = (np.arange(_RAYS) + 1) % _RAYS
 
 
-def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:
+def _steepest_pixels(level: Level, covered: NDArray[np.uint8] | None) -> Array:
     """Whole pixels where the saddle is steepest; (N, 2)."""
     u, v, steepness = _peaks(level)
     if covered is not None:

@@ -12,11 +12,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.levels import Level, sampled
+from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.geometry import Array
 
-__all__ = ["Links", "find_links", "find_seeds", "find_slim_seeds"]
+__all__ = ["Links", "find_links", "find_seeds_2x3", "find_seeds_3x3"]
 
 Index = NDArray[np.intp]
 
@@ -72,7 +72,7 @@ def find_links(level: Level, saddles: Saddles) -> Links:
         entry[found, p] = port[best, rows][found]
     mutual = (to >= 0) & (to[to, entry] == rows[:, None])
     to[~mutual], entry[~mutual] = -1, -1
-    torn = ~_edges_seen(level, saddles, to, entry)
+    torn = ~_edges_visible(level, saddles, to, entry)
     to[torn], entry[torn] = -1, -1
     return Links(to, entry)
 
@@ -94,7 +94,7 @@ def _port_towards(du: NDArray[np.float32], dv: NDArray[np.float32], ports: Array
     return port
 
 
-def _edges_seen(level: Level, saddles: Saddles, to: Index, entry: Index) -> NDArray[np.bool_]:
+def _edges_visible(level: Level, saddles: Saddles, to: Index, entry: Index) -> NDArray[np.bool_]:
     """(N, 4) whether bright and dark are told apart all along a link."""
     seen = np.zeros(to.shape, dtype=bool)
     first, p = np.nonzero(to >= 0)
@@ -109,7 +109,7 @@ def _edges_seen(level: Level, saddles: Saddles, to: Index, entry: Index) -> NDAr
     middle = start[:, None] + share[:, None] * way[:, None]
     offset = (reach[:, None] * normal)[:, None]
     # Growing angles turn from the way to its normal: behind an even port that side is dark.
-    step = sampled(level.smooth, np.stack([middle - offset, middle + offset], axis=1))
+    step = interpolate(level.smooth, np.stack([middle - offset, middle + offset], axis=1))
     rise = (step[:, 0] - step[:, 1]) * np.where(p % 2 == 0, 1, -1)[:, None]
     contrast = np.minimum(saddles.contrast[first], saddles.contrast[to[first, p]])
     seen[first, p] = rise.min(axis=1) > 0.15 * contrast
@@ -118,7 +118,7 @@ def _edges_seen(level: Level, saddles: Saddles, to: Index, entry: Index) -> NDAr
     return seen & back
 
 
-def find_seeds(saddles: Saddles, links: Links) -> tuple[Index, Array]:
+def find_seeds_3x3(saddles: Saddles, links: Links) -> tuple[Index, Array]:
     """Find blocks of four closed squares around a vertex, the most regular first.
 
     Returns
@@ -145,7 +145,7 @@ def find_seeds(saddles: Saddles, links: Links) -> tuple[Index, Array]:
     return block[order], irregularity[order]
 
 
-def find_slim_seeds(saddles: Saddles, links: Links) -> tuple[Index, Index]:
+def find_seeds_2x3(saddles: Saddles, links: Links) -> tuple[Index, Index]:
     """Find blocks of two closed squares side by side, where there are not four.
 
     Returns

@@ -10,7 +10,7 @@ import numpy as np
 from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.geometry import Array
 
-__all__ = ["Stretched", "stretched"]
+__all__ = ["Stretched", "stretch"]
 
 _FACTOR = 2.0
 _ONE_WAY = 1.8  # least ratio of the gradients across and along the slivers
@@ -39,7 +39,7 @@ class Stretched:
         return np.asarray((points - self.forth[:, 2]) @ np.linalg.inv(self.forth[:, :2]).T)
 
 
-def stretched(level: Level, saddles: Array) -> Stretched | None:
+def stretch(level: Level, saddles: Array) -> Stretched | None:
     """Stretch the surroundings of saddles across the way most edges run.
 
     Parameters

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.robust import median
+from neurocal_cli.detection.fitting.map_fit import median
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["FORMS", "LENS", "Frame", "Places", "SmoothMap", "homography_start"]
+__all__ = ["MAP_MODELS", "RICHEST_LENS", "Frame", "Places", "SmoothMap", "homography_start"]
 
 # Forms of the map from the simplest on: (radial parameters, degree of the polynomial rest).
-FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
-LENS = 3  # index of the richest form without a polynomial
+MAP_MODELS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
+RICHEST_LENS = 3  # index of the richest form without a polynomial
 
 _HOMOGRAPHY, _LENS = 8, 6
 _REST = _HOMOGRAPHY + _LENS
@@ -121,7 +121,7 @@ class SmoothMap:
         )
         return weights
 
-    def shaped(self, radial: int, degree: int) -> SmoothMap:
+    def with_model(self, radial: int, degree: int) -> SmoothMap:
         """The map with other free parameters; new ones are 0 and old ones dropped."""
         old = self.parameters[_REST:].reshape(2, -1)
         rest = np.zeros((2, len(_orders(degree, self.frame))))

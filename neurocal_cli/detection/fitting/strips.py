@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.geometry import Array
 
-__all__ = ["Lines", "Strips", "gather", "grid_lines"]
+__all__ = ["Lines", "Strips", "grid_lines", "strip_pixels"]
 
 Single = NDArray[np.float32]
 
@@ -135,7 +135,7 @@ class Strips:
     beyond: Array
 
 
-def gather(
+def strip_pixels(
     image: NDArray[np.generic], lines: Lines, half_width: Array, trim: Array, stride: int = 1
 ) -> Strips:
     """Pixels of the strips ``|d| <= half_width`` between the ends of lines.

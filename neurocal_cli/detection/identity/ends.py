@@ -65,10 +65,10 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
     with np.errstate(invalid="ignore"):  # what is not known is nan
         sides = _opposite(grey, grid.pixels.transpose(1, 0, 2), grid.dark)
         sides += _opposite(grey, grid.pixels, grid.dark)
-        return {direction: _judge(side) for direction, side in zip(DIRECTIONS, sides, strict=True)}
+        return {direction: _classify(side) for direction, side in zip(DIRECTIONS, sides, strict=True)}
 
 
-def _judge(side: _Side) -> End:
+def _classify(side: _Side) -> End:
     ring = side.profile[:, _RING].mean(axis=1)
     valid = np.abs(ring - side.light) < _SAME
     count = np.count_nonzero(valid)

@@ -24,10 +24,15 @@ from numpy.typing import NDArray
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End, board_ends
-from neurocal_cli.detection.identity.fit import fit_camera, is_flat, motion
+from neurocal_cli.detection.identity.linear_camera import fit_camera, is_flat, rigid_motion
+from neurocal_cli.detection.identity.messages import (
+    SYMMETRIC_BOARD,
+    NoBoardError,
+    ambiguity_message,
+    wrong_size_message,
+)
 from neurocal_cli.detection.identity.placement import Placement, placements
 from neurocal_cli.detection.identity.trim import trimmed
-from neurocal_cli.detection.identity.words import LOOKS_THE_SAME, NoBoardError, another_size, several_ways
 from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
 
@@ -96,12 +101,12 @@ def identify(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> 
     chosen = _candidates(board, grids, grey)
     whole = [candidate for candidate in chosen if candidate.whole]
     try:
-        kept, warnings = _settled(board, chosen, _consistent(board, chosen))
+        kept, warnings = _resolve_symmetry(board, chosen, _consistent(board, chosen))
     except NoBoardError:
         if len(whole) in (0, len(chosen)):
             raise
         chosen = whole  # the others are no part of the board, or too small a part of it
-        kept, warnings = _settled(board, chosen, _consistent(board, chosen))
+        kept, warnings = _resolve_symmetry(board, chosen, _consistent(board, chosen))
     located = [Located(c.grid, board.planes[p.plane], p) for c, p in zip(chosen, kept, strict=True)]
     return Identified(tuple(sorted(located, key=lambda one: one.placement.plane)), warnings)
 
@@ -117,7 +122,7 @@ class _Candidate:
 
 
 @dataclass(frozen=True)
-class _Way:
+class _Arrangement:
     """One way for all grids to lie on the board, and how badly one camera sees them so [px]."""
 
     placements: tuple[Placement, ...]
@@ -133,7 +138,7 @@ def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) 
         others = [c for c in every if not c.ways]
         usable = [c for c in usable if not any(_may_be_a_piece(c, other) for other in others)]
     if not usable:
-        raise NoBoardError(another_size(board, largest.grid, list(largest.ends.values())))
+        raise NoBoardError(wrong_size_message(board, largest.grid, list(largest.ends.values())))
     return (_foremost(board, usable) + [c for c in usable if not c.whole])[: len(board.planes)]
 
 
@@ -182,13 +187,13 @@ def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidat
     return _Candidate(grid, tuple(ways), whole, ends)
 
 
-def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Way]:
+def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement]:
     """Ways for all grids together that one camera can see, the best one first."""
     if len(board.planes) == 1:
-        return [_Way((placement,)) for placement in chosen[0].ways]
+        return [_Arrangement((placement,)) for placement in chosen[0].ways]
     flat = is_flat(np.concatenate([_corners(plane) for plane in board.planes]))
     front = board.planes[0].normal if flat else None
-    ways, before = [_Way(())], 0.0
+    ways, before = [_Arrangement(())], 0.0
     for count, candidate in enumerate(chosen, start=1):
         longer = [
             (*way.placements, placement)
@@ -197,7 +202,7 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Way]:
             if placement.plane not in {p.plane for p in way.placements}
         ]
         if len(longer) > _MOST_WAYS:
-            raise NoBoardError(several_ways(board, [c.grid for c in chosen], 0.0))
+            raise NoBoardError(ambiguity_message(board, [c.grid for c in chosen], 0.0))
         ways = [_scored(board, chosen[:count], placements, front) for placements in longer]
         ways = sorted((way for way in ways if np.isfinite(way.rms)), key=lambda way: way.rms)
         if not ways:
@@ -217,7 +222,7 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Way]:
 
 def _scored(
     board: Board, chosen: Sequence[_Candidate], way: tuple[Placement, ...], front: Array | None
-) -> _Way:
+) -> _Arrangement:
     world, pixels = [], []
     for candidate, placement in zip(chosen, way, strict=True):
         rows, columns = np.nonzero(candidate.grid.seen)
@@ -227,17 +232,17 @@ def _scored(
         pixels.append(candidate.grid.pixels[rows[some], columns[some]])
     fit = fit_camera(np.concatenate(world), np.concatenate(pixels), front)
     if fit.handed < 0:
-        return _Way(way, np.inf)
-    return _Way(way, fit.rms if len(chosen) > 1 else 0.0)  # a plane alone fits however it is bent
+        return _Arrangement(way, np.inf)
+    return _Arrangement(way, fit.rms if len(chosen) > 1 else 0.0)  # a plane alone fits however it is bent
 
 
-def _settled(
-    board: Board, chosen: Sequence[_Candidate], ways: Sequence[_Way]
+def _resolve_symmetry(
+    board: Board, chosen: Sequence[_Candidate], ways: Sequence[_Arrangement]
 ) -> tuple[tuple[Placement, ...], tuple[str, ...]]:
     """Choose among ways that geometry cannot tell apart: by colours, then by the image."""
     grids = [candidate.grid for candidate in chosen]
     if not all(_same_board(board, grids, ways[0], way) for way in ways[1:]):
-        raise NoBoardError(several_ways(board, grids, ways[0].rms))
+        raise NoBoardError(ambiguity_message(board, grids, ways[0].rms))
     colours = [_colours(grids, way) for way in ways]
     left = [way for way, colour in zip(ways, colours, strict=True) if colour == max(colours)]
     if len(left) == 1:
@@ -245,20 +250,20 @@ def _settled(
     # A tie lies at 45 degrees to an axis of the board, where boards are seldom held.
     towards = np.array([1.0, 1.0]) if len(left) == 2 else np.array([1.0, 0.0])
 
-    def leading(way: _Way) -> tuple[float, float]:
+    def leading(way: _Arrangement) -> tuple[float, float]:
         first, grid = min(zip(way.placements, grids, strict=True), key=lambda pair: pair[0].plane)
         return round(float(first.axis(grid) @ towards), 6), -float(np.nanmean(grid.pixels))
 
-    return max(left, key=leading).placements, (LOOKS_THE_SAME,)
+    return max(left, key=leading).placements, (SYMMETRIC_BOARD,)
 
 
-def _colours(grids: Sequence[Grid], way: _Way) -> tuple[bool, ...]:
+def _colours(grids: Sequence[Grid], way: _Arrangement) -> tuple[bool, ...]:
     """Whether the square at vertex (0, 0) is dark, plane by plane in the board's order."""
     pairs = sorted(zip(way.placements, grids, strict=True), key=lambda pair: pair[0].plane)
     return tuple(placement.first_square_is_dark(grid.dark) for placement, grid in pairs)
 
 
-def _same_board(board: Board, grids: Sequence[Grid], first: _Way, second: _Way) -> bool:
+def _same_board(board: Board, grids: Sequence[Grid], first: _Arrangement, second: _Arrangement) -> bool:
     """Whether two ways differ by a motion that takes the whole board onto itself."""
     world: list[list[Array]] = [[], []]
     for points, way in zip(world, (first, second), strict=True):
@@ -266,7 +271,7 @@ def _same_board(board: Board, grids: Sequence[Grid], first: _Way, second: _Way) 
             c, r = grid.shape[0] - 1, grid.shape[1] - 1
             box = placement.apply([[0, 0], [c, 0], [0, r], [c, r]])
             points.append(board.planes[placement.plane].at(box))
-    moved = motion(np.concatenate(world[0]), np.concatenate(world[1]))
+    moved = rigid_motion(np.concatenate(world[0]), np.concatenate(world[1]))
     if moved is None:
         return False
     R, t = moved

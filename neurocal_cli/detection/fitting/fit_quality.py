@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.newton import BLUR, CONTRAST, MEAN, Fit
-from neurocal_cli.detection.fitting.robust import median
+from neurocal_cli.detection.fitting.batched_newton import BLUR, CONTRAST, MEAN, BatchFit
+from neurocal_cli.detection.fitting.map_fit import median
 from neurocal_cli.geometry import Array
 
-__all__ = ["believable", "smooth"]
+__all__ = ["is_reliable", "is_typical"]
 
 _LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # of what is expected
 _MOST_BLUR = 2.0  # times what is expected, or its inverse
@@ -24,7 +24,7 @@ _MOST_SPREAD = 0.5  # standard deviation of an offset, in sigma; more is a fit t
 _MOST_STEP, _MOST_MOVE = 1.0, 0.03
 
 
-def smooth(fit: Fit) -> NDArray[np.bool_]:
+def is_typical(fit: BatchFit) -> NDArray[np.bool_]:
     """(E,) whether fits look like those of most of the board: enough to learn from them."""
     contrast = fit.values[:, CONTRAST] / median(fit.values[:, CONTRAST])
     rough = fit.chi2 / np.maximum(fit.count, 1)
@@ -33,7 +33,7 @@ def smooth(fit: Fit) -> NDArray[np.bool_]:
     return (contrast > _LEAST_CONTRAST**2) & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
 
 
-def believable(fit: Fit, departure: Array, beyond: Array) -> NDArray[np.bool_]:
+def is_reliable(fit: BatchFit, departure: Array, beyond: Array) -> NDArray[np.bool_]:
     """(E,) whether fits agree with their pixels, the rest of the board, and the map.
 
     Parameters

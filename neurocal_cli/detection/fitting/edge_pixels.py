@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.edges import EdgeData, edge_data
-from neurocal_cli.detection.fitting.robust import median
+from neurocal_cli.detection.fitting.edge_fit import EdgeData, edge_data
+from neurocal_cli.detection.fitting.map_fit import median
 from neurocal_cli.detection.fitting.shading import Shading
-from neurocal_cli.detection.fitting.strips import Lines, gather
+from neurocal_cli.detection.fitting.strips import Lines, strip_pixels
 from neurocal_cli.geometry import Array
 
 __all__ = ["REACH", "SHARP", "edge_pixels", "usual_stride"]
@@ -39,7 +39,7 @@ def edge_pixels(
         Only every so manieth column; 1 for the last fit, when the crossing lines are well known.
     """
     half = np.minimum(reach, 0.5 * lines.width)
-    strips = gather(image, lines, half, np.zeros((len(half), 1)), stride)
+    strips = strip_pixels(image, lines, half, np.zeros((len(half), 1)), stride)
     contrast = shading.at(lines.middle)[1]
     nearest = np.where(sigma < SHARP, _NEAREST_SHARP / sigma, _NEAREST)
     if stride > 1:

@@ -18,19 +18,19 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.box import sharp_profile
-from neurocal_cli.detection.fitting.newton import (
+from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     MORE_STEPS,
-    Fit,
-    Linear,
+    BatchFit,
+    LevelPrior,
+    Linearised,
     Part,
-    Prior,
-    Shape,
-    gauss_newton,
+    ProfileShape,
+    fit_batch,
     rows_for,
 )
-from neurocal_cli.detection.fitting.profile import erf_and_density, response
+from neurocal_cli.detection.fitting.edge_profile import erf_and_density, response
+from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.strips import Lines, Strips
 from neurocal_cli.geometry import Array
 
@@ -170,32 +170,32 @@ def edge_data(
 def fit_edges(
     data: EdgeData,
     start: Array,
-    prior: Prior,
+    prior: LevelPrior,
     half_length: Array,
-    shape: Shape,
+    shape: ProfileShape,
     steps: int,
     more: int = MORE_STEPS,
-) -> Fit:
+) -> BatchFit:
     """Gauss-Newton steps of all edges at once.
 
     Parameters
     ----------
     data : EdgeData
     start : (E, 5) array
-        Offset [px], tilt [px over the half length], and the values of `Fit`.
+        Offset [px], tilt [px over the half length], and the values of `BatchFit`.
     prior : Prior
     half_length : (E,) array [px]
     shape : Shape
     steps, more : int
-        See `gauss_newton`.
+        See `fit_batch`.
     """
     lever = data.s / half_length.astype(np.float32)[:, None]
 
-    def model_of(part: Part) -> Callable[[Array], Linear]:
-        pixels, levers, form = data.part(part), lever[part], shape.part(part)
-        return lambda values: linearised(pixels, levers, values, form)
+    def model_of(part: Part) -> Callable[[Array], Linearised]:
+        pixels, levers, part_shape = data.part(part), lever[part], shape.part(part)
+        return lambda values: linearised(pixels, levers, values, part_shape)
 
-    return gauss_newton(model_of, start, prior, data.count, steps, more)
+    return fit_batch(model_of, start, prior, data.count, steps, more)
 
 
 def light_at(data: EdgeData, values: Array) -> Single:
@@ -204,7 +204,7 @@ def light_at(data: EdgeData, values: Array) -> Single:
     return np.asarray(erf_and_density((data.d - offset) / sigma)[0] * data.Q, dtype=np.float32)
 
 
-def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Linear:
+def linearised(data: EdgeData, lever: Single, values: Array, shape: ProfileShape) -> Linearised:
     """The model and its derivatives; ``lever`` is s over the half length."""
     offset, tilt, mean, contrast, sigma = np.ascontiguousarray(values.T, data.value.dtype)[:, :, None]
     z = data.d - offset
@@ -222,8 +222,8 @@ def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Li
     rows = rows_for(len(z), 5, z.shape[1], x.dtype)
     residual, by_offset, by_tilt, by_mean, by_contrast, by_blur = rows.swapaxes(0, 1)[:6]
     factor = gain * (-contrast / sigma)
-    if shape.bend.any():
-        F, steep = response(x, shape.bend)
+    if shape.nonlinearity.any():
+        F, steep = response(x, shape.nonlinearity)
         factor *= steep
     else:
         F = x
@@ -239,7 +239,7 @@ def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Li
     np.subtract(data.value, mean, out=residual)
     residual *= data.root
     residual -= contrast * by_contrast
-    return Linear(rows, z, x)
+    return Linearised(rows, z, x)
 
 
 def with_weight(data: EdgeData, weight: Single) -> EdgeData:

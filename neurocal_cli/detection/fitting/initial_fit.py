@@ -7,19 +7,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.box import half_widths
-from neurocal_cli.detection.fitting.edges import EdgeData, fit_edges, with_weight
-from neurocal_cli.detection.fitting.gate import smooth
-from neurocal_cli.detection.fitting.newton import BLUR, Fit, Prior, Shape
-from neurocal_cli.detection.fitting.noise import profile_shape
-from neurocal_cli.detection.fitting.pixels import REACH, SHARP, edge_pixels, usual_stride
-from neurocal_cli.detection.fitting.profile import RESPONSE_TERMS, box_kurtosis
-from neurocal_cli.detection.fitting.robust import median
+from neurocal_cli.detection.fitting.batched_newton import BLUR, BatchFit, LevelPrior, ProfileShape
+from neurocal_cli.detection.fitting.common_parameters import profile_shape
+from neurocal_cli.detection.fitting.edge_fit import EdgeData, fit_edges, with_weight
+from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis
+from neurocal_cli.detection.fitting.fit_quality import is_typical
+from neurocal_cli.detection.fitting.map_fit import median
+from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.geometry import Array
 
-__all__ = ["FreeFit", "fit_freely"]
+__all__ = ["InitialFit", "fit_initial"]
 
 _SLACK = 0.5  # px, for starts that are off
 _FEW_STEPS, _STEPS = 3, 6  # of Gauss and Newton, at most; the former before blur and shape are known
@@ -30,7 +30,7 @@ _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations before anyt
 
 
 @dataclass(frozen=True, eq=False)
-class FreeFit:
+class InitialFit:
     """Fits with free levels.
 
     Attributes
@@ -42,8 +42,8 @@ class FreeFit:
     """
 
     data: EdgeData
-    fit: Fit
-    shape: Shape
+    fit: BatchFit
+    shape: ProfileShape
 
     @property
     def rough(self) -> float:
@@ -52,13 +52,13 @@ class FreeFit:
 
     def blur(self, otherwise: float) -> float:
         """Typical blur [px]."""
-        good = smooth(self.fit)
+        good = is_typical(self.fit)
         return median(self.fit.values[good, BLUR]) if good.any() else otherwise
 
 
-def fit_freely(
+def fit_initial(
     image: NDArray[np.generic], lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
-) -> FreeFit:
+) -> InitialFit:
     """Fit edges with levels of their own.
 
     Parameters
@@ -75,53 +75,53 @@ def fit_freely(
     """
     known = np.stack([*shading.at(lines.middle), np.full(len(offset), sigma)], axis=-1)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), known], axis=1)
-    begun = _begun(image, lines, start, known, shading, noise)
-    found = begun.blur(sigma)
+    started = _few_steps(image, lines, start, known, shading, noise)
+    found = started.blur(sigma)
     # The blur decides what the lines that cross do to the pixels.
     if abs(found - sigma) > _BLUR_OFF * sigma or (found < SHARP) != (sigma < SHARP):
         known[:, 2] = found
-        start = np.where(smooth(begun.fit)[:, None], begun.fit.values, start)
+        start = np.where(is_typical(started.fit)[:, None], started.fit.values, start)
         start[:, BLUR] = found
-        again = _shaped(_begun(image, lines, start, known, shading, noise), lines, found)
-        if again.rough < _WORSE * begun.rough:
+        again = _with_best_profile(_few_steps(image, lines, start, known, shading, noise), lines, found)
+        if again.rough < _WORSE * started.rough:
             return again
-    return _shaped(begun, lines, sigma)
+    return _with_best_profile(started, lines, sigma)
 
 
-def _begun(
+def _few_steps(
     image: NDArray[np.generic], lines: Lines, start: Array, known: Array, shading: Shading, noise: float
-) -> FreeFit:
+) -> InitialFit:
     """A few steps, to see what the blur is; known (E, 3) are mean level, contrast and blur."""
     blur, half_length = known[:, 2], 0.5 * lines.length
     data = edge_pixels(image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
     data = with_weight(data, np.full_like(data.root, 1 / noise))
     spread = known * [0.0, 0.0, _LOOSE_BLUR] + known[:, 1:2] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
-    prior = Prior(known.copy(), (1 / spread**2)[:, :, None] * np.eye(3))
-    shape = _blurred(lines, float(blur[0]))[-1]
-    return FreeFit(data, fit_edges(data, start, prior, half_length, shape, _FEW_STEPS, 0), shape)
+    prior = LevelPrior(known.copy(), (1 / spread**2)[:, :, None] * np.eye(3))
+    shape = _blur_profiles(lines, float(blur[0]))[-1]
+    return InitialFit(data, fit_edges(data, start, prior, half_length, shape, _FEW_STEPS, 0), shape)
 
 
-def _shaped(begun: FreeFit, lines: Lines, sigma: float) -> FreeFit:
+def _with_best_profile(started: InitialFit, lines: Lines, sigma: float) -> InitialFit:
     """The fits, with the profile that suits most of them."""
-    results = [_settled(begun, lines, shape) for shape in _blurred(lines, sigma)]
+    results = [_converged(started, lines, shape) for shape in _blur_profiles(lines, sigma)]
     # Both say the same where all edges run along the pixels: then it is the pixels' box.
     return results[0] if results[0].rough < _CLEARLY * results[-1].rough else results[-1]
 
 
-def _settled(begun: FreeFit, lines: Lines, shape: Shape) -> FreeFit:
-    data, fit, half_length = begun.data, begun.fit, 0.5 * lines.length
-    if (shape.half is None) != (begun.shape.half is None):
+def _converged(started: InitialFit, lines: Lines, shape: ProfileShape) -> InitialFit:
+    data, fit, half_length = started.data, started.fit, 0.5 * lines.length
+    if (shape.half is None) != (started.shape.half is None):
         fit = fit_edges(data, fit.values, fit.prior, half_length, shape, _FEW_STEPS, 0)
-    shape = profile_shape(data, fit, shape, smooth(fit))
-    return FreeFit(data, fit_edges(data, fit.values, fit.prior, half_length, shape, _STEPS), shape)
+    shape = profile_shape(data, fit, shape, is_typical(fit))
+    return InitialFit(data, fit_edges(data, fit.values, fit.prior, half_length, shape, _STEPS), shape)
 
 
-def _blurred(lines: Lines, sigma: float) -> list[Shape]:
+def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:
     """Profiles of nothing but blur."""
     none = np.zeros(RESPONSE_TERMS)
     tails = box_kurtosis(lines.normal, np.full(len(lines.normal), sigma))
-    shapes = [Shape(tails[:, None] * [1.0, 0.0], none)]
+    shapes = [ProfileShape(tails[:, None] * [1.0, 0.0], none)]
     if sigma < SHARP:
         # Cameras that sharpen their pictures leave edges that are no pixel's box any more.
-        shapes.append(Shape(np.zeros((len(tails), 2)), none, half_widths(lines.normal)))
+        shapes.append(ProfileShape(np.zeros((len(tails), 2)), none, half_widths(lines.normal)))
     return shapes

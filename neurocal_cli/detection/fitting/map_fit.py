@@ -7,20 +7,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.smooth_map import FORMS, Places, SmoothMap
+from neurocal_cli.detection.fitting.smooth_map import MAP_MODELS, Places, SmoothMap
 from neurocal_cli.geometry import Array
 
 __all__ = [
     "STEPS",
     "MapFit",
-    "Rows",
-    "Settled",
-    "finished_map",
+    "MapSolution",
+    "Observations",
     "fit_map",
     "loss_of",
     "median",
-    "settled_map",
-    "usual_scale",
+    "robust_scale",
+    "solve_map",
+    "with_covariance",
 ]
 
 STEPS = 25  # at most
@@ -28,13 +28,13 @@ _SHIFT_PRIOR = 1e-2  # 1/px^2
 _TINY = 1e-300
 _BELIEF = 20  # rows' worth of belief that variances are what they claim to be
 _CREEPING = 5e-3  # of chi2; what is gained so slowly is not worth the steps
-_SETTLED = 0.2  # of chi2
+_CONVERGED = 0.2  # of chi2
 _DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
 _TUKEY = 6.0  # standard deviations beyond which a row counts as an outlier
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class Observations:
     """Positions known along one direction each: ``direction . p = value``.
 
     Attributes
@@ -55,7 +55,7 @@ class Rows:
     shift: Array
 
     @classmethod
-    def of_points(cls, grid: Array, pixels: Array, sigma: float, shifts: int = 0) -> Rows:
+    def of_points(cls, grid: Array, pixels: Array, sigma: float, shifts: int = 0) -> Observations:
         """Both coordinates of points (N, 2)."""
         n = len(grid)
         return cls(
@@ -67,15 +67,15 @@ class Rows:
         )
 
     @property
-    def telling(self) -> NDArray[np.bool_]:
+    def informative(self) -> NDArray[np.bool_]:
         """(N,) rows that tell something about the map; anchors, which may be more than half, do not."""
         quarter = len(self.variance) // 4
         return np.asarray(self.variance < 100 * np.partition(self.variance, quarter)[quarter])
 
-    def and_(self, other: Rows) -> Rows:
+    def joined_with(self, other: Observations) -> Observations:
         """Both together."""
         names = ("grid", "direction", "value", "variance", "shift")
-        return Rows(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+        return Observations(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +108,12 @@ class MapFit:
     excess: float
 
     @property
-    def form(self) -> int:
+    def model_index(self) -> int:
         """Index of the map's form."""
-        return FORMS.index((self.map.radial, self.map.degree))
+        return MAP_MODELS.index((self.map.radial, self.map.degree))
 
 
-def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = STEPS) -> MapFit:
+def fit_map(start: SmoothMap, observations: Observations, shift: Array, steps: int = STEPS) -> MapFit:
     """Levenberg-Marquardt steps with Tukey's weights, from a start that is nearly right.
 
     Parameters
@@ -126,11 +126,11 @@ def fit_map(start: SmoothMap, rows: Rows, shift: Array, steps: int = STEPS) -> M
     steps : int
         At most.
     """
-    return finished_map(settled_map(start, rows, shift, steps), rows)
+    return with_covariance(solve_map(start, observations, shift, steps), observations)
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class MapSolution:
     """A map after its last step: shifts, residuals (N,) and derivatives (P, N) of what they compare with."""
 
     map: SmoothMap
@@ -139,15 +139,17 @@ class Settled:
     jacobian: Array
 
 
-def settled_map(start: SmoothMap, rows: Rows, shift: Array, steps: int, worth: float = 0.0) -> Settled:
+def solve_map(
+    start: SmoothMap, observations: Observations, shift: Array, steps: int, worth: float = 0.0
+) -> MapSolution:
     """Steps to the best map of a form, but only one if that gains less chi2 than would be worth more."""
     free, m = start.free, len(start.free)
     prior = np.concatenate([start.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
     values = np.concatenate([start.parameters[free], shift])
-    seen = _Rows.of(start, rows)
+    seen = _Prepared.of(start, observations)
     residual, jacobian = seen.residual(start, shift, free)
     # Before the first step everything may be off, the shifts above all.
-    precision, telling = seen.steep * seen.steep, rows.telling
+    precision, informative = seen.steep * seen.steep, observations.informative
     weight, damping, least = precision, _DAMPING, 0.0
     square = residual * residual
     for _ in range(steps):
@@ -171,11 +173,11 @@ def settled_map(start: SmoothMap, rows: Rows, shift: Array, steps: int, worth: f
             break
         worth = 0.0
         z = residual * seen.steep
-        scale = usual_scale(z[telling])
-        if before - after < max(_SETTLED * scale**2, _CREEPING * after) and damping <= max(_DAMPING, least):
+        scale = robust_scale(z[informative])
+        if before - after < max(_CONVERGED * scale**2, _CREEPING * after) and damping <= max(_DAMPING, least):
             break
         weight = _tukey(z / scale) * precision
-    return Settled(start, values[m:], residual, jacobian)
+    return MapSolution(start, values[m:], residual, jacobian)
 
 
 def median(x: Array) -> float:
@@ -197,7 +199,7 @@ def _tukey(z: Array) -> Array:
     return np.square(weight, out=weight)
 
 
-def usual_scale(z: Array) -> float:
+def robust_scale(z: Array) -> float:
     """How much larger than claimed the residuals of most rows are; at least 1.
 
     What the map cannot follow must not count as outliers as long as most rows have their share in it.
@@ -206,24 +208,26 @@ def usual_scale(z: Array) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Rows:
+class _Prepared:
     """Rows, prepared for maps of one form."""
 
-    rows: Rows
+    observations: Observations
     places: Places
     steep: Array  # inverse standard deviations
 
     @classmethod
-    def of(cls, form: SmoothMap, rows: Rows) -> _Rows:
-        direction = np.ascontiguousarray(rows.direction.T)
-        return cls(rows, form.places(rows.grid, direction), 1 / np.sqrt(rows.variance))
+    def of(cls, model_index: SmoothMap, observations: Observations) -> _Prepared:
+        direction = np.ascontiguousarray(observations.direction.T)
+        return cls(
+            observations, model_index.places(observations.grid, direction), 1 / np.sqrt(observations.variance)
+        )
 
     def residual(self, now: SmoothMap, shift: Array, free: NDArray[np.intp]) -> tuple[Array, Array]:
         """Residuals (N,), and derivatives (P, N) of what they are compared with."""
         value, along = now.along(self.places)
-        residual = self.rows.value - value
-        residual -= self.rows.shift @ shift
-        return residual, np.concatenate([along[free], self.rows.shift.T])
+        residual = self.observations.value - value
+        residual -= self.observations.shift @ shift
+        return residual, np.concatenate([along[free], self.observations.shift.T])
 
 
 def _solved(normal: Array, gradient: Array, damping: float) -> Array:
@@ -234,20 +238,20 @@ def _solved(normal: Array, gradient: Array, damping: float) -> Array:
     return np.asarray(size * np.linalg.solve(scaled, gradient * size))
 
 
-def finished_map(settled: Settled, rows: Rows) -> MapFit:
+def with_covariance(solution: MapSolution, observations: Observations) -> MapFit:
     """A settled map with its covariance, and what its residuals tell of the rows."""
-    now, shift, residual, jacobian = settled.map, settled.shift, settled.residual, settled.jacobian
-    free, telling = now.free, rows.telling
-    z = residual / np.sqrt(rows.variance)
-    weight = _tukey(z / usual_scale(z[telling]))
+    now, shift, residual, jacobian = solution.map, solution.shift, solution.residual, solution.jacobian
+    free, informative = now.free, observations.informative
+    z = residual / np.sqrt(observations.variance)
+    weight = _tukey(z / robust_scale(z[informative]))
     good = weight > 0
-    normal = (jacobian * (good / rows.variance)) @ jacobian.T
+    normal = (jacobian * (good / observations.variance)) @ jacobian.T
     normal.ravel()[:: len(normal) + 1] += np.concatenate([now.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
     size = 1 / np.sqrt(np.maximum(normal.diagonal(), _TINY))
     inverse = np.linalg.inv(normal * size[:, None] * size) * size[:, None] * size
-    telling = good & telling
-    left = int(telling.sum()) - len(free) - len(shift)
-    excess = float((z[telling] ** 2).sum()) / max(left, 0.2 * len(z))
+    informative = good & informative
+    left = int(informative.sum()) - len(free) - len(shift)
+    excess = float((z[informative] ** 2).sum()) / max(left, 0.2 * len(z))
     shrunk = min(1.0, (excess * left + _BELIEF) / (left + _BELIEF)) if left > 0 else 1.0
     covariance = np.zeros((len(now.parameters),) * 2)
     covariance[free[:, None], free] = inverse[: len(free), : len(free)]

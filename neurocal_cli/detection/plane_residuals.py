@@ -8,12 +8,12 @@ import numpy as np
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Measured
 from neurocal_cli.geometry import Array
 
-__all__ = ["residuals"]
+__all__ = ["plane_residuals"]
 
 _POINTS_A_TERM = 6  # that a coefficient of the lens's part must have to be fitted
 
 
-def residuals(measured: Measured) -> Array:
+def plane_residuals(measured: Measured) -> Array:
     """Measured pixels minus those of a homography and a polynomial fitted to them.
 
     The polynomial, of the fifth degree or what the number of points allows, takes up the lens.

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.detection.finding.grow import Lattice, cropped, framed, frontier
-from neurocal_cli.detection.finding.predict import expected
+from neurocal_cli.detection.finding.grow import Lattice, cropped, frontier, padded
+from neurocal_cli.detection.finding.predict import predict_vertices
 from neurocal_cli.geometry import Array
 
-__all__ = ["disputed", "distinct", "touching"]
+__all__ = ["any_overlap", "drop_duplicates", "trim_overlaps"]
 
 _SAME = 0.25  # of a square's width; between vertices that are the same
 _MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on ...
@@ -20,7 +20,7 @@ _COPY = 0.5  # share of vertices in another lattice
 _BESIDE = 2.0  # squares; farther from each other lattices have nothing in dispute
 
 
-def distinct(lattices: list[Lattice]) -> list[Lattice]:
+def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
     """Leave out lattices most of whose vertices are in a larger one."""
     kept: list[Lattice] = []
     for lattice in sorted(lattices, key=lambda x: -int(x.seen.sum())):
@@ -31,7 +31,7 @@ def distinct(lattices: list[Lattice]) -> list[Lattice]:
     return kept
 
 
-def touching(lattices: list[Lattice]) -> bool:
+def any_overlap(lattices: list[Lattice]) -> bool:
     """Whether any two lattices come so near each other that they may claim the same vertices."""
     boxes = []
     for lattice in lattices:
@@ -51,7 +51,7 @@ def _longest(lattice: Lattice) -> float:
     return float(np.nanmax(np.hypot(*sides.T)))
 
 
-def disputed(lattices: list[Lattice]) -> list[Lattice]:
+def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
     """Take outermost rows off a lattice that lie in another one, or where another one goes on.
 
     Of two planes that meet at a fold each may have grown to the fold and a little beyond it.
@@ -60,25 +60,25 @@ def disputed(lattices: list[Lattice]) -> list[Lattice]:
     if len(result) < 2:
         return result
     for _ in range(2):
-        claims = [_claim(x) for x in result]
+        places = [_vertices_and_next(x) for x in result]
         for i, lattice in enumerate(result):
-            for j, claim in enumerate(claims):
+            for j, place in enumerate(places):
                 if i != j:
-                    lattice = _trimmed(lattice, claim)
+                    lattice = _trimmed(lattice, place)
             result[i] = lattice
     return result
 
 
-def _claim(lattice: Lattice) -> tuple[Array, float]:
+def _vertices_and_next(lattice: Lattice) -> tuple[Array, float]:
     """Vertices of a lattice and where it would go on (N, 2), and its squares' width."""
-    wider, _ = framed(lattice)
+    wider, _ = padded(lattice)
     row, col = frontier(wider)
-    at = expected(wider.pixels, row, col)
-    return np.concatenate([lattice.pixels[lattice.seen], at.points]), lattice.width
+    predicted = predict_vertices(wider.pixels, row, col)
+    return np.concatenate([lattice.pixels[lattice.seen], predicted.points]), lattice.width
 
 
-def _trimmed(lattice: Lattice, claim: tuple[Array, float]) -> Lattice:
-    points, width = claim
+def _trimmed(lattice: Lattice, place: tuple[Array, float]) -> Lattice:
+    points, width = place
     seen = lattice.seen
     away = np.full(seen.shape, np.inf)
     away[seen] = _distance(lattice.pixels[seen], points) / min(width, lattice.width)

@@ -140,9 +140,9 @@ def tail_terms(z: Real, density: Real, out: Real) -> None:
     np.multiply(odd, square * (square - 10) + 15, out=out[:, 1])
 
 
-def response(x: Real, bend: Array) -> tuple[Real, Real]:
+def response(x: Real, nonlinearity: Array) -> tuple[Real, Real]:
     """F(x) and its derivative, for coefficients b_0, b_1, ..."""
-    last, *others = (x.dtype.type(coefficient) for coefficient in bend[::-1])
+    last, *others = (x.dtype.type(coefficient) for coefficient in nonlinearity[::-1])
     rest, steep = np.full_like(x, last), np.zeros_like(x)
     for coefficient in others:
         steep *= x

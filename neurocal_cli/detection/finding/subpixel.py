@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.finding.levels import Image
 from neurocal_cli.geometry import Array
 
-__all__ = ["settle"]
+__all__ = ["refine_saddles"]
 
 _LONGEST_STEP = 1.5  # px
 
@@ -38,7 +38,7 @@ def _window(half: int, width: int) -> NDArray[np.intp]:
     return (offset[:, None] * width + offset).ravel()
 
 
-def settle(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
+def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
     """Move points to the saddle points next to them.
 
     Parameters
@@ -62,8 +62,8 @@ def settle(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
     # Both coordinates in rows: sums over many short rows take longer.
     given = start.T
     low, high = half, np.array([[width - 1 - half], [height - 1 - half]])
-    framed = (given >= low) & (given <= high)
-    good = framed[0] & framed[1]
+    padded = (given >= low) & (given <= high)
+    good = padded[0] & padded[1]
     centre = np.rint(np.where(good, given, low))
     step, saddle = _newton(image, centre, sigma)
     # A step is the same from wherever a pixel is nearest: only those that lead to another one go on.

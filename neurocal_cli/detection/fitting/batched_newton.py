@@ -16,12 +16,12 @@ __all__ = [
     "CONTRAST",
     "MEAN",
     "MORE_STEPS",
-    "Fit",
-    "Linear",
+    "BatchFit",
+    "LevelPrior",
+    "Linearised",
     "Part",
-    "Prior",
-    "Shape",
-    "gauss_newton",
+    "ProfileShape",
+    "fit_batch",
     "rows_for",
 ]
 
@@ -31,7 +31,7 @@ Part = NDArray[np.intp] | slice  # of the fits
 # The last three values of every fit: mean level and half contrast [DN], sigma_t [px].
 MEAN, CONTRAST, BLUR = -3, -2, -1
 _LEAST_BLUR = 0.2905  # px; the pixel's box alone has 0.2887
-_MOST, _SETTLED = 0.9, 0.5  # share of the fits whose last step was less, in standard deviations
+_MOST, _CONVERGED = 0.9, 0.5  # share of the fits whose last step was less, in standard deviations
 MORE_STEPS = 20  # of those that have not settled with the others
 _DAMPING, _LEAST_DAMPING = 1.0, 0.01
 _SINGLE = 1e-6  # relative error of sums
@@ -39,7 +39,7 @@ _NOTHING = 1e-9  # information that keeps fits without pixels from dividing by 0
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class LevelPrior:
     """What is known of level, contrast and blur beforehand.
 
     Attributes
@@ -51,13 +51,13 @@ class Prior:
     mean: Array
     precision: Array
 
-    def part(self, which: NDArray[np.intp]) -> Prior:
+    def part(self, which: NDArray[np.intp]) -> LevelPrior:
         """That of some fits."""
-        return Prior(self.mean[which], self.precision[which])
+        return LevelPrior(self.mean[which], self.precision[which])
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class ProfileShape:
     """Shape of the profiles; see `fit_profile`.
 
     Attributes
@@ -72,16 +72,18 @@ class Shape:
     """
 
     tails: Array
-    bend: Array
+    nonlinearity: Array
     half: Array | None = None
 
-    def part(self, which: Part) -> Shape:
+    def part(self, which: Part) -> ProfileShape:
         """That of some fits."""
-        return Shape(self.tails[which], self.bend, None if self.half is None else self.half[which])
+        return ProfileShape(
+            self.tails[which], self.nonlinearity, None if self.half is None else self.half[which]
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class Linearised:
     """A model at some values.
 
     Attributes
@@ -106,11 +108,11 @@ class Linear:
         """(E, P + 1, P + 1) sums over pixels, for P values: chi2, the gradient beside it, the information."""
         return (self.rows @ self.rows.swapaxes(1, 2))[:, : count + 1, : count + 1].astype(float)
 
-    def part(self, which: NDArray[np.intp]) -> Linear:
+    def part(self, which: NDArray[np.intp]) -> Linearised:
         """That of some fits."""
-        return Linear(self.rows[which], self.z[which], self.x[which])
+        return Linearised(self.rows[which], self.z[which], self.x[which])
 
-    def put(self, which: NDArray[np.intp], part: Linear) -> None:
+    def put(self, which: NDArray[np.intp], part: Linearised) -> None:
         """Replace that of some fits, in place."""
         self.rows[which], self.z[which], self.x[which] = part.rows, part.z, part.x
 
@@ -127,7 +129,7 @@ def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) 
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class BatchFit:
     """Fitted values.
 
     Attributes
@@ -147,11 +149,11 @@ class Fit:
 
     values: Array
     information: Array
-    prior: Prior
+    prior: LevelPrior
     chi2: Array
     count: NDArray[np.int64]
     step: Array
-    linear: Linear
+    linear: Linearised
 
     @cached_property
     def covariance(self) -> Array:
@@ -165,23 +167,23 @@ class Fit:
         return np.asarray(np.linalg.inv(total), dtype=float)
 
     @property
-    def unsettled(self) -> Array:
+    def variance_growth(self) -> Array:
         """(E,) by which variances grow for what a last step of some standard deviations leaves open."""
         return np.where(self.step > 1, 1 + self.step**2, 1.0)
 
-    def scaled(self, noise: float) -> Fit:
+    def scaled(self, noise: float) -> BatchFit:
         """The same fits, the pixels' variance being another by a factor."""
         return replace(self, information=self.information / noise, chi2=self.chi2 / noise)
 
 
-def gauss_newton(
-    model_of: Callable[[Part], Callable[[Array], Linear]],
+def fit_batch(
+    model_of: Callable[[Part], Callable[[Array], Linearised]],
     start: Array,
-    prior: Prior,
+    prior: LevelPrior,
     count: NDArray[np.int64],
     steps: int,
     more: int = MORE_STEPS,
-) -> Fit:
+) -> BatchFit:
     """All fits at once, then those that have not settled by themselves.
 
     Parameters
@@ -199,14 +201,14 @@ def gauss_newton(
     model = model_of(slice(None))
     state = _State.of(model, start, prior)
     # What most fits still lack is little; those that cannot settle must not hold up the others.
-    state.settle(model, prior, steps, _MOST)
-    restless = np.flatnonzero(state.size >= _SETTLED)
-    if len(restless) and more:
-        part = state.part(restless)
-        part.settle(model_of(restless), prior.part(restless), more, 1.0)
-        state.put(restless, part)
+    state.iterate(model, prior, steps, _MOST)
+    unconverged = np.flatnonzero(state.size >= _CONVERGED)
+    if len(unconverged) and more:
+        part = state.part(unconverged)
+        part.iterate(model_of(unconverged), prior.part(unconverged), more, 1.0)
+        state.put(unconverged, part)
     information, chi2 = state.products[:, 1:, 1:], state.products[:, 0, 0]
-    return Fit(state.values, information, prior, chi2, count, state.size, state.linear)
+    return BatchFit(state.values, information, prior, chi2, count, state.size, state.linear)
 
 
 @dataclass(eq=False)
@@ -214,14 +216,14 @@ class _State:
     """Fits on their way: values, model there and its products, cost, damping, and size of the last step."""
 
     values: Array
-    linear: Linear
+    linear: Linearised
     products: Array
     cost: Array
     damping: Array
     size: Array
 
     @classmethod
-    def of(cls, model: Callable[[Array], Linear], values: Array, prior: Prior) -> _State:
+    def of(cls, model: Callable[[Array], Linearised], values: Array, prior: LevelPrior) -> _State:
         linear = model(values)
         products, none = linear.products(values.shape[1]), np.zeros(len(values))
         return cls(values, linear, products, _cost(products, values, prior), none, none)
@@ -243,7 +245,9 @@ class _State:
         self.linear.put(which, part.linear)
         self.products[which] = part.products
 
-    def settle(self, model: Callable[[Array], Linear], prior: Prior, steps: int, most: float) -> None:
+    def iterate(
+        self, model: Callable[[Array], Linearised], prior: LevelPrior, steps: int, most: float
+    ) -> None:
         """Levenberg-Marquardt steps until a share of the fits has settled."""
         for _ in range(steps):
             tried = _moved(self.values, self._step(prior))
@@ -262,10 +266,10 @@ class _State:
                 longer = np.where(self.damping > _LEAST_DAMPING, 0.1 * self.damping, 0.0)
                 self.damping = np.where(worse, shorter, longer)
             self.values, self.linear, self.products, self.cost = tried, ahead, products, cost
-            if (self.size < _SETTLED).mean() >= most:
+            if (self.size < _CONVERGED).mean() >= most:
                 break
 
-    def _step(self, prior: Prior) -> Array:
+    def _step(self, prior: LevelPrior) -> Array:
         """The next step; `size` becomes that of the undamped one."""
         information, gradient = self.products[:, 1:, 1:].copy(), self.products[:, 1:, 0].copy()
         pull = self.values[:, MEAN:] - prior.mean
@@ -290,7 +294,7 @@ class _State:
         return step
 
 
-def _cost(products: Array, values: Array, prior: Prior) -> Array:
+def _cost(products: Array, values: Array, prior: LevelPrior) -> Array:
     pull = values[:, MEAN:] - prior.mean
     return np.asarray(products[:, 0, 0] + np.einsum("ei,eij,ej->e", pull, prior.precision, pull))
 

@@ -4,20 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.detection.fitting.robust import (
+from neurocal_cli.detection.fitting.map_fit import (
     STEPS,
     MapFit,
-    Rows,
-    Settled,
-    finished_map,
+    MapSolution,
+    Observations,
     loss_of,
-    settled_map,
-    usual_scale,
+    robust_scale,
+    solve_map,
+    with_covariance,
 )
-from neurocal_cli.detection.fitting.smooth_map import FORMS, SmoothMap
+from neurocal_cli.detection.fitting.smooth_map import MAP_MODELS, SmoothMap
 from neurocal_cli.geometry import Array
 
-__all__ = ["choose_map"]
+__all__ = ["select_map"]
 
 # A richer form must lower the chi2 by so much for each of its parameters; chance alone gives 1. Residuals far
 # above the noise are those of a board that is uneven by itself: its form is not smooth, and not for a
@@ -28,13 +28,13 @@ _BARREN = 2  # richer forms without gain, of lenses or of polynomials, after whi
 _UNEVEN = 4.0  # times the noise; residuals from which on a polynomial is tried when no lens has gained
 
 
-def choose_map(
+def select_map(
     start: SmoothMap,
-    rows: Rows,
+    observations: Observations,
     shift: Array,
     enough: float = 0.0,
     least: int = 0,
-    most: int = len(FORMS) - 1,
+    most: int = len(MAP_MODELS) - 1,
 ) -> MapFit:
     """The map of the simplest form that the rows do not contradict.
 
@@ -49,21 +49,23 @@ def choose_map(
     least, most : int
         Indices of the simplest and the richest form that is tried.
     """
-    best: Settled | None = None
+    best: MapSolution | None = None
     now, paid, barren = start, 0, [0, 0]  # the latter of lenses, and of polynomials
-    telling, precision = rows.telling, 1 / np.sqrt(rows.variance)
-    n_telling, scale = int(telling.sum()), 0.0
-    for radial, degree in FORMS[least : most + 1]:
+    informative, precision = observations.informative, 1 / np.sqrt(observations.variance)
+    n_telling, scale = int(informative.sum()), 0.0
+    for radial, degree in MAP_MODELS[least : most + 1]:
         if barren[degree > 0] >= _BARREN:
             continue
-        now = now.shaped(radial, degree)
+        now = now.with_model(radial, degree)
         if best is not None and len(now.free) + len(shift) > 0.5 * n_telling:
             break
         count = len(now.free)
-        fit = settled_map(now, rows, shift, STEPS, _FIRST_SHARE * _price(scale) * scale**2 * (count - paid))
+        fit = solve_map(
+            now, observations, shift, STEPS, _FIRST_SHARE * _price(scale) * scale**2 * (count - paid)
+        )
         now, shift = fit.map, fit.shift
         z = fit.residual * precision
-        scale = usual_scale(z[telling])
+        scale = robust_scale(z[informative])
         loss = loss_of(z / scale)
         excess = max(1.0, loss / max(n_telling - count, 1))
         price = _price(scale) * excess * (count - paid)
@@ -71,13 +73,13 @@ def choose_map(
             best, paid, barren = fit, count, [0, 0]
         else:
             barren[degree > 0] += 1
-        if loss * scale**2 + _PRICE * count < enough * len(rows.value):
+        if loss * scale**2 + _PRICE * count < enough * len(observations.value):
             break
         # Where no lens bends the board so, it may still be bent itself.
         if barren[0] >= _BARREN and scale < _UNEVEN:
             break
     assert best is not None
-    return finished_map(best, rows)
+    return with_covariance(best, observations)
 
 
 def _price(scale: float) -> float:

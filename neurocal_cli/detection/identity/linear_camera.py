@@ -12,7 +12,7 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["CameraFit", "fit_camera", "is_flat", "motion"]
+__all__ = ["CameraFit", "fit_camera", "is_flat", "rigid_motion"]
 
 _FLAT = 1e-6  # smallest extent over the largest, of points in one plane
 _WEAK = 3.0  # how many times worse a camera without perspective must fit for perspective to be certain
@@ -67,7 +67,7 @@ def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> Camer
     return CameraFit(rms, int(sign * np.sign(np.linalg.det(P[:, :3]))))
 
 
-def motion(first: Array, second: Array) -> tuple[Array, Array] | None:
+def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:
     """Rotation R and shift t with ``second = first R^T + t``; None if there are none.
 
     Parameters

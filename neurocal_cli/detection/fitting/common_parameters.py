@@ -7,20 +7,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.edges import OFFSET, EdgeData
-from neurocal_cli.detection.fitting.newton import BLUR, CONTRAST, MEAN, Fit, Prior, Shape, rows_for
-from neurocal_cli.detection.fitting.profile import (
+from neurocal_cli.detection.fitting.batched_newton import (
+    BLUR,
+    CONTRAST,
+    MEAN,
+    BatchFit,
+    LevelPrior,
+    ProfileShape,
+    rows_for,
+)
+from neurocal_cli.detection.fitting.edge_fit import OFFSET, EdgeData
+from neurocal_cli.detection.fitting.edge_profile import (
     RESPONSE_TERMS,
     erf_and_density,
     response,
     response_terms,
     tail_terms,
 )
-from neurocal_cli.detection.fitting.robust import median
+from neurocal_cli.detection.fitting.map_fit import median
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.geometry import Array
 
-__all__ = ["BoardBlur", "Noise", "level_prior", "profile_shape"]
+__all__ = ["BoardBlur", "PixelNoise", "level_prior", "profile_shape"]
 
 Single = NDArray[np.float32]
 
@@ -40,7 +48,7 @@ _TINY = np.float32(1e-30)
 
 
 @dataclass(frozen=True)
-class Noise:
+class PixelNoise:
     """Variance of the pixels [DN^2] on the dark side, at the edge, on the light side."""
 
     dark: float
@@ -48,7 +56,7 @@ class Noise:
     light: float
 
     @classmethod
-    def of(cls, fit: Fit, root: Single, floor: float) -> Noise:
+    def of(cls, fit: BatchFit, root: Single, floor: float) -> PixelNoise:
         """From the residuals of fits.
 
         Parameters
@@ -71,9 +79,9 @@ class Noise:
             variances.append(median(sums[some] / np.maximum(count[some], 1)) if some.any() else 0.0)
         return cls(*(max(v, floor, _LEAST_SHARE * max(variances)) for v in variances))
 
-    def times(self, factor: float) -> Noise:
+    def times(self, factor: float) -> PixelNoise:
         """All of it more by a factor."""
-        return Noise(factor * self.dark, factor * self.edge, factor * self.light)
+        return PixelNoise(factor * self.dark, factor * self.edge, factor * self.light)
 
     def weights(self, x: Single) -> Single:
         """Inverse variances [1/DN^2] of pixels at a light x between the levels."""
@@ -83,7 +91,9 @@ class Noise:
         return np.reciprocal(variance, out=variance)
 
 
-def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_]) -> Shape:
+def profile_shape(
+    data: EdgeData, fit: BatchFit, shape: ProfileShape, good: NDArray[np.bool_]
+) -> ProfileShape:
     """Better shape of the profile from what the fits have left over, by least squares.
 
     Shift, blur and levels are varied along with it, so that these don't hide what they cannot change.
@@ -109,7 +119,7 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     _, density = erf_and_density(z)
     scale *= root
     scale *= fit.values[good, CONTRAST].astype(np.float32)[:, None]
-    steep = scale * Q if not shape.bend.any() else response(x, shape.bend)[1] * Q * scale
+    steep = scale * Q if not shape.nonlinearity.any() else response(x, shape.nonlinearity)[1] * Q * scale
     # Edge by edge: small products, for which no threads are started.
     columns = rows_for(len(z), RESPONSE_TERMS + 6, z.shape[1], z.dtype)
     others, tails, bends = np.split(columns[:, : RESPONSE_TERMS + 7], [5, 7], axis=1)
@@ -127,11 +137,11 @@ def profile_shape(data: EdgeData, fit: Fit, shape: Shape, good: NDArray[np.bool_
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
     # Blur, contrast, tails and the odd terms of the response can nearly stand in for one another.
     believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _BENDS)]) ** -2
-    known = np.concatenate([shape.tails.mean(axis=0), shape.bend])
+    known = np.concatenate([shape.tails.mean(axis=0), shape.nonlinearity])
     right[4:] -= believed * known
     np.einsum("ii->i", normal)[4:] += believed
     change = np.linalg.solve(normal, right)[4:]
-    return replace(shape, tails=shape.tails + change[:2], bend=shape.bend + change[2:])
+    return replace(shape, tails=shape.tails + change[:2], nonlinearity=shape.nonlinearity + change[2:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,7 +160,7 @@ class BoardBlur:
     spread: float
 
     @classmethod
-    def of(cls, fit: Fit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
+    def of(cls, fit: BatchFit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
         """From the good ones of fits of edges with normals (E, 2)."""
         if not good.any():
             good = np.ones_like(good)
@@ -173,7 +183,7 @@ class BoardBlur:
         return np.sqrt(np.maximum(square, _LEAST_BLUR**2))
 
 
-def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: float, noise: float) -> Prior:
+def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: float, noise: float) -> LevelPrior:
     """What the whole board tells about the levels and the blur of single edges.
 
     Parameters
@@ -194,4 +204,4 @@ def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: float
     precision[:, MEAN, MEAN] = precision[:, CONTRAST, CONTRAST] = high + low
     precision[:, MEAN, CONTRAST] = precision[:, CONTRAST, MEAN] = high - low
     precision[:, BLUR, BLUR] = 1 / (blur_spread + (_BLUR_SPREAD * sigma) ** 2)
-    return Prior(np.stack([mean, contrast, sigma], axis=-1), precision)
+    return LevelPrior(np.stack([mean, contrast, sigma], axis=-1), precision)

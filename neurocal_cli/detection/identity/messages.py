@@ -9,9 +9,9 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.errors import NeurocalError
 
-__all__ = ["LOOKS_THE_SAME", "NoBoardError", "another_size", "several_ways"]
+__all__ = ["SYMMETRIC_BOARD", "NoBoardError", "ambiguity_message", "wrong_size_message"]
 
-LOOKS_THE_SAME = (
+SYMMETRIC_BOARD = (
     "the board looks the same after a turn, colours included, so which corner is the first one depends on "
     "how it lies in the image; for points that are the same in all images use a board with one even and "
     "one odd side"
@@ -22,7 +22,7 @@ class NoBoardError(NeurocalError):
     """An image that does not show the board, or not enough of it to tell where its points are."""
 
 
-def another_size(board: Board, grid: Grid, ends: Sequence[End]) -> str:
+def wrong_size_message(board: Board, grid: Grid, ends: Sequence[End]) -> str:
     """What to say of a grid that has no place on the board."""
     wanted = _sizes(board)
     shape = grid.shape
@@ -38,7 +38,7 @@ def another_size(board: Board, grid: Grid, ends: Sequence[End]) -> str:
     )
 
 
-def several_ways(board: Board, grids: Sequence[Grid], rms: float) -> str:
+def ambiguity_message(board: Board, grids: Sequence[Grid], rms: float) -> str:
     """What to say of grids that can lie on the board in more ways than one, the best to `rms` px."""
     sizes = [sorted((plane.cols, plane.rows)) for plane in board.planes]
     part = next((grid for grid in grids if sorted(grid.shape) not in sizes), None)

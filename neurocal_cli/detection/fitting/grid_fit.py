@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.box import half_widths
-from neurocal_cli.detection.fitting.edges import (
+from neurocal_cli.detection.fitting.batched_newton import CONTRAST, MEAN, BatchFit, ProfileShape
+from neurocal_cli.detection.fitting.common_parameters import BoardBlur, PixelNoise, level_prior, profile_shape
+from neurocal_cli.detection.fitting.edge_fit import (
     OFFSET,
     EdgeData,
     fit_edges,
@@ -16,21 +17,20 @@ from neurocal_cli.detection.fitting.edges import (
     moments,
     with_weight,
 )
-from neurocal_cli.detection.fitting.forms import choose_map
-from neurocal_cli.detection.fitting.free import fit_freely
-from neurocal_cli.detection.fitting.gate import believable, smooth
-from neurocal_cli.detection.fitting.newton import CONTRAST, MEAN, Fit, Shape
-from neurocal_cli.detection.fitting.noise import BoardBlur, Noise, level_prior, profile_shape
-from neurocal_cli.detection.fitting.pixels import REACH, SHARP, edge_pixels, usual_stride
-from neurocal_cli.detection.fitting.robust import MapFit, Rows, fit_map, median
+from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
+from neurocal_cli.detection.fitting.initial_fit import fit_initial
+from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, median
+from neurocal_cli.detection.fitting.map_selection import select_map
+from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading, square_levels
-from neurocal_cli.detection.fitting.smooth_map import LENS, Frame, SmoothMap, homography_start
-from neurocal_cli.detection.fitting.strips import Lines, gather, grid_lines
-from neurocal_cli.detection.fitting.vertices import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
+from neurocal_cli.detection.fitting.smooth_map import RICHEST_LENS, Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
+from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
-__all__ = ["Board", "Edges", "Fitted", "fit_all_vertices", "fit_board"]
+__all__ = ["GridEdges", "GridFit", "GridImage", "fit_grid", "fit_grid_vertices"]
 
 Image = NDArray[np.generic]
 
@@ -48,7 +48,7 @@ _PRECISE = 0.003  # sigma; standard deviation of offsets
 
 
 @dataclass(frozen=True, eq=False)
-class Edges:
+class GridEdges:
     """The edges between neighbouring vertices of a grid, those along c first.
 
     Attributes
@@ -67,7 +67,7 @@ class Edges:
     light: Array
 
     @classmethod
-    def of(cls, grid: Grid) -> Edges:
+    def of(cls, grid: Grid) -> GridEdges:
         """All whose both vertices are seen."""
         seen = grid.seen
         along_c = np.argwhere(seen[:, :-1] & seen[:, 1:])[:, ::-1]
@@ -80,7 +80,7 @@ class Edges:
 
 
 @dataclass(frozen=True, eq=False)
-class Board:
+class GridImage:
     """What is to be fitted.
 
     Attributes
@@ -96,33 +96,33 @@ class Board:
 
     image: Image
     grid: Grid
-    edges: Edges
-    anchors: Rows
+    edges: GridEdges
+    anchors: Observations
     floor: float
 
     @classmethod
-    def of(cls, image: Image, grid: Grid, floor: float) -> Board:
+    def of(cls, image: Image, grid: Grid, floor: float) -> GridImage:
         """From an image and a grid in it."""
         vertices = np.argwhere(grid.seen)[:, ::-1].astype(float)
-        anchors = Rows.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
-        return cls(image, grid, Edges.of(grid), anchors, floor)
+        anchors = Observations.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
+        return cls(image, grid, GridEdges.of(grid), anchors, floor)
 
     def lines(self, at: SmoothMap) -> Lines:
         """The edges as a map sees them."""
         return grid_lines(at, self.edges.centre, self.edges.vertical, self.edges.light)
 
-    def rows(self, lines: Lines, offset: Array, variance: Array) -> Rows:
+    def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
         """Edges as what a map is fitted to; moved by an unknown common shift to the light side."""
         value = (lines.middle * lines.normal).sum(axis=1) + offset
-        edges = Rows(self.edges.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
+        edges = Observations(self.edges.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
         if len(offset) > _ENOUGH:
             return edges
         anchors = replace(self.anchors, variance=np.full_like(self.anchors.variance, _ANCHOR**2))
-        return edges.and_(anchors)
+        return edges.joined_with(anchors)
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
+class GridFit:
     """Fitted edges and what they share.
 
     Attributes
@@ -139,12 +139,12 @@ class Fitted:
     """
 
     lines: Lines
-    fit: Fit
+    fit: BatchFit
     data: EdgeData
     map: MapFit
     shading: Shading
-    shape: Shape
-    noise: Noise
+    shape: ProfileShape
+    noise: PixelNoise
     good: NDArray[np.bool_]
 
     @property
@@ -159,85 +159,93 @@ class Fitted:
         return max(self.map.excess - 1, 0.0) * median(self.fit.covariance[self.good, OFFSET, OFFSET])
 
 
-def fit_board(board: Board) -> Fitted:
+def fit_grid(grid_image: GridImage) -> GridFit:
     """All stages: map of the found vertices, moments, a first fit, what edges share, the last fit."""
-    frame = Frame.of(board.anchors.grid, (board.image.shape[1], board.image.shape[0]))
-    n = len(board.anchors.grid) // 2
-    points = board.anchors.value.reshape(2, n).T
-    start = homography_start(frame, board.anchors.grid[:n], points)
-    found = choose_map(start, board.anchors, np.zeros(1), _GOOD_START)
-    dark, light = square_levels(board.image, board.grid, found.map)
+    frame = Frame.of(grid_image.anchors.grid, (grid_image.image.shape[1], grid_image.image.shape[0]))
+    n = len(grid_image.anchors.grid) // 2
+    points = grid_image.anchors.value.reshape(2, n).T
+    start = homography_start(frame, grid_image.anchors.grid[:n], points)
+    found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
+    dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = fit_shading(frame, dark, light)
-    noise = max(median(np.concatenate([dark.noise, light.noise])), board.floor)
-    mapped, sigma = _by_moments(board, found, shading)
-    first = _first_fit(board, mapped, sigma, shading, noise)
-    return _last_fit(board, first)
+    noise = max(median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
+    mapped, sigma = _by_moments(grid_image, found, shading)
+    first = _first_fit(grid_image, mapped, sigma, shading, noise)
+    return _last_fit(grid_image, first)
 
 
-def _by_moments(board: Board, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
+def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
     """Map through the edges' moments, and their blur [px]."""
-    lines = board.lines(found.map)
+    lines = grid_image.lines(found.map)
     # Where lines cross at an angle they come into wide strips from the side.
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
     half = np.clip(half, 2.0, _WIDEST)
-    strips = gather(board.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
+    strips = strip_pixels(grid_image.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
     offset, _, blur = moments(strips, half, *shading.at(lines.middle))
     sigma = float(np.clip(median(blur), 0.33, 0.25 * median(lines.width)))
-    rows = board.rows(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
-    return fit_map(found.map, rows, found.shift), sigma
+    observations = grid_image.observations(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
+    return fit_map(found.map, observations, found.shift), sigma
 
 
-def _first_fit(board: Board, mapped: MapFit, sigma: float, shading: Shading, noise: float) -> Fitted:
+def _first_fit(
+    grid_image: GridImage, mapped: MapFit, sigma: float, shading: Shading, noise: float
+) -> GridFit:
     """Edges fitted with free levels, and the map through them."""
-    lines = board.lines(mapped.map)
+    lines = grid_image.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
-    free = fit_freely(board.image, lines, offset, sigma, shading, noise)
+    free = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
     data, fit, shape = free.data, free.fit, free.shape
-    good = smooth(fit)
+    good = is_typical(fit)
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
     variance = np.where(good, variance, _ANCHOR**2)
-    rows = board.rows(lines, fit.values[:, OFFSET], variance)
+    observations = grid_image.observations(lines, fit.values[:, OFFSET], variance)
     # What the vertices' map needs, that of the edges needs as well; a board's own unevenness is for later.
-    chosen = choose_map(mapped.map, rows, mapped.shift, least=mapped.form, most=max(mapped.form, LENS))
+    chosen = select_map(
+        mapped.map,
+        observations,
+        mapped.shift,
+        least=mapped.model_index,
+        most=max(mapped.model_index, RICHEST_LENS),
+    )
     good &= chosen.weight[: len(good)] > 0
-    return Fitted(lines, fit, data, chosen, shading, shape, Noise(noise, noise, noise), good)
+    return GridFit(lines, fit, data, chosen, shading, shape, PixelNoise(noise, noise, noise), good)
 
 
-def _last_fit(board: Board, first: Fitted) -> Fitted:
+def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     """Edges fitted with what all of them share, and the map through them."""
     good, n = first.good, len(first.good)
-    lines = board.lines(first.map.map)
+    lines = grid_image.lines(first.map.map)
     shading = _shading(first)
-    fit, data, shape, noise = _fine_fit(board, first, lines, shading)
+    fit, data, shape, noise = _fine_fit(grid_image, first, lines, shading)
     scale = max(median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
-    trusted = np.where(smooth(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
-    rows = board.rows(lines, fit.values[:, OFFSET], trusted)
+    trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
+    observations = grid_image.observations(lines, fit.values[:, OFFSET], trusted)
     # Better edges may tell of a richer form.
-    mapped = choose_map(first.map.map, rows, first.map.shift, least=first.map.form)
-    expected = variance + mapped.map.variance(board.edges.centre, lines.normal)
+    mapped = select_map(first.map.map, observations, first.map.shift, least=first.map.model_index)
+    expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
     # A board that is uneven by itself, as paper is, departs from its map everywhere: no single edge is
     # wrong for that, but all of them are less certain.
     uneven = max(_NORMAL * median(np.abs(departure)), 1.0)
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
-    good = believable(fit, departure, data.beyond)
-    return Fitted(lines, fit, data, mapped, shading, shape, noise, good)
+    good = is_reliable(fit, departure, data.beyond)
+    return GridFit(lines, fit, data, mapped, shading, shape, noise, good)
 
 
 def _fine_fit(
-    board: Board, first: Fitted, lines: Lines, shading: Shading
-) -> tuple[Fit, EdgeData, Shape, Noise]:
+    grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading
+) -> tuple[BatchFit, EdgeData, ProfileShape, PixelNoise]:
     """Fits to all pixels, with levels, blur, profile and noise from the whole board."""
     n, half_length = len(first.good), 0.5 * lines.length
     shape = profile_shape(first.data, first.fit, first.shape, first.good)
-    noise = Noise.of(first.fit, first.data.root, board.floor)
+    noise = PixelNoise.of(first.fit, first.data.root, grid_image.floor)
     blur = BoardBlur.of(first.fit, lines.normal, first.good)
     sigma = blur.along(lines.normal)
-    data = edge_pixels(board.image, lines, sigma, shading, REACH * sigma, 1)
+    data = edge_pixels(grid_image.image, lines, sigma, shading, REACH * sigma, 1)
     prior = level_prior(shading, lines.middle, sigma, blur.spread, noise.edge)
     offset = first.map.residual[:n] + first.map.shift[0]
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
@@ -247,25 +255,29 @@ def _fine_fit(
     if usual < SHARP or median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # So precise, or so sharp, that the profile from a share of the pixels is what is worst known.
         shape = profile_shape(data, fit, shape, first.good)
-        noise = Noise.of(fit, data.root, board.floor)
+        noise = PixelNoise.of(fit, data.root, grid_image.floor)
         data = with_weight(data, noise.weights(fit.linear.x))
         fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
     return fit, data, shape, noise
 
 
-def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Lines], NDArray[np.bool_]]:
+def fit_grid_vertices(
+    grid_image: GridImage, fitted: GridFit
+) -> tuple[BatchFit, tuple[Lines, Lines], NDArray[np.bool_]]:
     """Fits of all seen vertices after those of the edges, with their lines, and which to believe."""
-    grid = board.anchors.grid[: len(board.anchors.grid) // 2]
+    grid = grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2]
     lines = vertex_lines(fitted.map.map, grid)
-    light = np.where((grid.sum(axis=1) + board.grid.dark) % 2 == 1, 1.0, -1.0)
+    light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
     blur = BoardBlur.of(fitted.fit, fitted.lines.normal, fitted.good)
     sigma = 0.5 * (blur.along(lines[0].normal) + blur.along(lines[1].normal))
     contrast = fitted.shading.at(place)[1]
     slopes = fitted.shading.slopes(place)
-    data = vertex_data(board.image, lines, light, sigma, REACH, slopes, contrast, _ends(board.grid.seen))
+    data = vertex_data(
+        grid_image.image, lines, light, sigma, REACH, slopes, contrast, _ends(grid_image.grid.seen)
+    )
     tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
-    shape = Shape(tails, fitted.shape.bend)
+    shape = ProfileShape(tails, fitted.shape.nonlinearity)
     if fitted.shape.half is not None:
         shape = replace(shape, half=np.stack([half_widths(line.normal) for line in lines], axis=1))
     prior = level_prior(fitted.shading, place, sigma, blur.spread, fitted.noise.edge)
@@ -281,7 +293,7 @@ def fit_all_vertices(board: Board, fitted: Fitted) -> tuple[Fit, tuple[Lines, Li
         variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
         variance *= fitted.map.excess
         departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
-    return fit, lines, believable(fit, departure, data.beyond)
+    return fit, lines, is_reliable(fit, departure, data.beyond)
 
 
 def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -292,7 +304,7 @@ def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(np.stack([along_c[seen], along_r[seen]], axis=1))
 
 
-def _shading(first: Fitted) -> Shading:
+def _shading(first: GridFit) -> Shading:
     """Levels of the whole board from those of its edges."""
     covariance, values, good = first.fit.covariance, first.fit.values, first.good
     both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]

@@ -11,15 +11,26 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.fold import bend, joined, restricted, unfolded
-from neurocal_cli.detection.finding.grow import Lattice, cropped, judged, smoothing, squared
+from neurocal_cli.detection.finding.folds import (
+    connected_parts,
+    largest_second_difference,
+    split_at_folds,
+    subset,
+)
+from neurocal_cli.detection.finding.grow import (
+    Lattice,
+    check_lattice,
+    cropped,
+    derivative_sigma,
+    in_whole_square,
+)
 from neurocal_cli.detection.finding.levels import Level
-from neurocal_cli.detection.finding.refine import settle
 from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.detection.finding.seeds import Links
+from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 
-__all__ = ["linked"]
+__all__ = ["lattice_from_links"]
 
 # (c, r) from a vertex to its neighbour at the port along c, and at the next ones.
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -30,7 +41,7 @@ _MOST_BENT = 0.16  # squares, of a row; more is seldom perspective, and may be a
 _WHOLE = 0.5  # share of an outer line; links lead astray beyond the board, and growing tells the better
 
 
-def linked(
+def lattice_from_links(
     level: Level, saddles: Saddles, links: Links, middle: int, taken: NDArray[np.bool_]
 ) -> Lattice | None:
     """Put together what is linked with a vertex.
@@ -50,29 +61,29 @@ def linked(
     lattice : Lattice or None
         None where what the links lead to is not all as a board's.
     """
-    places = _followed(links, middle, taken.tolist())
+    places = _follow(links, middle, taken.tolist())
     if len(places) < _FEWEST:
         return None
-    lattice = _laid(saddles, places)
+    lattice = _lattice(saddles, places)
     row, col = np.nonzero(lattice.seen)
-    settled = settle(level.image, lattice.pixels[row, col], smoothing(lattice.width))
-    stays = np.abs(settled - lattice.pixels[row, col]).max(axis=1) < _NEAR
-    lattice.pixels[row, col] = np.where(stays[:, None], settled, np.nan)
+    refined = refine_saddles(level.image, lattice.pixels[row, col], derivative_sigma(lattice.width))
+    stays = np.abs(refined - lattice.pixels[row, col]).max(axis=1) < _NEAR
+    lattice.pixels[row, col] = np.where(stays[:, None], refined, np.nan)
     # Over a fold vertices are linked as anywhere else; growing stops there.
-    part = _with(unfolded(lattice), saddles.points[middle])
+    part = _with(split_at_folds(lattice), saddles.points[middle])
     for _ in range(_ROUNDS):
         count = 0 if part is None else np.count_nonzero(part.seen)
         if part is None or count < _FEWEST:
             break
-        part, good = judged(level, part)
+        part, good = check_lattice(level, part)
         wrong = count - np.count_nonzero(good)
         if wrong == 0:
             # Holes may hide a fold.
-            return part if bend(part) < _MOST_BENT else None
+            return part if largest_second_difference(part) < _MOST_BENT else None
         if wrong > _WRONG * count:
             break
         # What is left out has another chance when the grid grows.
-        part = _with(joined(restricted(part, squared(good))), saddles.points[middle])
+        part = _with(connected_parts(subset(part, in_whole_square(good))), saddles.points[middle])
     return None
 
 
@@ -82,14 +93,14 @@ def _with(parts: list[Lattice], point: Array) -> Lattice | None:
     return next(near, None)
 
 
-def _laid(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
+def _lattice(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
     """Saddles at their places (c, r), without those that close no square, and without ragged outer lines."""
     place, index = np.array(list(places)), np.array(list(places.values()))
     left, top = place.min(axis=0)
     cols, rows = place.max(axis=0) - (left, top) + 1
     member = np.full((rows, cols), -1, dtype=np.intp)
     member[place[:, 1] - top, place[:, 0] - left] = index
-    seen = squared(member >= 0)
+    seen = in_whole_square(member >= 0)
     for line in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
         seen[line] &= seen[line].mean() > _WHOLE
     row, col = np.nonzero(seen)
@@ -99,7 +110,7 @@ def _laid(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
     return cropped(Lattice(pixels, contrast, int(left + top) % 2))
 
 
-def _followed(links: Links, middle: int, taken: list[bool]) -> dict[tuple[int, int], int]:
+def _follow(links: Links, middle: int, taken: list[bool]) -> dict[tuple[int, int], int]:
     """Saddles by their places (c, r) from the middle one, each at the first place that leads to it."""
     to, entry = links.lists
     places, along = {(0, 0): middle}, {middle: 0}  # the latter: each one's port along c

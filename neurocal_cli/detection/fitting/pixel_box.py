@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.detection.fitting.profile import Real, erf_and_density, profile, tails_of, with_sign
+from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, profile, tails_of, with_sign
 from neurocal_cli.geometry import Array
 
 __all__ = ["PIXEL", "box_profile", "half_widths", "sharp_profile"]

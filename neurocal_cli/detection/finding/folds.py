@@ -17,7 +17,7 @@ from neurocal_cli.detection.finding.grow import Lattice, cropped
 from neurocal_cli.detection.medians import median, quantile
 from neurocal_cli.geometry import Array
 
-__all__ = ["bend", "joined", "restricted", "unfolded"]
+__all__ = ["connected_parts", "largest_second_difference", "split_at_folds", "subset"]
 
 # The least bend that is a fold [squares] and its ratio to the bends of the rows far from it: paper
 # is bent too, and the less the better the board is otherwise.
@@ -29,16 +29,16 @@ _BETWEEN = 1.4  # what a bend shared by two rows counts more, to be as large as 
 _ONE_SIDED = 0.7  # what a bend counts that is compared with one side only
 
 
-def unfolded(lattice: Lattice) -> list[Lattice]:
+def split_at_folds(lattice: Lattice) -> list[Lattice]:
     """Cut a lattice into the parts that are joined and have no fold.
 
     Vertices on a fold go to neither side: they belong to both planes, and their edges bend there.
     """
-    whole = joined(lattice)
+    whole = connected_parts(lattice)
     if len(whole) != 1:
-        return [part for piece in whole for part in unfolded(piece)]
+        return [part for piece in whole for part in split_at_folds(piece)]
     lattice = whole[0]
-    row, col = _folds(lattice)
+    row, col = _sharpest_folds(lattice)
     if row[1] == 0 and col[1] == 0:
         return [lattice]
     pixels = lattice.pixels if row[1] >= col[1] else lattice.pixels.transpose(1, 0, 2)
@@ -52,33 +52,33 @@ def unfolded(lattice: Lattice) -> list[Lattice]:
         kept = np.where(side[:, None, None], pixels, np.nan)
         if pixels is not lattice.pixels:
             kept = kept.transpose(1, 0, 2)
-        part = restricted(lattice, np.isfinite(kept[..., 0]))
-        parts += unfolded(part) if part.seen.any() else []
+        part = subset(lattice, np.isfinite(kept[..., 0]))
+        parts += split_at_folds(part) if part.seen.any() else []
     return parts
 
 
-def restricted(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:
+def subset(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:
     """Some of a lattice's vertices."""
     pixels = np.where(kept[..., None], lattice.pixels, np.nan)
     return cropped(replace(lattice, pixels=pixels, contrast=np.where(kept, lattice.contrast, np.nan)))
 
 
-def joined(lattice: Lattice) -> list[Lattice]:
+def connected_parts(lattice: Lattice) -> list[Lattice]:
     """Parts whose vertices are neighbours of each other along rows and columns."""
     count, label = cv2.connectedComponents(lattice.seen.astype(np.uint8), connectivity=4)
     if count == 2:
         return [cropped(lattice)]
-    return [restricted(lattice, label == k) for k in range(1, count)]
+    return [subset(lattice, label == k) for k in range(1, count)]
 
 
-def _folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
+def _sharpest_folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
     """The sharpest folds along a row and along a column, see `_fold`."""
     width = max(median(lattice.known[2].width), 1.0)
     along_columns, along_rows = _second_differences(lattice)
     return _fold(along_columns, width), _fold(along_rows, width)
 
 
-def bend(lattice: Lattice) -> float:
+def largest_second_difference(lattice: Lattice) -> float:
     """How much the most bent row or column of a lattice is bent, folds included [squares]."""
     return max(float(_size(second).max()) for second in _second_differences(lattice))
 
@@ -125,7 +125,10 @@ def _fold(second: Array, width: float) -> tuple[float, float]:
     others = np.abs(np.arange(2 * rows) - best) > 3
     far_off = size[others & (size > 0)]
     usual = quantile(far_off, 0.25) if len(far_off) else _UNKNOWN
-    least = (max(bend + _BENT_PX / width, ratio * usual) for bend, ratio in _FOLDS)
+    least = (
+        max(largest_second_difference + _BENT_PX / width, ratio * usual)
+        for largest_second_difference, ratio in _FOLDS
+    )
     if size[best] < min(least):
         return 0.0, 0.0
     return 0.5 * best, float(size[best])
