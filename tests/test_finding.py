@@ -12,10 +12,11 @@ from neurocal_cli.detection.finding import levels as find_levels
 from neurocal_cli.detection.finding.folds import largest_second_difference
 from neurocal_cli.detection.finding.from_links import lattice_from_links
 from neurocal_cli.detection.finding.grids import find_grids
-from neurocal_cli.detection.finding.grow import Lattice
+from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.finding.levels import Level, levels_of
+from neurocal_cli.detection.finding.links import find_links
 from neurocal_cli.detection.finding.saddles import find_saddles
-from neurocal_cli.detection.finding.seeds import find_links, find_seeds_3x3
+from neurocal_cli.detection.finding.seeds import find_seeds_3x3
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import PlaneTruth, Rectangle, render, scene_bound
@@ -335,7 +336,7 @@ def linked_first(level: Level) -> Lattice | None:
     """What is linked with the best seed of a level."""
     saddles = find_saddles(level)
     links = find_links(level, saddles)
-    seeds, _ = find_seeds_3x3(saddles, links)
+    seeds = find_seeds_3x3(saddles, links)
     return lattice_from_links(level, saddles, links, int(seeds[0, 1, 1]), np.zeros(len(saddles), dtype=bool))
 
 
@@ -357,7 +358,7 @@ def test_links_do_not_lead_over_a_fold(seed: int) -> None:
     level = levels_of(shot.image)[-1]
     saddles = find_saddles(level)
     links = find_links(level, saddles)
-    seeds, _ = find_seeds_3x3(saddles, links)
+    seeds = find_seeds_3x3(saddles, links)
     none = np.zeros(len(saddles), dtype=bool)
     together = [lattice_from_links(level, saddles, links, int(s), none) for s in np.unique(seeds[:, 1, 1])]
     assert any(together)

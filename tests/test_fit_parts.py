@@ -19,11 +19,12 @@ from neurocal_cli.detection.fitting.batched_newton import (
     rows_for,
 )
 from neurocal_cli.detection.fitting.common_parameters import BoardBlur
-from neurocal_cli.detection.fitting.map_fit import Observations, fit_map, median
+from neurocal_cli.detection.fitting.map_fit import Observations, fit_map
 from neurocal_cli.detection.fitting.map_selection import select_map
 from neurocal_cli.detection.fitting.shading import Levels, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import grid_lines, strip_pixels
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
 GRID = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
@@ -207,5 +208,5 @@ def test_rows_may_be_put_together() -> None:
 
 
 def test_median_of_an_even_number_is_the_upper_one() -> None:
-    assert median(np.array([4.0, 1.0, 3.0, 2.0])) == 3
-    assert median(np.array([3.0, 1.0, 2.0])) == 2
+    assert upper_median(np.array([4.0, 1.0, 3.0, 2.0])) == 3
+    assert upper_median(np.array([3.0, 1.0, 2.0])) == 2

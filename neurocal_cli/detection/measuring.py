@@ -1,9 +1,10 @@
-"""Mid-points or vertices of a found grid, measured as well as the pixels' noise allows.
+"""Mid-points or vertices of a grid, measured to the limit that the noise of the pixels sets.
 
-Every edge is fitted with all the pixels around it. A smooth map from grid to pixels through all the
-edges tells the mid-points' coordinates along the edges, and how the edges are bent; across, each
-mid-point has only its own edge's word. What moves all edges towards the dark or the light side shows
-as an alternating shift between edges and map, and is taken off.
+In: an image and a grid with vertices known to half a pixel. Out: `Measured` points with covariances. Every
+edge is fitted to all the pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
+coordinates of the mid-points along their edges, and the curvature of the edges. Across its edge, a mid-point
+is measured by that edge alone. Gamma, ink spread and blooming displace all edges towards the dark or the
+light side: an alternating shift between edges and map, which is estimated and removed.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from neurocal_cli.detection.fitting.batched_newton import BLUR
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
 from neurocal_cli.detection.fitting.edge_profile import response
 from neurocal_cli.detection.fitting.grid_fit import GridFit, GridImage, fit_grid, fit_grid_vertices
-from neurocal_cli.detection.fitting.map_fit import median
 from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = ["measure"]
 
 _ROUNDING = 1 / 12  # DN^2
-_EXACT, _TINY = 1e-5, 1e-30  # relative rounding of the fits' own numbers, for images without noise
-_FAR, _PLACES = 3.0, 601  # sigma, and places where the middle level is looked for
+_EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance of images without noise
+_FAR, _PLACES = 3.0, 601  # sigma on both sides of an edge and samples, to find its middle level
 
 
 def measure(
@@ -36,7 +37,7 @@ def measure(
     points: Literal["midpoints", "vertices"] = "midpoints",
     gamma: float | None = None,
 ) -> Measured:
-    """Measure the mid-points of all edges between seen vertices, or the vertices.
+    """Measure the mid-points of all edges between known vertices, or the vertices.
 
     Parameters
     ----------
@@ -46,13 +47,13 @@ def measure(
         Vertices known to about half a pixel.
     points : {"midpoints", "vertices"}
     gamma : float, optional
-        The image is light^(1 / gamma), which is undone first. Without, whatever the response does to
-        the edges is measured.
+        The image is ``light^(1 / gamma)``, which is inverted first. Without it, the effect of the response
+        on the edges is estimated.
 
     Returns
     -------
     measured : Measured
-        With points that failed the quality gate left out.
+        Without the points whose fits were rejected.
     """
     light = image if gamma is None else _linear(image, gamma)
     whole = np.issubdtype(light.dtype, np.integer)
@@ -111,9 +112,9 @@ def _midpoints(grid_image: GridImage, fitted: GridFit) -> tuple[Array, Array]:
 
 
 def _polarity(fitted: GridFit) -> float:
-    """How far towards the dark side [px] the middle between the levels lies from the undisturbed edge."""
+    """Displacement [px] of the middle between the levels from the true edge, towards the dark side."""
     z = np.linspace(-_FAR, _FAR, _PLACES)[None]
-    sigma = median(fitted.fit.values[:, BLUR])
+    sigma = upper_median(fitted.fit.values[:, BLUR])
     half = None if fitted.shape.half is None else fitted.shape.half[:1]
     edge = sharp_profile(z, np.array([[sigma]]), fitted.shape.tails[:1], half)[0]
     light = response(edge, fitted.shape.nonlinearity)[0][0]
@@ -148,7 +149,7 @@ def _vertices(grid_image: GridImage, fitted: GridFit, vertices: Array) -> Measur
 
 
 def _linear(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:
-    """Light that made an image, in units of the image's own full scale."""
+    """The image linearised, in units of its own full scale."""
     if np.issubdtype(image.dtype, np.integer):
         full = float(np.iinfo(image.dtype).max)  # type: ignore[type-var]
         table = full * (np.arange(full + 1) / full) ** gamma

@@ -1,10 +1,14 @@
-"""Whether a lattice is a chessboard, or something in the clutter that resembles one."""
+"""The last tests of a lattice: a chessboard, or clutter.
+
+In: a lattice that has grown. Out: whether it has a block of 3 x 3 vertices, whether its vertices lie on a
+smooth surface, and whether its edges separate dark from light. Called by `grids`.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.detection.finding.grow import Lattice, signs
+from neurocal_cli.detection.finding.lattice import Lattice, signs
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
@@ -21,7 +25,7 @@ _MANY, _FEW_SMOOTH = 18, 0.6  # few vertices are in line by chance: less is tole
 
 
 def has_block(lattice: Lattice) -> bool:
-    """Whether a block of 3 x 3 vertices is known: below that no line is tested by a third vertex."""
+    """Whether a block of 3 x 3 vertices is known. In smaller lattices no line is tested by a third vertex."""
     seen = lattice.seen
     if min(seen.shape) < 3:
         return False
@@ -30,13 +34,13 @@ def has_block(lattice: Lattice) -> bool:
 
 
 def is_smooth(level: Level, lattice: Lattice) -> bool:
-    """Whether vertices are where their neighbours put them, as well as noise allows."""
+    """Whether the vertices lie where their neighbours predict them, within what noise explains."""
     return roughness(level, lattice) < (1 if lattice.seen.sum() >= _MANY else _FEW_SMOOTH)
 
 
 def roughness(level: Level, lattice: Lattice) -> float:
-    """How far vertices are from where their neighbours put them, over what is tolerated."""
-    row, col, predicted = lattice.known
+    """Root mean square distance of the vertices from their predictions, relative to the tolerance."""
+    row, col, predicted = lattice.predicted
     off = (
         predicted.in_squares(lattice.pixels[row, col] - predicted.points)
         / np.maximum(predicted.spread, 1.0)[:, None]
@@ -47,23 +51,23 @@ def roughness(level: Level, lattice: Lattice) -> float:
 
 
 def edges_visible(level: Level, lattice: Lattice) -> bool:
-    """Whether dark and bright are told apart across the edges between neighbouring vertices."""
-    row, col, predicted = lattice.known
+    """Whether the edges between neighbouring vertices separate dark from light."""
+    row, col, predicted = lattice.predicted
     pixels, contrast = lattice.pixels, lattice.contrast
     c, r = np.full_like(pixels, np.nan), np.full_like(pixels, np.nan)
     c[row, col], r[row, col] = predicted.c, predicted.r
-    held = [
+    visible = [
         _edges_with_contrast(level, pixels, r, contrast, lattice.dark),
-        # With rows and columns exchanged, the squares on either side are too.
+        # Exchanging rows and columns also exchanges the two sides of an edge.
         _edges_with_contrast(
             level, pixels.transpose(1, 0, 2), c.transpose(1, 0, 2), contrast.T, lattice.dark
         ),
     ]
-    return float(np.concatenate(held).mean()) >= _EDGES
+    return float(np.concatenate(visible).mean()) >= _EDGES
 
 
 def _edges_with_contrast(level: Level, pixels: Array, steps: Array, contrast: Array, dark: int) -> Array:
-    """Whether each edge along a row is seen; ways (rows, cols, 2) lead from row to row."""
+    """Whether each edge along a row has contrast; steps (rows, cols, 2) lead from row to row."""
     known = np.isfinite(pixels[..., 0])
     row, col = np.nonzero(known[:, :-1] & known[:, 1:])
     start, end = pixels[row, col], pixels[row, col + 1]

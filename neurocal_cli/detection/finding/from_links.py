@@ -1,7 +1,7 @@
-"""The vertices of a board that are linked with one another: most of a grid, before it begins to grow.
+"""A short cut for growth: most of a grid at once, by following links from vertex to vertex.
 
-Layer by layer a grid grows as surely, only more slowly: what links have put together counts only where every
-vertex looks like one and is where its neighbours put it.
+In: saddles, their links, and the middle of a seed. Out: a lattice, or None. The lattice is only accepted
+where every vertex passes the tests that `grow` applies; growing layer by layer gives the same, more slowly.
 """
 
 from __future__ import annotations
@@ -11,22 +11,19 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.folds import (
-    connected_parts,
-    largest_second_difference,
-    split_at_folds,
-    subset,
-)
-from neurocal_cli.detection.finding.grow import (
+from neurocal_cli.detection.finding.folds import largest_second_difference, split_at_folds
+from neurocal_cli.detection.finding.grow import check_lattice
+from neurocal_cli.detection.finding.lattice import (
     Lattice,
-    check_lattice,
+    connected_parts,
     cropped,
     derivative_sigma,
     in_whole_square,
+    subset,
 )
 from neurocal_cli.detection.finding.levels import Level
+from neurocal_cli.detection.finding.links import Links
 from neurocal_cli.detection.finding.saddles import Saddles
-from neurocal_cli.detection.finding.seeds import Links
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 
@@ -34,17 +31,18 @@ __all__ = ["lattice_from_links"]
 
 # (c, r) from a vertex to its neighbour at the port along c, and at the next ones.
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
-_NEAR = 1.0  # px; of a saddle from where it is with more smoothing
-_FEWEST = 12  # vertices
-_ROUNDS, _WRONG = 3, 0.35  # times that some are left out, and their share
-_MOST_BENT = 0.16  # squares, of a row; more is seldom perspective, and may be a fold
-_WHOLE = 0.5  # share of an outer line; links lead astray beyond the board, and growing tells the better
+# A lattice rejected here grows instead, which costs time only: tests/benchmarks/test_detection_speed.py.
+_NEAR = 1.0  # px, that a saddle may move when derivatives are smoothed more
+_FEWEST = 12  # vertices; fewer are grown from the seed
+_ROUNDS, _WRONG = 3, 0.35  # rounds of removing outliers, and their greatest share
+_MOST_BENT = 0.16  # squares; a larger second difference may be a fold
+_WHOLE = 0.5  # least share of an outer line that is linked; beyond the board, links lead astray
 
 
 def lattice_from_links(
     level: Level, saddles: Saddles, links: Links, middle: int, taken: NDArray[np.bool_]
 ) -> Lattice | None:
-    """Put together what is linked with a vertex.
+    """Follow the links that start at a vertex, and test what they lead to.
 
     Parameters
     ----------
@@ -59,7 +57,7 @@ def lattice_from_links(
     Returns
     -------
     lattice : Lattice or None
-        None where what the links lead to is not all as a board's.
+        None where the vertices fail the tests.
     """
     places = _follow(links, middle, taken.tolist())
     if len(places) < _FEWEST:
@@ -69,7 +67,7 @@ def lattice_from_links(
     refined = refine_saddles(level.image, lattice.pixels[row, col], derivative_sigma(lattice.width))
     stays = np.abs(refined - lattice.pixels[row, col]).max(axis=1) < _NEAR
     lattice.pixels[row, col] = np.where(stays[:, None], refined, np.nan)
-    # Over a fold vertices are linked as anywhere else; growing stops there.
+    # Links cross folds.
     part = _with(split_at_folds(lattice), saddles.points[middle])
     for _ in range(_ROUNDS):
         count = 0 if part is None else np.count_nonzero(part.seen)
@@ -78,23 +76,23 @@ def lattice_from_links(
         part, good = check_lattice(level, part)
         wrong = count - np.count_nonzero(good)
         if wrong == 0:
-            # Holes may hide a fold.
+            # A fold may hide in a gap.
             return part if largest_second_difference(part) < _MOST_BENT else None
         if wrong > _WRONG * count:
             break
-        # What is left out has another chance when the grid grows.
+        # Vertices left out here can be found again when the grid grows.
         part = _with(connected_parts(subset(part, in_whole_square(good))), saddles.points[middle])
     return None
 
 
 def _with(parts: list[Lattice], point: Array) -> Lattice | None:
-    """The lattice that a point [px] is a vertex of."""
+    """The lattice that has a vertex at a point [px]."""
     near = (part for part in parts if (np.abs(part.pixels - point) < _NEAR).all(axis=-1).any())
     return next(near, None)
 
 
 def _lattice(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
-    """Saddles at their places (c, r), without those that close no square, and without ragged outer lines."""
+    """Saddles at their places (c, r), without ragged outer lines and those outside complete squares."""
     place, index = np.array(list(places)), np.array(list(places.values()))
     left, top = place.min(axis=0)
     cols, rows = place.max(axis=0) - (left, top) + 1
@@ -106,14 +104,14 @@ def _lattice(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
     row, col = np.nonzero(seen)
     pixels, contrast = np.full((rows, cols, 2), np.nan), np.full((rows, cols), np.nan)
     pixels[row, col], contrast[row, col] = (x[member[row, col]] for x in (saddles.points, saddles.contrast))
-    # The square that begins at the middle one, between its ports 0 and 1, is dark.
+    # The square between ports 0 and 1 of the middle vertex is dark.
     return cropped(Lattice(pixels, contrast, int(left + top) % 2))
 
 
 def _follow(links: Links, middle: int, taken: list[bool]) -> dict[tuple[int, int], int]:
-    """Saddles by their places (c, r) from the middle one, each at the first place that leads to it."""
+    """Saddles by their places (c, r) relative to the middle one, found breadth first."""
     to, entry = links.lists
-    places, along = {(0, 0): middle}, {middle: 0}  # the latter: each one's port along c
+    places, along = {(0, 0): middle}, {middle: 0}  # saddle by place, and its port along c
     waiting = deque(places)
     while waiting:
         c, r = waiting.popleft()

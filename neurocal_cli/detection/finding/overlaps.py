@@ -1,12 +1,14 @@
-"""Vertices that two lattices claim: copies of a lattice, and the vertices on a fold."""
+"""Vertices that belong to two lattices: copies of a lattice, and rows beyond a fold.
+
+In: the lattices of a level. Out: lattices that share no vertices.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from neurocal_cli.detection.finding.grow import Lattice, cropped, frontier, padded
+from neurocal_cli.detection.finding.grow import frontier
+from neurocal_cli.detection.finding.lattice import Lattice, padded, subset
 from neurocal_cli.detection.finding.predict import predict_vertices
 from neurocal_cli.geometry import Array
 
@@ -21,7 +23,7 @@ _BESIDE = 2.0  # squares; farther from each other lattices have nothing in dispu
 
 
 def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
-    """Leave out lattices most of whose vertices are in a larger one."""
+    """Drop lattices most of whose vertices belong to a larger one."""
     kept: list[Lattice] = []
     for lattice in sorted(lattices, key=lambda x: -int(x.seen.sum())):
         points = lattice.pixels[lattice.seen]
@@ -32,7 +34,7 @@ def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
 
 
 def any_overlap(lattices: list[Lattice]) -> bool:
-    """Whether any two lattices come so near each other that they may claim the same vertices."""
+    """Whether any two lattices are near enough to share vertices."""
     boxes = []
     for lattice in lattices:
         points, room = lattice.pixels[lattice.seen], _BESIDE * _longest(lattice)
@@ -52,9 +54,9 @@ def _longest(lattice: Lattice) -> float:
 
 
 def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
-    """Take outermost rows off a lattice that lie in another one, or where another one goes on.
+    """Remove outermost rows of a lattice that lie on another lattice or on its next row.
 
-    Of two planes that meet at a fold each may have grown to the fold and a little beyond it.
+    A lattice of one plane may have grown across a fold into the other plane.
     """
     result = list(lattices)
     if len(result) < 2:
@@ -70,7 +72,7 @@ def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
 
 
 def _vertices_and_next(lattice: Lattice) -> tuple[Array, float]:
-    """Vertices of a lattice and where it would go on (N, 2), and its squares' width."""
+    """Vertices of a lattice and of its next rows (N, 2), and the width of its squares."""
     wider, _ = padded(lattice)
     row, col = frontier(wider)
     predicted = predict_vertices(wider.pixels, row, col)
@@ -85,14 +87,13 @@ def _trimmed(lattice: Lattice, place: tuple[Array, float]) -> Lattice:
     drop = np.zeros_like(seen)
     for line, inner in _OUTERMOST:
         known = int(seen[line].sum())
-        # A row that is not whole is likelier to be where a plane ends.
+        # An incomplete row is more likely to lie beyond the end of its plane.
         meets = _MEETS if known > 0.75 * seen[inner].sum() else _MEETS_PARTLY
         if known and (away[line][seen[line]] < meets).mean() >= _MOSTLY:
             drop[line] = seen[line]
     if not drop.any():
         return lattice
-    pixels = np.where(drop[..., None], np.nan, lattice.pixels)
-    return cropped(replace(lattice, pixels=pixels, contrast=np.where(drop, np.nan, lattice.contrast)))
+    return subset(lattice, seen & ~drop)
 
 
 _OUTERMOST = (

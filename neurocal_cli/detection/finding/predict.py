@@ -1,8 +1,9 @@
-"""Where a vertex should be, from its neighbours: a smooth map fitted around every place.
+"""Predicting a vertex from its neighbours, by a local regression.
 
-The map is a quadratic polynomial of the grid coordinates, fitted to the vertices at most three
-squares away. Its second derivatives are held small, as they are for perspective and lens
-distortion, so that few neighbours give a plane map and many a curved one.
+In: an array of known vertices and places in it. Out: the predicted pixel of each place, the steps to the
+next vertices, and the prediction's spread. The map is a quadratic polynomial of the grid coordinates, fitted
+to the vertices at most three squares away by weighted ridge regression. The ridge keeps second derivatives
+small, as perspective and distortion make them, so that few neighbours give a linear map.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from neurocal_cli.geometry import Array
 __all__ = ["PredictedVertices", "predict_vertices"]
 
 _REACH = 3  # squares
-_WIDTH = 1.4  # squares; of the weights
-_HELD_BACK = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])
+_WIDTH = 1.4  # squares; standard deviation of the Gaussian weights
+_RIDGE = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])
 
 _c, _r = (x.ravel().astype(float) for x in np.meshgrid(*[np.arange(-_REACH, _REACH + 1)] * 2))
 _BASIS = np.stack([np.ones_like(_c), _c, _r, 0.5 * _c**2, _c * _r, 0.5 * _r**2], axis=-1)
 _WEIGHT = np.exp(-0.5 * (_c**2 + _r**2) / _WIDTH**2) * (_c**2 + _r**2 > 0)
-# Products of the basis with itself and its weights, a row for each neighbour; then 1, for their number.
+# Weighted products of the basis with itself, one row for each neighbour, and a 1 that counts them.
 _PRODUCTS = (_WEIGHT[:, None, None] * _BASIS[:, :, None] * _BASIS[:, None, :]).reshape(len(_c), -1)
 _PRODUCTS = np.concatenate([_PRODUCTS, np.ones((len(_c), 1))], axis=1)
 _RIGHT = _WEIGHT[:, None] * _BASIS
@@ -33,13 +34,13 @@ _FIRST, _ONES = np.eye(6)[0], np.ones(len(_c))
 
 @dataclass(frozen=True, eq=False)
 class PredictedVertices:
-    """Expected vertices.
+    """Predicted vertices.
 
     Attributes
     ----------
     points : (N, 2) array [px]
-    ways : (N, 2, 2) array [px]
-        To the next vertex along a row, and along a column.
+    steps : (N, 2, 2) array [px]
+        From it to the next vertex along a row, and along a column.
     spread : (N,) array
         Standard deviation of the point per standard deviation of a vertex.
     """
@@ -54,12 +55,12 @@ class PredictedVertices:
 
     @property
     def c(self) -> Array:
-        """(N, 2) ways along a row [px]."""
+        """(N, 2) steps along a row [px]."""
         return self.steps[:, 0]
 
     @property
     def r(self) -> Array:
-        """(N, 2) ways along a column [px]."""
+        """(N, 2) steps along a column [px]."""
         return self.steps[:, 1]
 
     @cached_property
@@ -69,7 +70,7 @@ class PredictedVertices:
 
     @property
     def width(self) -> Array:
-        """(N,) distance between opposite sides of a square, the smaller one [px]."""
+        """(N,) smaller distance between opposite sides of a square [px]."""
         length = np.hypot(self.steps[..., 0], self.steps[..., 1])
         longest = np.maximum(length[:, 0], length[:, 1])
         return np.asarray(np.abs(self.area) / np.maximum(longest, 1e-9))
@@ -97,12 +98,12 @@ def _window(width: int) -> NDArray[np.intp]:
 
 
 def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> PredictedVertices:
-    """Expect vertices where their neighbours put them, whether they are known or not.
+    """Predict vertices from their neighbours, whether they are known or not.
 
     Parameters
     ----------
     pixels : (rows, cols, 2) array [px]
-        nan where unknown.
+        NaN where unknown.
     row, col : (N,) int arrays
     """
     rows, cols = pixels.shape[:2]
@@ -115,8 +116,8 @@ def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]
     near = padded.reshape(3, -1).take((row * width + col)[:, None] + _window(width), axis=1)
     known = near[2]
     sums = known @ _PRODUCTS
-    normal = sums[:, :-1].reshape(-1, 6, 6) + _HELD_BACK
-    # About the mean of the neighbours, for the sake of rounding.
+    normal = sums[:, :-1].reshape(-1, 6, 6) + _RIDGE
+    # Relative to the mean of the neighbours, against rounding errors.
     origin = near[:2] @ _ONES
     origin /= np.maximum(sums[:, -1], 1.0)
     offset = near[:2]

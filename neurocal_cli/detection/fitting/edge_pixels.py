@@ -1,4 +1,4 @@
-"""The pixels that the fits of edges take: how far across, how near to other lines, and how many of them."""
+"""Selecting the pixels of the edge fits: how far across the edge, how near to other lines, and how many."""
 
 from __future__ import annotations
 
@@ -6,19 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.edge_fit import EdgeData, edge_data
-from neurocal_cli.detection.fitting.map_fit import median
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines, strip_pixels
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = ["REACH", "SHARP", "edge_pixels", "usual_stride"]
 
-REACH = 4.0  # sigma on both sides of an edge
-SHARP = 0.45  # px; blur below which the pixel's box is taken exactly
+REACH = 4.0  # sigma on both sides of an edge; farther pixels hold no information on its place
+SHARP = 0.45  # px; below this blur the box of the pixel is modelled exactly
 _NEAREST = 0.5  # sigma from the crossing lines
-_NEAREST_FIRST, _ENDS = 2.0, 0.12  # sigma, but no more than so much of the length, before the last fit
-_NEAREST_SHARP = 0.75  # px from the crossing lines, beyond which no pixel reaches over them
-_COLUMNS = 40  # of pixels along an edge, before the last fit
+_NEAREST_FIRST, _ENDS = 2.0, 0.12  # before the last fit: sigma, at most this share of the length
+_NEAREST_SHARP = 0.75  # px from the crossing lines; no nearer pixel is cut by them
+_COLUMNS = 40  # columns of pixels along an edge before the last fit
 
 
 def edge_pixels(
@@ -36,7 +36,7 @@ def edge_pixels(
     reach : (E,) array [px]
         On both sides of the edges.
     stride : int
-        Only every so manieth column; 1 for the last fit, when the crossing lines are well known.
+        Use every n-th column only; 1 for the last fit, when the crossing lines are well known.
     """
     half = np.minimum(reach, 0.5 * lines.width)
     strips = strip_pixels(image, lines, half, np.zeros((len(half), 1)), stride)
@@ -48,5 +48,5 @@ def edge_pixels(
 
 
 def usual_stride(lines: Lines) -> int:
-    """Only every so manieth column of pixels is taken until the last fit: enough for a start."""
-    return max(2, int(median(lines.length) / _COLUMNS))
+    """The stride of columns before the last fit, for speed."""
+    return max(2, int(upper_median(lines.length) / _COLUMNS))

@@ -1,4 +1,8 @@
-"""The fits of all edges of a board, stage by stage: from vertices known to half a pixel to the limit."""
+"""The fits of all edges of a board, in stages: from vertices known to half a pixel to the noise limit.
+
+A map through the found vertices, offsets of the edges from moments, a first fit with independent levels,
+common parameters, a last fit, and the map through it. In: `GridImage`. Out: `GridFit`, for `measuring`.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +24,7 @@ from neurocal_cli.detection.fitting.edge_fit import (
 from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
-from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, median
+from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map
 from neurocal_cli.detection.fitting.map_selection import select_map
 from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading, square_levels
@@ -28,23 +32,24 @@ from neurocal_cli.detection.fitting.smooth_map import RICHEST_LENS, Frame, Smoot
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
 from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = ["GridEdges", "GridFit", "GridImage", "fit_grid", "fit_grid_vertices"]
 
 Image = NDArray[np.generic]
 
-_START_SIGMA = 0.3  # px, of the found vertices' coordinates
-_GOOD_START = 1.3  # chi2 per coordinate of the found vertices at which their map will do
-_ANCHOR = 2.0  # px; later they only hold what the edges leave open
-_ENOUGH = 60  # edges that need no anchors
+_START_SIGMA = 0.3  # px, of the coordinates of the found vertices
+_GOOD_START = 1.3  # chi2 per coordinate of these vertices at which no richer map is tried
+_ANCHOR = 2.0  # px, of these vertices in later maps, which they only keep regular
+_ENOUGH = 60  # edges that need no such anchors
 _MOMENT_SIGMA = 0.05  # px, of offsets from moments
-_STEPS = 6  # of Gauss and Newton, at most
+_WIDEST = 12.0  # px, half width of the strips for moments
+_STEPS = 6  # Gauss-Newton steps, at most
 _LEAST_VARIANCE = 1e-12  # px^2
-_NORMAL = 1.4826  # standard deviations in a median of absolute values
-_LEAST_SCALE = 0.1  # of the noise by the final residuals; less cannot be, the rounding being known
-_WIDEST = 12.0  # px, of the strips for moments
-_PRECISE = 0.003  # sigma; standard deviation of offsets
+_NORMAL = 1.4826  # standard deviation over the median absolute deviation
+_LEAST_SCALE = 0.1  # of the noise by the final residuals, relative to the first estimate
+_PRECISE = 0.003  # sigma; standard deviation of offsets below which the profile is estimated again
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +73,7 @@ class GridEdges:
 
     @classmethod
     def of(cls, grid: Grid) -> GridEdges:
-        """All whose both vertices are seen."""
+        """All edges between two known vertices."""
         seen = grid.seen
         along_c = np.argwhere(seen[:, :-1] & seen[:, 1:])[:, ::-1]
         along_r = np.argwhere(seen[:-1] & seen[1:])[:, ::-1]
@@ -81,7 +86,7 @@ class GridEdges:
 
 @dataclass(frozen=True, eq=False)
 class GridImage:
-    """What is to be fitted.
+    """An image and a grid in it, prepared for the fits.
 
     Attributes
     ----------
@@ -91,7 +96,7 @@ class GridImage:
     anchors : Rows
         The found vertices.
     floor : float [DN^2]
-        Variance of the pixels that is always there, by rounding.
+        Least variance of the pixels, by rounding.
     """
 
     image: Image
@@ -108,11 +113,11 @@ class GridImage:
         return cls(image, grid, GridEdges.of(grid), anchors, floor)
 
     def lines(self, at: SmoothMap) -> Lines:
-        """The edges as a map sees them."""
+        """The edges in the image, by a map."""
         return grid_lines(at, self.edges.centre, self.edges.vertical, self.edges.light)
 
     def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
-        """Edges as what a map is fitted to; moved by an unknown common shift to the light side."""
+        """Edges as observations of a map, with an unknown common shift to the light side."""
         value = (lines.middle * lines.normal).sum(axis=1) + offset
         edges = Observations(self.edges.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
         if len(offset) > _ENOUGH:
@@ -123,7 +128,7 @@ class GridImage:
 
 @dataclass(frozen=True, eq=False)
 class GridFit:
-    """Fitted edges and what they share.
+    """Fitted edges and their common parameters.
 
     Attributes
     ----------
@@ -135,7 +140,7 @@ class GridFit:
     shape : Shape
     noise : Noise
     good : (E,) bool array
-        Edges to be believed.
+        Edges that passed the quality tests.
     """
 
     lines: Lines
@@ -149,18 +154,18 @@ class GridFit:
 
     @property
     def unevenness(self) -> float:
-        """Variance [px^2] of the edges around the smooth map that their fits cannot explain.
+        """Variance [px^2] of the edges around the smooth map beyond that of their fits.
 
-        A print or a board that is not even, and pixels that the model does not describe: for a camera,
-        noise of the points like any other.
+        Its causes are an uneven print or board, and errors of the model of the pixels. For a calibration it
+        is noise of the points.
         """
         if not self.good.any():
             return 0.0
-        return max(self.map.excess - 1, 0.0) * median(self.fit.covariance[self.good, OFFSET, OFFSET])
+        return max(self.map.excess - 1, 0.0) * upper_median(self.fit.covariance[self.good, OFFSET, OFFSET])
 
 
 def fit_grid(grid_image: GridImage) -> GridFit:
-    """All stages: map of the found vertices, moments, a first fit, what edges share, the last fit."""
+    """All stages: map of the found vertices, moments, first fit, common parameters, last fit."""
     frame = Frame.of(grid_image.anchors.grid, (grid_image.image.shape[1], grid_image.image.shape[0]))
     n = len(grid_image.anchors.grid) // 2
     points = grid_image.anchors.value.reshape(2, n).T
@@ -168,22 +173,22 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = fit_shading(frame, dark, light)
-    noise = max(median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
+    noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
     mapped, sigma = _by_moments(grid_image, found, shading)
     first = _first_fit(grid_image, mapped, sigma, shading, noise)
     return _last_fit(grid_image, first)
 
 
 def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
-    """Map through the edges' moments, and their blur [px]."""
+    """The map through offsets from moments, and the blur [px]."""
     lines = grid_image.lines(found.map)
-    # Where lines cross at an angle they come into wide strips from the side.
+    # Oblique crossing lines enter wide strips from the side.
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
     half = np.clip(half, 2.0, _WIDEST)
     strips = strip_pixels(grid_image.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
     offset, _, blur = moments(strips, half, *shading.at(lines.middle))
-    sigma = float(np.clip(median(blur), 0.33, 0.25 * median(lines.width)))
+    sigma = float(np.clip(upper_median(blur), 0.33, 0.25 * upper_median(lines.width)))
     observations = grid_image.observations(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
     return fit_map(found.map, observations, found.shift), sigma
 
@@ -191,7 +196,7 @@ def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple
 def _first_fit(
     grid_image: GridImage, mapped: MapFit, sigma: float, shading: Shading, noise: float
 ) -> GridFit:
-    """Edges fitted with free levels, and the map through them."""
+    """Edges fitted with independent levels, and the map through them."""
     lines = grid_image.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
     free = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
@@ -201,7 +206,7 @@ def _first_fit(
     good &= variance > 0
     variance = np.where(good, variance, _ANCHOR**2)
     observations = grid_image.observations(lines, fit.values[:, OFFSET], variance)
-    # What the vertices' map needs, that of the edges needs as well; a board's own unevenness is for later.
+    # At least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
     chosen = select_map(
         mapped.map,
         observations,
@@ -214,23 +219,23 @@ def _first_fit(
 
 
 def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
-    """Edges fitted with what all of them share, and the map through them."""
+    """Edges fitted with common parameters, and the map through them."""
     good, n = first.good, len(first.good)
     lines = grid_image.lines(first.map.map)
     shading = _shading(first)
     fit, data, shape, noise = _fine_fit(grid_image, first, lines, shading)
-    scale = max(median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
+    scale = max(upper_median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
     observations = grid_image.observations(lines, fit.values[:, OFFSET], trusted)
-    # Better edges may tell of a richer form.
+    # More accurate edges may need a richer model.
     mapped = select_map(first.map.map, observations, first.map.shift, least=first.map.model_index)
     expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
-    # A board that is uneven by itself, as paper is, departs from its map everywhere: no single edge is
-    # wrong for that, but all of them are less certain.
-    uneven = max(_NORMAL * median(np.abs(departure)), 1.0)
+    # An uneven board departs from its map everywhere: no single edge is an outlier for that, but all
+    # of them are less certain.
+    uneven = max(_NORMAL * upper_median(np.abs(departure)), 1.0)
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
     good = is_reliable(fit, departure, data.beyond)
     return GridFit(lines, fit, data, mapped, shading, shape, noise, good)
@@ -239,7 +244,7 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
 def _fine_fit(
     grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading
 ) -> tuple[BatchFit, EdgeData, ProfileShape, PixelNoise]:
-    """Fits to all pixels, with levels, blur, profile and noise from the whole board."""
+    """Fits to all pixels, with levels, blur, profile and noise of the whole board."""
     n, half_length = len(first.good), 0.5 * lines.length
     shape = profile_shape(first.data, first.fit, first.shape, first.good)
     noise = PixelNoise.of(first.fit, first.data.root, grid_image.floor)
@@ -251,9 +256,9 @@ def _fine_fit(
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     data = with_weight(data, noise.weights(light_at(data, start)))
     fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
-    usual = median(sigma)
-    if usual < SHARP or median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
-        # So precise, or so sharp, that the profile from a share of the pixels is what is worst known.
+    usual = upper_median(sigma)
+    if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
+        # The profile, estimated from a part of the pixels, is now the largest error: estimate it again.
         shape = profile_shape(data, fit, shape, first.good)
         noise = PixelNoise.of(fit, data.root, grid_image.floor)
         data = with_weight(data, noise.weights(fit.linear.x))
@@ -264,7 +269,7 @@ def _fine_fit(
 def fit_grid_vertices(
     grid_image: GridImage, fitted: GridFit
 ) -> tuple[BatchFit, tuple[Lines, Lines], NDArray[np.bool_]]:
-    """Fits of all seen vertices after those of the edges, with their lines, and which to believe."""
+    """Fits of all known vertices after those of the edges, with their lines and a mask of reliable ones."""
     grid = grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2]
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
@@ -287,7 +292,7 @@ def fit_grid_vertices(
     fit = fit_vertices(unit, start, prior, half, shape, _STEPS)
     root = np.sqrt(fitted.noise.weights(fit.linear.x)) * (data.root > 0)
     fit = fit_vertices(replace(data, root=root), fit.values, prior, half, shape, _STEPS)
-    fit = fit.scaled(max(median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
+    fit = fit.scaled(max(upper_median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
         variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
@@ -297,7 +302,7 @@ def fit_grid_vertices(
 
 
 def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(V, 2, 2) where no vertex follows a seen one: back and forth, along c and along r."""
+    """(V, 2, 2) mask of known vertices without a neighbour: before and after, along c and along r."""
     beyond = ~np.pad(seen, 1)
     along_c = np.stack([beyond[1:-1, :-2], beyond[1:-1, 2:]], axis=-1)
     along_r = np.stack([beyond[:-2, 1:-1], beyond[2:, 1:-1]], axis=-1)
@@ -305,7 +310,7 @@ def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _shading(first: GridFit) -> Shading:
-    """Levels of the whole board from those of its edges."""
+    """Shading of the whole board from the levels of its edges."""
     covariance, values, good = first.fit.covariance, first.fit.values, first.good
     both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]
     cross = 2 * covariance[:, MEAN, CONTRAST]

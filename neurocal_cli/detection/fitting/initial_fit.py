@@ -1,4 +1,8 @@
-"""The first fits of a board's edges, with levels of their own, which tell its blur and its profile."""
+"""The first fits of a board's edges, each with its own levels, to estimate blur and profile.
+
+In: lines from the map, rough offsets and blur. Out: `InitialFit`, from which `grid_fit` estimates what all
+edges have in common.
+"""
 
 from __future__ import annotations
 
@@ -13,30 +17,30 @@ from neurocal_cli.detection.fitting.edge_fit import EdgeData, fit_edges, with_we
 from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis
 from neurocal_cli.detection.fitting.fit_quality import is_typical
-from neurocal_cli.detection.fitting.map_fit import median
 from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = ["InitialFit", "fit_initial"]
 
-_SLACK = 0.5  # px, for starts that are off
-_FEW_STEPS, _STEPS = 3, 6  # of Gauss and Newton, at most; the former before blur and shape are known
-_CLEARLY = 0.97  # of chi2, with which another profile than the pixel's box is believed
-_WORSE = 1.2  # of chi2, with which another blur is not
-_BLUR_OFF = 0.2  # relative error of the blur that makes the fit begin again
-_LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations before anything is known
+_SLACK = 0.5  # px, added to the strips because lines are not accurate yet
+_FEW_STEPS, _STEPS = 3, 6  # Gauss-Newton steps before and after blur and shape are known
+_CLEARLY = 0.97  # ratio of chi2 below which the smooth profile is preferred to the pixel's box
+_WORSE = 1.2  # ratio of chi2 from which on fits with the new blur are rejected
+_BLUR_OFF = 0.2  # relative error of the blur that makes the fits start again
+_LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations of the prior
 
 
 @dataclass(frozen=True, eq=False)
 class InitialFit:
-    """Fits with free levels.
+    """Fits of edges with independent levels.
 
     Attributes
     ----------
     data : EdgeData
-        Pixels that were fitted.
+        The pixels used.
     fit : Fit
     shape : Shape
     """
@@ -48,27 +52,27 @@ class InitialFit:
     @property
     def rough(self) -> float:
         """Typical chi2 per pixel."""
-        return median(self.fit.chi2 / np.maximum(self.fit.count, 1))
+        return upper_median(self.fit.chi2 / np.maximum(self.fit.count, 1))
 
     def blur(self, otherwise: float) -> float:
         """Typical blur [px]."""
         good = is_typical(self.fit)
-        return median(self.fit.values[good, BLUR]) if good.any() else otherwise
+        return upper_median(self.fit.values[good, BLUR]) if good.any() else otherwise
 
 
 def fit_initial(
     image: NDArray[np.generic], lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
 ) -> InitialFit:
-    """Fit edges with levels of their own.
+    """Fit edges with independent levels.
 
     Parameters
     ----------
     image : (H, W) array
     lines : Lines
     offset : (E,) array [px]
-        Of the edges from their lines, to begin with.
+        Start of the edges' distances from their lines.
     sigma : float [px]
-        Blur, to begin with.
+        Start of the blur.
     shading : Shading
     noise : float [DN^2]
         Variance of a pixel.
@@ -77,7 +81,7 @@ def fit_initial(
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), known], axis=1)
     started = _few_steps(image, lines, start, known, shading, noise)
     found = started.blur(sigma)
-    # The blur decides what the lines that cross do to the pixels.
+    # The effect of crossing lines on the pixels depends on the blur.
     if abs(found - sigma) > _BLUR_OFF * sigma or (found < SHARP) != (sigma < SHARP):
         known[:, 2] = found
         start = np.where(is_typical(started.fit)[:, None], started.fit.values, start)
@@ -91,7 +95,7 @@ def fit_initial(
 def _few_steps(
     image: NDArray[np.generic], lines: Lines, start: Array, known: Array, shading: Shading, noise: float
 ) -> InitialFit:
-    """A few steps, to see what the blur is; known (E, 3) are mean level, contrast and blur."""
+    """A few steps, to estimate the blur; known (E, 3) are mean level, contrast and blur."""
     blur, half_length = known[:, 2], 0.5 * lines.length
     data = edge_pixels(image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
     data = with_weight(data, np.full_like(data.root, 1 / noise))
@@ -102,9 +106,9 @@ def _few_steps(
 
 
 def _with_best_profile(started: InitialFit, lines: Lines, sigma: float) -> InitialFit:
-    """The fits, with the profile that suits most of them."""
+    """Continue the fits with the blur profile that gives the lower chi2."""
     results = [_converged(started, lines, shape) for shape in _blur_profiles(lines, sigma)]
-    # Both say the same where all edges run along the pixels: then it is the pixels' box.
+    # Prefer the pixel's box: both agree where all edges run along the pixels.
     return results[0] if results[0].rough < _CLEARLY * results[-1].rough else results[-1]
 
 
@@ -117,11 +121,11 @@ def _converged(started: InitialFit, lines: Lines, shape: ProfileShape) -> Initia
 
 
 def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:
-    """Profiles of nothing but blur."""
+    """Profiles of pure blur: the series and, for sharp images, the pixel's box."""
     none = np.zeros(RESPONSE_TERMS)
     tails = box_kurtosis(lines.normal, np.full(len(lines.normal), sigma))
     shapes = [ProfileShape(tails[:, None] * [1.0, 0.0], none)]
     if sigma < SHARP:
-        # Cameras that sharpen their pictures leave edges that are no pixel's box any more.
+        # Cameras that sharpen images do not leave the profile of a pixel's box.
         shapes.append(ProfileShape(np.zeros((len(tails), 2)), none, half_widths(lines.normal)))
     return shapes

@@ -1,4 +1,11 @@
-"""Fitting the smooth map to points known along directions, against outliers."""
+"""Robust fit of the smooth map to positions known along one direction each.
+
+This is not the package's least-squares core, because its problem is different: one dense fit of at most 70
+parameters to a few hundred observations takes well under a millisecond, less than the core's general blocks
+would add. Tukey's weights change between steps.
+
+In: a start, observations. Out: the map with its covariance, residuals, weights of outliers, excess variance.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.smooth_map import MAP_MODELS, Places, SmoothMap
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -17,20 +25,20 @@ __all__ = [
     "Observations",
     "fit_map",
     "loss_of",
-    "median",
     "robust_scale",
     "solve_map",
     "with_covariance",
 ]
 
 STEPS = 25  # at most
-_SHIFT_PRIOR = 1e-2  # 1/px^2
+_SHIFT_PRIOR = 1e-2  # 1/px^2, of the shifts: 10 px
 _TINY = 1e-300
-_BELIEF = 20  # rows' worth of belief that variances are what they claim to be
-_CREEPING = 5e-3  # of chi2; what is gained so slowly is not worth the steps
+_BELIEF = 20  # weight, in observations, of the prior that the given variances are true
+_CREEPING = 5e-3  # relative gain of chi2 below which steps end
 _CONVERGED = 0.2  # of chi2
 _DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
-_TUKEY = 6.0  # standard deviations beyond which a row counts as an outlier
+_ROBUST = 1.5  # standard deviation over the median absolute value, about 1.4826
+_TUKEY = 6.0  # standard deviations beyond which an observation is an outlier
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +53,7 @@ class Observations:
     value : (N,) array [px]
     variance : (N,) array [px^2]
     shift : (N, K) array
-        What else moves the values, linearly, by unknowns that are found along with the map.
+        Derivatives of the values by further unknowns, which are fitted with the map.
     """
 
     grid: Array
@@ -68,7 +76,7 @@ class Observations:
 
     @property
     def informative(self) -> NDArray[np.bool_]:
-        """(N,) rows that tell something about the map; anchors, which may be more than half, do not."""
+        """(N,) mask of the observations that determine the map; anchors, maybe more than half, do not."""
         quarter = len(self.variance) // 4
         return np.asarray(self.variance < 100 * np.partition(self.variance, quarter)[quarter])
 
@@ -80,7 +88,7 @@ class Observations:
 
 @dataclass(frozen=True, eq=False)
 class MapFit:
-    """A map fitted to rows.
+    """A map fitted to observations.
 
     Attributes
     ----------
@@ -93,10 +101,10 @@ class MapFit:
     weight : (N,) array
         From 1 down to 0 for outliers.
     chi2 : float
-        Tukey's loss, about the number of good rows less that of parameters.
+        Of the good observations; about their number minus that of the parameters.
     excess : float
-        Variance of the good rows that tell something about the map, as a multiple of what they claim;
-        1 as long as it may be that by chance, less where it is less.
+        Variance of the good and informative residuals relative to the given variances; 1 where the
+        difference may be chance, less where they are smaller.
     """
 
     map: SmoothMap
@@ -109,17 +117,17 @@ class MapFit:
 
     @property
     def model_index(self) -> int:
-        """Index of the map's form."""
+        """Index of the map's model in `MAP_MODELS`."""
         return MAP_MODELS.index((self.map.radial, self.map.degree))
 
 
 def fit_map(start: SmoothMap, observations: Observations, shift: Array, steps: int = STEPS) -> MapFit:
-    """Levenberg-Marquardt steps with Tukey's weights, from a start that is nearly right.
+    """Levenberg-Marquardt with Tukey's weights, from a start that is nearly right.
 
     Parameters
     ----------
     start : SmoothMap
-        Whose form is kept.
+        Its model is kept.
     rows : Rows
     shift : (K,) array [px]
         Start of the shifts.
@@ -131,7 +139,7 @@ def fit_map(start: SmoothMap, observations: Observations, shift: Array, steps: i
 
 @dataclass(frozen=True, eq=False)
 class MapSolution:
-    """A map after its last step: shifts, residuals (N,) and derivatives (P, N) of what they compare with."""
+    """A fitted map: shifts, residuals (N,) and derivatives (P, N) of the predictions."""
 
     map: SmoothMap
     shift: Array
@@ -142,13 +150,13 @@ class MapSolution:
 def solve_map(
     start: SmoothMap, observations: Observations, shift: Array, steps: int, worth: float = 0.0
 ) -> MapSolution:
-    """Steps to the best map of a form, but only one if that gains less chi2 than would be worth more."""
+    """Fit a map of the start's model; stop after the first step if it lowers chi2 by less than `worth`."""
     free, m = start.free, len(start.free)
     prior = np.concatenate([start.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
     values = np.concatenate([start.parameters[free], shift])
     seen = _Prepared.of(start, observations)
     residual, jacobian = seen.residual(start, shift, free)
-    # Before the first step everything may be off, the shifts above all.
+    # Before the first step all residuals may be large: no weights yet.
     precision, informative = seen.steep * seen.steep, observations.informative
     weight, damping, least = precision, _DAMPING, 0.0
     square = residual * residual
@@ -164,7 +172,7 @@ def solve_map(
         before = weight @ square + prior @ (values * values)
         after = weight @ square_ahead + prior @ (moved * moved)
         if not after <= before:
-            # Where parameters can stand in for one another, it would be so again.
+            # Strongly correlated parameters: keep the damping from now on.
             damping = least = 10 * damping
             continue
         start, values, residual, jacobian, square = tried, moved, ahead, slopes, square_ahead
@@ -180,17 +188,8 @@ def solve_map(
     return MapSolution(start, values[m:], residual, jacobian)
 
 
-def median(x: Array) -> float:
-    """The median, of an even number the upper one; numpy's takes ten times as long for a few hundred."""
-    flat = x.flatten()
-    if not len(flat):
-        return float("nan")
-    flat.partition(len(flat) // 2)
-    return float(flat[len(flat) // 2])
-
-
 def loss_of(z: Array) -> float:
-    """Chi2 that grows no more beyond what no good row reaches."""
+    """Chi2 with every term limited to 100, for outliers."""
     return float(np.minimum(z * z, 100.0).sum())
 
 
@@ -200,30 +199,30 @@ def _tukey(z: Array) -> Array:
 
 
 def robust_scale(z: Array) -> float:
-    """How much larger than claimed the residuals of most rows are; at least 1.
+    """Robust standard deviation of normalised residuals; at least 1.
 
-    What the map cannot follow must not count as outliers as long as most rows have their share in it.
+    Errors of the map that most observations share do not make them outliers.
     """
-    return max(1.0, 1.5 * median(np.abs(z)))
+    return max(1.0, _ROBUST * upper_median(np.abs(z)))
 
 
 @dataclass(frozen=True, eq=False)
 class _Prepared:
-    """Rows, prepared for maps of one form."""
+    """Observations, prepared for maps of one model."""
 
     observations: Observations
     places: Places
     steep: Array  # inverse standard deviations
 
     @classmethod
-    def of(cls, model_index: SmoothMap, observations: Observations) -> _Prepared:
+    def of(cls, start: SmoothMap, observations: Observations) -> _Prepared:
         direction = np.ascontiguousarray(observations.direction.T)
         return cls(
-            observations, model_index.places(observations.grid, direction), 1 / np.sqrt(observations.variance)
+            observations, start.places(observations.grid, direction), 1 / np.sqrt(observations.variance)
         )
 
     def residual(self, now: SmoothMap, shift: Array, free: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Residuals (N,), and derivatives (P, N) of what they are compared with."""
+        """Residuals (N,) and derivatives (P, N) of the predictions."""
         value, along = now.along(self.places)
         residual = self.observations.value - value
         residual -= self.observations.shift @ shift
@@ -231,7 +230,7 @@ class _Prepared:
 
 
 def _solved(normal: Array, gradient: Array, damping: float) -> Array:
-    """Solution of damped normal equations whose parameters have very different sizes."""
+    """Solution of damped normal equations, with scaled parameters."""
     size = 1 / np.sqrt(np.maximum(normal.diagonal(), _TINY))
     scaled = normal * size[:, None] * size
     scaled.ravel()[:: len(size) + 1] += damping
@@ -239,7 +238,7 @@ def _solved(normal: Array, gradient: Array, damping: float) -> Array:
 
 
 def with_covariance(solution: MapSolution, observations: Observations) -> MapFit:
-    """A settled map with its covariance, and what its residuals tell of the rows."""
+    """A solution with its covariance, weights and excess variance."""
     now, shift, residual, jacobian = solution.map, solution.shift, solution.residual, solution.jacobian
     free, informative = now.free, observations.informative
     z = residual / np.sqrt(observations.variance)

@@ -1,4 +1,7 @@
-"""Choosing the form of the smooth map: as rich as the points ask for, and no richer."""
+"""Selecting the model of the smooth map: the simplest one that the observations do not contradict.
+
+In: a start and observations. Out: the fitted map of the selected model of `smooth_map.MAP_MODELS`.
+"""
 
 from __future__ import annotations
 
@@ -19,13 +22,12 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["select_map"]
 
-# A richer form must lower the chi2 by so much for each of its parameters; chance alone gives 1. Residuals far
-# above the noise are those of a board that is uneven by itself: its form is not smooth, and not for a
-# polynomial to follow, so that more is asked.
+# A richer model must lower chi2 by this much for each of its parameters; chance alone gives 1. Residuals far
+# above the noise come from an uneven board, which a polynomial must not follow: the price is higher then.
 _PRICE, _UNEVEN_PRICE = 2.25, 3.0
-_FIRST_SHARE = 0.3  # of that price, which the first step must save for there to be more
-_BARREN = 2  # richer forms without gain, of lenses or of polynomials, after which no more are tried
-_UNEVEN = 4.0  # times the noise; residuals from which on a polynomial is tried when no lens has gained
+_FIRST_SHARE = 0.3  # of that price; what the first step must gain for a model to be fitted further
+_FUTILE = 2  # richer models without gain, of the lens or the polynomial, after which no more are tried
+_UNEVEN = 4.0  # residuals over noise from which a polynomial is tried although no lens model gained
 
 
 def select_map(
@@ -36,25 +38,25 @@ def select_map(
     least: int = 0,
     most: int = len(MAP_MODELS) - 1,
 ) -> MapFit:
-    """The map of the simplest form that the rows do not contradict.
+    """Fit the simplest model that the observations do not contradict.
 
     Parameters
     ----------
     start : SmoothMap
-        Of any form.
+        Of any model.
     rows : Rows
     shift : (K,) array [px]
     enough : float
-        Chi2 per row with which no richer form is tried.
+        Chi2 per observation at which no richer model is tried.
     least, most : int
-        Indices of the simplest and the richest form that is tried.
+        Indices of the simplest and the richest model that are tried.
     """
     best: MapSolution | None = None
-    now, paid, barren = start, 0, [0, 0]  # the latter of lenses, and of polynomials
+    now, paid, futile = start, 0, [0, 0]  # futile: lens models, polynomials
     informative, precision = observations.informative, 1 / np.sqrt(observations.variance)
     n_telling, scale = int(informative.sum()), 0.0
     for radial, degree in MAP_MODELS[least : most + 1]:
-        if barren[degree > 0] >= _BARREN:
+        if futile[degree > 0] >= _FUTILE:
             continue
         now = now.with_model(radial, degree)
         if best is not None and len(now.free) + len(shift) > 0.5 * n_telling:
@@ -70,19 +72,19 @@ def select_map(
         excess = max(1.0, loss / max(n_telling - count, 1))
         price = _price(scale) * excess * (count - paid)
         if best is None or loss_of(best.residual * precision / scale) - loss > price:
-            best, paid, barren = fit, count, [0, 0]
+            best, paid, futile = fit, count, [0, 0]
         else:
-            barren[degree > 0] += 1
+            futile[degree > 0] += 1
         if loss * scale**2 + _PRICE * count < enough * len(observations.value):
             break
-        # Where no lens bends the board so, it may still be bent itself.
-        if barren[0] >= _BARREN and scale < _UNEVEN:
+        # A board may be curved although no lens model fits.
+        if futile[0] >= _FUTILE and scale < _UNEVEN:
             break
     assert best is not None
     return with_covariance(best, observations)
 
 
 def _price(scale: float) -> float:
-    """Chi2 that each parameter of a richer form must save, in units of the scale's square."""
+    """Chi2 that each parameter of a richer model must gain, in units of the squared scale."""
     chance = _PRICE / max(scale, 1.0) ** 2
     return max(chance, _UNEVEN_PRICE - chance)

@@ -1,13 +1,14 @@
-"""The smooth map from a grid's coordinates to pixels: homography, radial distortion, polynomial rest.
+"""The smooth map from grid coordinates to pixels: homography, radial distortion, polynomial.
 
-With x the grid coordinates scaled to [-1, 1] and pixels relative to the image's centre in half diagonals,
+It predicts mid-points along their edges and the curvature of edges; `map_fit` fits it. With x the
+grid coordinates scaled to [-1, 1] and pixels relative to the image's centre in half diagonals,
 
     q = (h0 x + h1 y + h2, h3 x + h4 y + h5) / (1 + h6 x + h7 y)
     p = q + e (k1 rho + k2 rho^2) + sum_k a_k T_k(x, y),    e = q - c
     rho = (1 + m) e_u^2 + 2 n e_u e_v + (1 - m) e_v^2
 
-with m and n for pixels that are not square, and T_k products of Chebyshev's polynomials of a total
-degree from 2 on.
+with m and n for pixels that are not square, and T_k products of Chebyshev polynomials of a total degree
+of at least 2.
 """
 
 from __future__ import annotations
@@ -22,15 +23,15 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["MAP_MODELS", "RICHEST_LENS", "Frame", "Places", "SmoothMap", "homography_start"]
 
-# Forms of the map from the simplest on: (radial parameters, degree of the polynomial rest).
+# Models of the map, the simplest first: (set of radial parameters, degree of the polynomial).
 MAP_MODELS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
-RICHEST_LENS = 3  # index of the richest form without a polynomial
+RICHEST_LENS = 3  # index of the richest model without a polynomial
 
 _HOMOGRAPHY, _LENS = 8, 6
 _REST = _HOMOGRAPHY + _LENS
 _FREE_LENS: tuple[tuple[int, ...], ...] = ((), (10,), (8, 9, 10, 11), (8, 9, 10, 11, 12, 13))
-# Standard deviations of what is known beforehand: the centre of distortion [half diagonals], k1 and k2,
-# m and n, the polynomial's coefficients [half diagonals]. They only bind what the data leave open.
+# Prior standard deviations of the centre of distortion [half diagonals], of k1 and k2, and of all others
+# [half diagonals]: they only matter for what the data do not determine.
 _CENTRE_PRIOR, _RADIAL_PRIOR, _PIXEL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.03, 0.1
 
 
@@ -63,7 +64,7 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Grid points, each with a direction in the image, as maps of one form need them.
+    """Grid points, each with a direction in the image, prepared for maps of one model.
 
     Attributes
     ----------
@@ -74,7 +75,7 @@ class Places:
     origin : (N,) array [px]
         The frame's centre along them.
     rest : (2 m, N) array or None [px]
-        What the polynomials' coefficients change there, along u and along v.
+        Derivatives by the polynomials' coefficients, along u and along v.
     """
 
     ground: Array
@@ -85,7 +86,7 @@ class Places:
 
 @dataclass(frozen=True, eq=False)
 class SmoothMap:
-    """A map with its parameters, of which some may be held at 0.
+    """A map with its parameters, some of which may be fixed at 0.
 
     Attributes
     ----------
@@ -93,11 +94,11 @@ class SmoothMap:
     parameters : (P,) array
         h0..h7, c_u, c_v, k1, k2, m, n, then a_k along u and along v.
     radial : int
-        What is free of the lens: nothing, k1, both and the centre, m and n as well.
+        Free parameters of the lens: none; k1; k1, k2 and the centre; all with m and n.
     degree : int
-        Of the polynomial rest, 0 without.
+        Of the polynomial; 0 without.
     covariance : (P, P) array
-        Of the parameters; 0 for those held.
+        Of the parameters; 0 for fixed ones.
     """
 
     frame: Frame
@@ -114,7 +115,7 @@ class SmoothMap:
 
     @property
     def prior(self) -> Array:
-        """(P,) inverse variances of what is known beforehand."""
+        """(P,) inverse variances of the prior."""
         weights = np.zeros(len(self.parameters))
         weights[8:10], weights[10:12], weights[12:] = 1 / np.square(
             [_CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR]
@@ -122,7 +123,7 @@ class SmoothMap:
         return weights
 
     def with_model(self, radial: int, degree: int) -> SmoothMap:
-        """The map with other free parameters; new ones are 0 and old ones dropped."""
+        """The map with other free parameters; new ones are 0, and old ones are dropped."""
         old = self.parameters[_REST:].reshape(2, -1)
         rest = np.zeros((2, len(_orders(degree, self.frame))))
         common = min(old.shape[1], rest.shape[1])
@@ -153,7 +154,7 @@ class SmoothMap:
         return np.asarray(frame.centre + frame.unit * q.T).reshape(grid.shape)
 
     def places(self, grid: Array, direction: Array) -> Places:
-        """Grid points (N, 2) and unit vectors (2, N), prepared for maps of this form."""
+        """Grid points (N, 2) and unit vectors (2, N), prepared for maps of this model."""
         frame = self.frame
         ground = np.ones((3, len(grid)))
         ground[:2] = ((grid - frame.origin) / frame.half).T
@@ -165,7 +166,7 @@ class SmoothMap:
         return Places(ground, way, frame.centre @ direction, rest)
 
     def along(self, places: Places) -> tuple[Array, Array]:
-        """Pixels along the places' directions, and what they change by.
+        """Pixels along the places' directions, and their derivatives.
 
         Parameters
         ----------
@@ -176,7 +177,7 @@ class SmoothMap:
         -------
         value : (N,) array [px]
         derivatives : (P, N) array
-            By the parameters; 0 for those of the lens that are held.
+            By the parameters; 0 for fixed ones of the lens.
         """
         values, way = self.parameters, places.way
         out = np.empty((len(values), way.shape[1]))
@@ -201,7 +202,7 @@ class SmoothMap:
         return value, out
 
     def _lens(self, q: Array, way: Array, out: Array) -> tuple[Array, Array]:
-        """What the lens adds along ways (2, N), and to these; out (6, N) takes its derivatives."""
+        """Contribution of the lens along ways (2, N) and its derivative by q; out (6, N) takes the others."""
         (k1, k2), metric = self.parameters[10:12], self._metric
         e = q - self.parameters[8:10, None]
         slope = metric @ e
@@ -257,8 +258,8 @@ def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
 def _orders(degree: int, frame: Frame) -> tuple[tuple[int, int], ...]:
     """Orders (i, j) of the polynomials in x and in y.
 
-    Edges tell a place along a line only at the line's vertices. An order as high as their number less
-    one can be anything between them.
+    Edges determine the map along a line at the line's vertices only. An order must therefore be lower than
+    the number of vertices minus one.
     """
     most_x, most_y = (2 * frame.half - 1).tolist()
     return _orders_up_to(degree, max(most_x, 0), max(most_y, 0))

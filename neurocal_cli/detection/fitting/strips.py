@@ -1,4 +1,7 @@
-"""The pixels along lines of a chessboard: where the lines run, and windows of pixels around them."""
+"""Lines of a grid in the image, and the strips of pixels along them.
+
+In: a smooth map. Out: `Lines`, a local frame for each edge, and `Strips`, its pixels, for the edge fits.
+"""
 
 from __future__ import annotations
 
@@ -21,12 +24,12 @@ _NEIGHBOURS = np.array([[0.0, -1.0], [0.0, 1.0]])
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Pieces of grid lines in the image, one cell long, each with the frame that its pixels are seen in.
+    """Pieces of grid lines in the image, one square long, each with a local frame.
 
     Attributes
     ----------
     middle : (E, 2) array [px]
-        Where the map sees the middle of the piece; origin of the frame.
+        Pixel of the middle of the piece; origin of the frame.
     tangent, normal : (E, 2) arrays
         Unit vectors; the normal points to the light side.
     curvature : (E,) array [1/px]
@@ -62,7 +65,7 @@ class Lines:
         across = s * s
         across *= _column(0.5 * self.curvature)
         across += d
-        # The frame is orthogonal, but longer than one where the line is bent.
+        # The vectors are orthogonal, but longer than one on curved lines.
         square = (self.tangent**2).sum(axis=1, keepdims=True)
         t, n = self.tangent / square, self.normal / square
         u, v = s * _column(t[:, 0]), s * _column(t[:, 1])
@@ -72,7 +75,7 @@ class Lines:
 
 
 def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light: Array) -> Lines:
-    """Lines of a grid as a map sees them.
+    """Lines of a grid in the image, by a map.
 
     Parameters
     ----------
@@ -95,7 +98,7 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
     normal = turned * (light * np.where(vertical, -1, 1))[:, None]
     ends = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], tangent)
     sag = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], normal)
-    # The parabola through both ends, its slope at the origin folded into the frame.
+    # A parabola through both ends; turn the frame by its slope at the origin.
     curvature = 2 * (sag[:, 1] / ends[:, 1] - sag[:, 0] / ends[:, 0]) / (ends[:, 1] - ends[:, 0])
     slope = sag[:, 0] / ends[:, 0] - 0.5 * curvature * ends[:, 0]
     tangent, normal = tangent + slope[:, None] * normal, normal - slope[:, None] * tangent
@@ -116,7 +119,7 @@ class Strips:
     Attributes
     ----------
     s, d : (E, N) arrays [px]
-        Tangential and normal coordinate, the latter less the line's curve.
+        Tangential coordinate, and normal distance from the curved line.
     value : (E, N) array [DN]
     inside : (E, N) bool array
         False for the padding and for pixels outside the strip or the image.
@@ -149,9 +152,9 @@ def strip_pixels(
     lines : Lines
     half_width : (E,) array [px]
     trim : (E, 2) array [px]
-        What is left out at the two ends.
+        Length to leave out at the two ends.
     stride : int
-        Only every so manieth column.
+        Use every n-th column only.
     """
     steep = np.abs(lines.tangent[:, 1]) > np.abs(lines.tangent[:, 0])
     order = np.where(steep[:, None], [[1, 0]], [[0, 1]])
@@ -166,7 +169,7 @@ def strip_pixels(
     column = first[:, None] + stride * np.arange(count)
     a: Array = column - middle[:, :1]
     along = a / t[:, :1]
-    # The chord's height over the tangent, to the first order: columns are cut straight.
+    # Height of the curve over its tangent, to first order.
     height = middle[:, 1:] + along * t[:, 1:] + 0.5 * lines.curvature[:, None] * along**2 / n[:, 1:]
     spread = half_width / np.abs(t[:, 0])
     rows = int(np.ceil(2 * spread.max() + 1))
@@ -196,13 +199,13 @@ def _values(image: NDArray[np.generic], lines: Lines, u: Single, v: Single) -> S
 
 
 def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Where the wanted ones of each row are, side by side.
+    """Positions of the wanted elements of each row, side by side.
 
     Parameters
     ----------
     wanted : (E, N) bool array
     count : (E,) int array
-        Of the wanted ones in each row.
+        Number of wanted elements in each row.
 
     Returns
     -------

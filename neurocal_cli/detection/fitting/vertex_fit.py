@@ -1,12 +1,14 @@
 """Maximum-likelihood fits of the vertices, where two edges cross.
 
-With z1, z2 the distances from the two lines in sigma, towards growing r and growing c, the light is
+In: the map, levels and blur of the fitted edges. Out: `BatchFit` with offset and tilt of both lines through
+each vertex. With z1, z2 the distances from the two lines in sigma, towards growing r and growing c, the
+light is
 
     x = +-(E(z1) E(z2) + 4 rho phi(z1) phi(z2) + ...) Q
 
-with the sign of the square between them, rho the cosine between the normals, and Q fading the edges out
-towards the parallel lines on both sides where these are near. The pixels are those of two strips along
-the two lines, each taking the pixels that are nearer to its own line: all that carry information.
+with the sign of the square between them, rho the cosine between the normals, and Q the effect of the
+parallel lines on both sides. The pixels are those of two strips along the two lines, each with the pixels
+that are nearer to its own line.
 """
 
 from __future__ import annotations
@@ -39,22 +41,23 @@ Single = NDArray[np.float32]
 # Values of a vertex's fit: offset [px] and tilt [px over the half length] of the line along c and of that
 # along r, then those of `BatchFit`.
 FIRST, SECOND = 0, 2
-_LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, and at most, as a share of the line
-# Terms of the series for oblique crossings up to a cosine, and for all others.
+_LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this share of the line
+# Terms of the series for oblique crossings up to a cosine, and for all others; tests/test_fit_models.py
+# compares them with a rendered cross.
 _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
-_ALONE = 9.0  # sigma to the next parallel line, beyond which it cannot be noticed
+_ALONE = 9.0  # sigma; a parallel line at this distance has no effect
 
 
 @dataclass(frozen=True, eq=False)
 class VertexData:
-    """What the fits need of the pixels; (V, N) float32 arrays.
+    """The pixels as the fits need them; (V, N) float32 arrays.
 
     Attributes
     ----------
     s1, d1, s2, d2 : arrays [px]
         Tangential and normal coordinates of both lines.
     value : array [DN]
-        Less the slopes' share of A.
+        Minus the slope of A.
     gain : array
         B(u, v) relative to the vertex's own.
     Q : array
@@ -119,7 +122,7 @@ def vertex_data(
     contrast : (V,) array [DN]
         B where the slopes hold.
     last : (V, 2, 2) bool array
-        Which ends of the two lines are the board's: at a fold, what blur brings there is another plane's.
+        Which ends of the two lines are the board's. At a fold, another plane's light is blurred into these.
     """
     parts = []
     for k in (0, 1):
@@ -148,7 +151,7 @@ def vertex_data(
 
 
 def _faded(lines: tuple[Lines, Lines], distances: tuple[Single, Single], sigma: Array) -> Single:
-    """What the parallel lines on both sides leave of the edges, where they are near."""
+    """The effect of near parallel lines on both sides of the edges."""
     Q = np.ones_like(distances[0])
     for line, d in zip(lines, distances, strict=True):
         for k, side in ((0, 1), (1, -1)):
@@ -174,7 +177,7 @@ def fit_vertices(
     shape: ProfileShape,
     steps: int,
 ) -> BatchFit:
-    """Gauss-Newton steps of all vertices at once.
+    """Fit all vertices at once.
 
     Parameters
     ----------
@@ -203,7 +206,7 @@ def fit_vertices(
 def linearised(
     data: VertexData, levers: tuple[Single, Single], values: Array, shape: ProfileShape
 ) -> Linearised:
-    """The model and its derivatives; ``levers`` are s over the half lengths."""
+    """The model and its derivatives; levers are s over the half lengths."""
     offset1, tilt1, offset2, tilt2, mean, contrast, sigma = (
         x.astype(data.value.dtype)[:, None] for x in values.T
     )
@@ -236,10 +239,10 @@ def linearised(
 
 
 def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, Real]:
-    """What the angle between two lines adds to E(z1) E(z2), and its derivatives by z1 and z2.
+    """The effect of the angle between two lines on E(z1) E(z2), and its derivatives by z1 and z2.
 
     The tetrachoric series of two correlated normal variables, 4 phi phi sum_n rho^n / n! He_{n-1} He_{n-1},
-    the longer the more oblique the lines are.
+    with more terms for more oblique lines.
     """
     most = float(np.abs(rho).max(initial=0.0))
     terms = next((n for n, limit in _TERMS if most < limit), _MOST_TERMS)

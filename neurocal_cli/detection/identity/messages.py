@@ -1,4 +1,4 @@
-"""Why an image gives no points: what is said when its grids cannot be laid on the board."""
+"""Messages about images whose grids cannot be located on the board."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ SYMMETRIC_BOARD = (
 
 
 class NoBoardError(NeurocalError):
-    """An image that does not show the board, or not enough of it to tell where its points are."""
+    """An image does not show the board, or not enough of it to locate its points."""
 
 
 def wrong_size_message(board: Board, grid: Grid, ends: Sequence[End]) -> str:
-    """What to say of a grid that has no place on the board."""
+    """The message about a grid that has no place on the board."""
     wanted = _sizes(board)
     shape = grid.shape
     if len(board.planes) == 1:
@@ -39,7 +39,7 @@ def wrong_size_message(board: Board, grid: Grid, ends: Sequence[End]) -> str:
 
 
 def ambiguity_message(board: Board, grids: Sequence[Grid], rms: float) -> str:
-    """What to say of grids that can lie on the board in more ways than one, the best to `rms` px."""
+    """The message about grids with several arrangements, the best one with an rms error [px]."""
     sizes = [sorted((plane.cols, plane.rows)) for plane in board.planes]
     part = next((grid for grid in grids if sorted(grid.shape) not in sizes), None)
     if part is not None:
