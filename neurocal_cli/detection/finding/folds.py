@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.detection.finding.lattice import Lattice, connected_parts, subset
+from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.medians import median, quantile
 from neurocal_cli.geometry import Array
 
 __all__ = ["largest_second_difference", "split_at_folds"]
 
 # Least second difference of a fold [squares], and its least ratio to those of distant rows; paper is not
-# flat either. Chosen so that FOLDED in tests/test_finding.py is split and WHOLE is not.
+# flat either. Insensitive, as all constants here; FOLDED and
+# WHOLE in tests/test_finding.py repeat this.
 _FOLDS = ((0.13, 4.0), (0.06, 12.0))
 _VERTEX_ERROR = 0.2  # px, that errors of the vertices add
 _UNKNOWN = 0.03  # squares; second difference of distant rows where there are none
@@ -30,7 +31,7 @@ def split_at_folds(lattice: Lattice) -> list[Lattice]:
 
     Vertices on a fold are dropped: they belong to both planes, and their edges change direction there.
     """
-    whole = connected_parts(lattice)
+    whole = lattice.connected_parts()
     if len(whole) != 1:
         return [part for piece in whole for part in split_at_folds(piece)]
     lattice = whole[0]
@@ -48,7 +49,7 @@ def split_at_folds(lattice: Lattice) -> list[Lattice]:
         kept = np.where(side[:, None, None], pixels, np.nan)
         if pixels is not lattice.pixels:
             kept = kept.transpose(1, 0, 2)
-        part = subset(lattice, np.isfinite(kept[..., 0]))
+        part = lattice.subset(np.isfinite(kept[..., 0]))
         parts += split_at_folds(part) if part.seen.any() else []
     return parts
 

@@ -13,14 +13,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.folds import largest_second_difference, split_at_folds
 from neurocal_cli.detection.finding.grow import check_lattice
-from neurocal_cli.detection.finding.lattice import (
-    Lattice,
-    connected_parts,
-    cropped,
-    derivative_sigma,
-    in_whole_square,
-    subset,
-)
+from neurocal_cli.detection.finding.lattice import Lattice, in_whole_square
 from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.detection.finding.links import Links
 from neurocal_cli.detection.finding.saddles import Saddles
@@ -31,7 +24,8 @@ __all__ = ["lattice_from_links"]
 
 # (c, r) from a vertex to its neighbour at the port along c, and at the next ones.
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
-# A lattice rejected here grows instead, which costs time only: tests/benchmarks/test_detection_speed.py.
+# Insensitive: a lattice rejected here grows instead, which only costs time
+# (tests/benchmarks/test_detection_speed.py).
 _NEAR = 1.0  # px, that a saddle may move when derivatives are smoothed more
 _FEWEST = 12  # vertices; fewer are grown from the seed
 _ROUNDS, _WRONG = 3, 0.35  # rounds of removing outliers, and their greatest share
@@ -64,7 +58,7 @@ def lattice_from_links(
         return None
     lattice = _lattice(saddles, places)
     row, col = np.nonzero(lattice.seen)
-    refined = refine_saddles(level.image, lattice.pixels[row, col], derivative_sigma(lattice.width))
+    refined = refine_saddles(level.image, lattice.pixels[row, col], lattice.derivative_sigma)
     stays = np.abs(refined - lattice.pixels[row, col]).max(axis=1) < _NEAR
     lattice.pixels[row, col] = np.where(stays[:, None], refined, np.nan)
     # Links cross folds.
@@ -81,7 +75,7 @@ def lattice_from_links(
         if wrong > _WRONG * count:
             break
         # Vertices left out here can be found again when the grid grows.
-        part = _with(connected_parts(subset(part, in_whole_square(good))), saddles.points[middle])
+        part = _with(part.subset(in_whole_square(good)).connected_parts(), saddles.points[middle])
     return None
 
 
@@ -105,7 +99,7 @@ def _lattice(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
     pixels, contrast = np.full((rows, cols, 2), np.nan), np.full((rows, cols), np.nan)
     pixels[row, col], contrast[row, col] = (x[member[row, col]] for x in (saddles.points, saddles.contrast))
     # The square between ports 0 and 1 of the middle vertex is dark.
-    return cropped(Lattice(pixels, contrast, int(left + top) % 2))
+    return Lattice(pixels, contrast, int(left + top) % 2).cropped()
 
 
 def _follow(links: Links, middle: int, taken: list[bool]) -> dict[tuple[int, int], int]:

@@ -19,7 +19,7 @@ from neurocal_cli.detection.finding.accept import edges_visible, has_block, is_s
 from neurocal_cli.detection.finding.folds import split_at_folds
 from neurocal_cli.detection.finding.from_links import lattice_from_links
 from neurocal_cli.detection.finding.grow import grow, remove_outliers
-from neurocal_cli.detection.finding.lattice import Lattice, connected_parts, derivative_sigma
+from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
 from neurocal_cli.detection.finding.levels import Level, levels_of
 from neurocal_cli.detection.finding.links import Links, find_links
 from neurocal_cli.detection.finding.merge import merge_lattices
@@ -38,6 +38,7 @@ __all__ = ["find_grids"]
 _SEARCHED = 1.4e6
 # Larger levels are never searched, for the memory and time it takes.
 _MOST_SEARCHED = 30_000_000
+# Insensitive; they bound the time: tests/benchmarks/test_detection_speed.py, "clutter only".
 _TRIES, _TRIES_2X3 = 8, 4  # seeds of a level that may fail; bounds the time where there is no board
 _BEHIND = 3.0  # ratio of the squares' sizes from which on a second board is not searched
 
@@ -189,7 +190,7 @@ def _find_slivers(level: Level, saddles: Saddles) -> list[Lattice]:
     for lattice in _find_new(part.level, find_saddles(part.level), []):
         pixels = np.full_like(lattice.pixels, np.nan)
         pixels[lattice.seen] = part.back(lattice.pixels[lattice.seen])
-        grid = grow(level, _refined(level, replace(lattice, pixels=pixels), derivative_sigma(0.0), 1))
+        grid = grow(level, _refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))
         found += _boards(remove_outliers(level, grid))
     return found
 
@@ -197,7 +198,7 @@ def _find_slivers(level: Level, saddles: Saddles) -> list[Lattice]:
 def _to_finer_level(level: Level, lattice: Lattice) -> Lattice:
     """The same grid on the next level."""
     lattice = replace(lattice, pixels=2 * lattice.pixels)
-    return _refined(level, lattice, derivative_sigma(lattice.width), 2)
+    return _refined(level, lattice, lattice.derivative_sigma, 2)
 
 
 def _refined(level: Level, lattice: Lattice, sigma: float, most: float) -> Lattice:
@@ -226,4 +227,4 @@ def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
 
 def _boards(lattice: Lattice) -> list[Lattice]:
     """Connected parts of a lattice that are large enough for a board."""
-    return [part for part in connected_parts(lattice) if has_block(part)]
+    return [part for part in lattice.connected_parts() if has_block(part)]

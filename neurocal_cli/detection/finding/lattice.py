@@ -14,17 +14,16 @@ from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
 
 __all__ = [
+    "LEAST_SIGMA",
+    "Index",
     "Lattice",
-    "connected_parts",
-    "cropped",
-    "derivative_sigma",
     "in_whole_square",
-    "padded",
     "signs",
-    "subset",
 ]
 
 Index = NDArray[np.intp]
+
+LEAST_SIGMA = 0.75  # px, of the smoothing of derivatives; for the narrowest squares
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,64 +71,56 @@ class Lattice:
         known = longest > 0
         return median(area[known] / longest[known]) if known.any() else 0.0
 
+    @property
+    def derivative_sigma(self) -> float:
+        """Smoothing of derivatives for the squares' width [px], in steps of 0.25 px to reuse kernels."""
+        return min(max(round(0.15 * self.width / 0.25) * 0.25, LEAST_SIGMA), 2.0)
+
+    def padded(self) -> tuple[Lattice, tuple[int, int]]:
+        """Add an empty row or column on each side that has none; returns the shift of the indices too."""
+        seen = self.seen
+        top, bottom, left, right = (int(line.any()) for line in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
+        if top + left + bottom + right == 0:
+            return self, (0, 0)
+        room, nan = (top, bottom, left, right, cv2.BORDER_CONSTANT), (np.nan, np.nan)
+        pixels, contrast = (
+            np.asarray(cv2.copyMakeBorder(x, *room, value=nan), dtype=float)
+            for x in (self.pixels, self.contrast)
+        )
+        return Lattice(pixels, contrast, (self.dark + top + left) % 2), (top, left)
+
+    def cropped(self) -> Lattice:
+        """Remove outer rows and columns without vertices."""
+        row, col = np.nonzero(self.seen)
+        if not len(row):
+            return self
+        top, left, bottom, right = row.min(), col.min(), row.max() + 1, col.max() + 1
+        if top == left == 0 and (bottom, right) == self.contrast.shape:
+            return self
+        part = slice(top, bottom), slice(left, right)
+        dark = int(self.dark + top + left) % 2
+        return Lattice(self.pixels[part], self.contrast[part], dark)
+
+    def subset(self, kept: NDArray[np.bool_]) -> Lattice:
+        """A lattice of some of the vertices; kept is a (rows, cols) mask."""
+        pixels = np.where(kept[..., None], self.pixels, np.nan)
+        return replace(self, pixels=pixels, contrast=np.where(kept, self.contrast, np.nan)).cropped()
+
+    def connected_parts(self) -> list[Lattice]:
+        """Parts whose vertices are connected along rows and columns."""
+        count, label = cv2.connectedComponents(self.seen.astype(np.uint8), connectivity=4)
+        if count == 2:
+            return [self.cropped()]
+        return [self.subset(label == k) for k in range(1, count)]
+
 
 def signs(row: Index, col: Index, dark: int) -> Array:
     """+1 where the square towards growing c and r is dark, else -1."""
     return np.where((row + col + dark) % 2 == 0, 1.0, -1.0)
 
 
-def derivative_sigma(width: float) -> float:
-    """Smoothing of derivatives for squares of a width [px], in steps of 0.25 px to reuse kernels."""
-    return min(max(round(0.15 * width / 0.25) * 0.25, 0.75), 2.0)
-
-
-def padded(lattice: Lattice) -> tuple[Lattice, tuple[int, int]]:
-    """Add an empty row or column on each side that has none; returns the shift of the indices too."""
-    seen = lattice.seen
-    top, bottom, left, right = (int(line.any()) for line in (seen[0], seen[-1], seen[:, 0], seen[:, -1]))
-    if top + left + bottom + right == 0:
-        return lattice, (0, 0)
-    pixels, contrast = (
-        np.asarray(
-            cv2.copyMakeBorder(x, top, bottom, left, right, cv2.BORDER_CONSTANT, value=(np.nan, np.nan)),
-            dtype=float,
-        )
-        for x in (lattice.pixels, lattice.contrast)
-    )
-    return Lattice(pixels, contrast, (lattice.dark + top + left) % 2), (top, left)
-
-
-def cropped(lattice: Lattice) -> Lattice:
-    """Remove outer rows and columns without vertices."""
-    row, col = np.nonzero(lattice.seen)
-    if not len(row):
-        return lattice
-    top, left, bottom, right = row.min(), col.min(), row.max() + 1, col.max() + 1
-    if top == left == 0 and (bottom, right) == lattice.contrast.shape:
-        return lattice
-    part = slice(top, bottom), slice(left, right)
-    dark = int(lattice.dark + top + left) % 2
-    return Lattice(lattice.pixels[part], lattice.contrast[part], dark)
-
-
-def subset(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:
-    """A lattice of some of the vertices; kept is a (rows, cols) mask."""
-    pixels = np.where(kept[..., None], lattice.pixels, np.nan)
-    return cropped(replace(lattice, pixels=pixels, contrast=np.where(kept, lattice.contrast, np.nan)))
-
-
-def connected_parts(lattice: Lattice) -> list[Lattice]:
-    """Parts whose vertices are connected along rows and columns."""
-    count, label = cv2.connectedComponents(lattice.seen.astype(np.uint8), connectivity=4)
-    if count == 2:
-        return [cropped(lattice)]
-    return [subset(lattice, label == k) for k in range(1, count)]
-
-
 def in_whole_square(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Mask of the vertices of squares whose four vertices are known; seen is a (rows, cols) mask."""
-    whole = seen[:-1, :-1] & seen[:-1, 1:] & seen[1:, :-1] & seen[1:, 1:]
-    result = np.zeros_like(seen)
-    for part in (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]):
-        result[part] |= whole
-    return result
+    corners, kernel = seen.view(np.uint8), np.ones((2, 2), np.uint8)
+    whole = cv2.erode(corners, kernel, anchor=(1, 1), borderType=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(cv2.dilate(whole, kernel, anchor=(0, 0)) > 0)

@@ -18,6 +18,7 @@ __all__ = ["Level", "interpolate", "levels_of"]
 
 Image = NDArray[np.float32]
 
+# _SMOOTHING, _SMALLEST and _LEAST_NOISE are insensitive; the others bound memory.
 _SMOOTHING = 1.0  # px; against noise and aliasing
 _SMALLEST = 100  # px; the shorter side of the smallest level
 _LARGE = 30_000_000  # pixels; in larger images the noise is measured in bands only, to save memory ...

@@ -100,16 +100,16 @@ def _edges_visible(level: Level, saddles: Saddles, to: Index, entry: Index) -> N
     if not len(first):
         return seen
     start, end = saddles.points[first], saddles.points[to[first, p]]
-    way = end - start
-    length = np.hypot(*way.T)
-    normal = np.stack([-way[:, 1], way[:, 0]], axis=-1) / length[:, None]
+    step = end - start
+    length = np.hypot(*step.T)
+    normal = np.stack([-step[:, 1], step[:, 0]], axis=-1) / length[:, None]
     reach = np.clip(0.2 * length, 1.0, 2.5)
     share = np.array([0.3, 0.5, 0.7])
-    middle = start[:, None] + share[:, None] * way[:, None]
+    middle = start[:, None] + share[:, None] * step[:, None]
     offset = (reach[:, None] * normal)[:, None]
-    # The normal lies at a growing angle from the way: on the dark side for an even port.
-    step = interpolate(level.smooth, np.stack([middle - offset, middle + offset], axis=1))
-    rise = (step[:, 0] - step[:, 1]) * np.where(p % 2 == 0, 1, -1)[:, None]
+    # The normal lies at a growing angle from the step: on the dark side for an even port.
+    sides = interpolate(level.smooth, np.stack([middle - offset, middle + offset], axis=1))
+    rise = (sides[:, 0] - sides[:, 1]) * np.where(p % 2 == 0, 1, -1)[:, None]
     contrast = np.minimum(saddles.contrast[first], saddles.contrast[to[first, p]])
     seen[first, p] = rise.min(axis=1) > 0.15 * contrast
     back = np.zeros_like(seen)

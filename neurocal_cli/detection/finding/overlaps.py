@@ -8,18 +8,19 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.detection.finding.grow import frontier
-from neurocal_cli.detection.finding.lattice import Lattice, padded, subset
+from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.finding.predict import predict_vertices
 from neurocal_cli.geometry import Array
 
 __all__ = ["any_overlap", "drop_duplicates", "trim_overlaps"]
 
+# Insensitive; FOLDED and "two boards" in tests/test_finding.py repeat this.
 _SAME = 0.25  # of a square's width; between vertices that are the same
 _MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on ...
 _MEETS_PARTLY = 0.22  # ... if few of its row are seen
 _MOSTLY = 0.6  # share of a row
 _COPY = 0.5  # share of vertices in another lattice
-_BESIDE = 2.0  # squares; farther from each other lattices have nothing in dispute
+_BESIDE = 2.0  # squares; lattices farther apart share no vertices
 
 
 def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
@@ -73,7 +74,7 @@ def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
 
 def _vertices_and_next(lattice: Lattice) -> tuple[Array, float]:
     """Vertices of a lattice and of its next rows (N, 2), and the width of its squares."""
-    wider, _ = padded(lattice)
+    wider, _ = lattice.padded()
     row, col = frontier(wider)
     predicted = predict_vertices(wider.pixels, row, col)
     return np.concatenate([lattice.pixels[lattice.seen], predicted.points]), lattice.width
@@ -93,7 +94,7 @@ def _trimmed(lattice: Lattice, place: tuple[Array, float]) -> Lattice:
             drop[line] = seen[line]
     if not drop.any():
         return lattice
-    return subset(lattice, seen & ~drop)
+    return lattice.subset(seen & ~drop)
 
 
 _OUTERMOST = (

@@ -18,6 +18,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["PredictedVertices", "predict_vertices"]
 
+# _REACH and _RIDGE are insensitive; tests/test_finding.py.
 _REACH = 3  # squares
 _WIDTH = 1.4  # squares; standard deviation of the Gaussian weights
 _RIDGE = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])

@@ -2,8 +2,8 @@
 
 This is not the package's least-squares core, because its problems are different: one image has hundreds of
 independent fits to hundreds of pixels each. Arrays hold all fits side by side, pixels are float32 to halve
-memory traffic, and fits that have not converged with the others go on by themselves. The sums and the small
-systems of normal equations are float64.
+memory traffic, and fits that have not converged with the others go on by themselves. The small
+systems of normal equations are solved in float64.
 
 In: a model with derivatives, a start, a prior. Out: `BatchFit` with values, Fisher information and chi2.
 """
@@ -40,6 +40,7 @@ Part = NDArray[np.intp] | slice  # of the fits
 # The last three values of every fit: mean level and half contrast [DN], sigma_t [px].
 MEAN, CONTRAST, BLUR = -3, -2, -1
 LEAST_BLUR = 0.2905  # px; a pixel's box alone has sqrt(1/12) = 0.2887
+# Insensitive.
 _MOST, _CONVERGED = 0.9, 0.5  # share of the fits whose last step is below so many standard deviations
 MORE_STEPS = 20  # at most, of fits that have not converged with the others
 _DAMPING, _LEAST_DAMPING = 1.0, 0.01  # first and last damping after a step that raised the cost

@@ -29,13 +29,14 @@ from neurocal_cli.detection.fitting.edge_profile import (
     tail_terms,
 )
 from neurocal_cli.detection.fitting.shading import Shading
-from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = ["BoardBlur", "PixelNoise", "level_prior", "profile_shape"]
 
 Single = NDArray[np.float32]
 
+# Insensitive, apart from _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.
 _FLAT = 0.95  # light, from -1 to 1, beyond which a pixel has the dark or the light level
 _LEAST_SHARE = 0.3  # of the largest noise; clipped pixels seem to have less
 _ROUND = 0.5  # relative deviation of the squared blur at which an edge counts half ...
@@ -47,7 +48,6 @@ _ENOUGH = 10000  # pixels that are enough to estimate the profile's shape
 _TAILS, _RESPONSE = 0.01, 0.06
 _RIDGE = 1e-5
 _LEAST_SPREAD = 0.0002  # of the levels' variance, in variances of the noise
-_NORMAL_SQUARE = 0.455  # median of chi-squared with one degree of freedom
 _TINY = np.float32(1e-30)
 
 
@@ -178,7 +178,7 @@ class BoardBlur:
         uu, uv, vv = np.linalg.solve(normal_matrix, terms @ (weight * rest))
         matrix = usual**2 * np.eye(2) + np.array([[uu, uv], [uv, vv]])
         blur = cls(matrix, 0.0)
-        scatter = upper_median((sigma - blur.along(normal[good])) ** 2) / _NORMAL_SQUARE
+        scatter = upper_median((sigma - blur.along(normal[good])) ** 2) / CHI2_MEDIAN
         return cls(matrix, max(scatter - 2 * upper_median(fit.covariance[good, BLUR, BLUR]), 0.0))
 
     def along(self, normal: Array) -> Array:

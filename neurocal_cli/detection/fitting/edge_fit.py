@@ -50,6 +50,7 @@ __all__ = [
 Single = NDArray[np.float32]
 
 OFFSET, TILT = 0, 1  # the first two values of an edge's fit
+# Insensitive.
 _ALONE = 9.0  # sigma; a parallel line at this distance has no effect
 _BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
 

@@ -32,13 +32,14 @@ from neurocal_cli.detection.fitting.smooth_map import RICHEST_LENS, Frame, Smoot
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = ["GridEdges", "GridFit", "GridImage", "fit_grid", "fit_grid_vertices"]
 
 Image = NDArray[np.generic]
 
+# Insensitive: later stages correct the errors of earlier ones.
 _START_SIGMA = 0.3  # px, of the coordinates of the found vertices
 _GOOD_START = 1.3  # chi2 per coordinate of these vertices at which no richer map is tried
 _ANCHOR = 2.0  # px, of these vertices in later maps, which they only keep regular
@@ -47,7 +48,6 @@ _MOMENT_SIGMA = 0.05  # px, of offsets from moments
 _WIDEST = 12.0  # px, half width of the strips for moments
 _STEPS = 6  # Gauss-Newton steps, at most
 _LEAST_VARIANCE = 1e-12  # px^2
-_NORMAL = 1.4826  # standard deviation over the median absolute deviation
 _LEAST_SCALE = 0.1  # of the noise by the final residuals, relative to the first estimate
 _PRECISE = 0.003  # sigma; standard deviation of offsets below which the profile is estimated again
 
@@ -235,7 +235,7 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
     # An uneven board departs from its map everywhere: no single edge is an outlier for that, but all
     # of them are less certain.
-    uneven = max(_NORMAL * upper_median(np.abs(departure)), 1.0)
+    uneven = max(MAD_TO_SIGMA * upper_median(np.abs(departure)), 1.0)
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
     good = is_reliable(fit, departure, data.beyond)
     return GridFit(lines, fit, data, mapped, shading, shape, noise, good)

@@ -24,6 +24,7 @@ __all__ = ["select_map"]
 
 # A richer model must lower chi2 by this much for each of its parameters; chance alone gives 1. Residuals far
 # above the noise come from an uneven board, which a polynomial must not follow: the price is higher then.
+# Insensitive, as all constants here; tests/test_fit_parts.py selects known models.
 _PRICE, _UNEVEN_PRICE = 2.25, 3.0
 _FIRST_SHARE = 0.3  # of that price; what the first step must gain for a model to be fitted further
 _FUTILE = 2  # richer models without gain, of the lens or the polynomial, after which no more are tried

@@ -21,6 +21,7 @@ from neurocal_cli.geometry import Array
 __all__ = ["PIXEL", "box_profile", "half_widths", "sharp_profile"]
 
 PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
+# Against division by 0 in blurs and boxes that cannot be measured; insensitive.
 _LEAST_PSF = 0.02  # px
 _LEAST_HALF = 5e-3  # px
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = ["Levels", "Shading", "fit_shading", "square_levels"]
@@ -20,12 +20,12 @@ __all__ = ["Levels", "Shading", "fit_shading", "square_levels"]
 _x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
 # Weights of a square's corners in places (64, 4) of its interior, away from the blurred edges.
 _INTERIOR = np.stack([(1 - _x) * (1 - _y), _x * (1 - _y), (1 - _x) * _y, _x * _y], axis=-1)
+# Insensitive.
 _STEPS = 2  # reweighted fits after the last degree has been reached
 _TUKEY = 5.0  # standard deviations beyond which a level counts as an outlier
-_NORMAL, _NORMAL_SQUARE = 1.4826, 0.455  # see `fit_quality` and `common_parameters`
 _TINY = 1e-9  # DN^2
 _RIDGE = 1e-12
-_LEAST_CONTRAST = 1e-3  # DN, against division by 0; fits without contrast are rejected later
+_LEAST_CONTRAST = 1e-3  # DN, against division by 0
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 
 
@@ -95,7 +95,7 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
     values = image[v, u].astype(float)
     half = values.shape[1] // 2
     level = np.sort(values, axis=1)[:, half]
-    noise = (_NORMAL * np.sort(np.abs(values - level[:, None]), axis=1)[:, half]) ** 2 + 1 / 12
+    noise = (MAD_TO_SIGMA * np.sort(np.abs(values - level[:, None]), axis=1)[:, half]) ** 2 + 1 / 12
     is_dark = (c + r + grid.dark) % 2 == 0
     middle = corners.mean(axis=1)
     dark, light = (
@@ -123,7 +123,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     for used in (*_TERMS, *(most,) * _STEPS):
         used = min(used, most)
         # The median is robust against the outliers that the weights have to find.
-        scatter = upper_median(residual**2) / _NORMAL_SQUARE * n / max(n - used, 1)
+        scatter = upper_median(residual**2) / CHI2_MEDIAN * n / max(n - used, 1)
         weight = np.maximum(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6) ** 2
         root = np.sqrt(weight / (levels.variance + spread))
         weighted = terms[:, :used].T * root

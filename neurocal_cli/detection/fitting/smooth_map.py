@@ -31,8 +31,8 @@ _HOMOGRAPHY, _LENS = 8, 6
 _REST = _HOMOGRAPHY + _LENS
 _FREE_LENS: tuple[tuple[int, ...], ...] = ((), (10,), (8, 9, 10, 11), (8, 9, 10, 11, 12, 13))
 # Prior standard deviations of the centre of distortion [half diagonals], of k1 and k2, and of all others
-# [half diagonals]: they only matter for what the data do not determine.
-_CENTRE_PRIOR, _RADIAL_PRIOR, _PIXEL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.03, 0.1
+# [half diagonals]. Insensitive: they only matter for what the data do not determine.
+_CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Places:
     ----------
     ground : (3, N) array
         Scaled coordinates x and y, and 1.
-    way : (2, N) array [px]
+    axis : (2, N) array [px]
         Unit vectors, times the frame's unit.
     origin : (N,) array [px]
         The frame's centre along them.
@@ -79,7 +79,7 @@ class Places:
     """
 
     ground: Array
-    way: Array
+    axis: Array
     origin: Array
     rest: Array | None
 
@@ -158,12 +158,12 @@ class SmoothMap:
         frame = self.frame
         ground = np.ones((3, len(grid)))
         ground[:2] = ((grid - frame.origin) / frame.half).T
-        way = frame.unit * direction
+        axis = frame.unit * direction
         rest = None
         if self.degree:
             terms = _rest(self.degree, frame, ground[0], ground[1]).T
-            rest = (way[:, None] * terms).reshape(-1, len(grid))
-        return Places(ground, way, frame.centre @ direction, rest)
+            rest = (axis[:, None] * terms).reshape(-1, len(grid))
+        return Places(ground, axis, frame.centre @ direction, rest)
 
     def along(self, places: Places) -> tuple[Array, Array]:
         """Pixels along the places' directions, and their derivatives.
@@ -179,51 +179,51 @@ class SmoothMap:
         derivatives : (P, N) array
             By the parameters; 0 for fixed ones of the lens.
         """
-        values, way = self.parameters, places.way
-        out = np.empty((len(values), way.shape[1]))
+        values, axis = self.parameters, places.axis
+        out = np.empty((len(values), axis.shape[1]))
         homogeneous = self._homography @ places.ground
         depth = 1 / homogeneous[2]
         q = homogeneous[:2] * depth
-        value = (way * q).sum(axis=0)
+        value = (axis * q).sum(axis=0)
         value += places.origin
         if places.rest is not None:
             out[_REST:] = places.rest
             value += values[_REST:] @ places.rest
         if self.radial:
-            further, bent = self._lens(q, way, out[_HOMOGRAPHY:_REST])
+            further, turned = self._lens(q, axis, out[_HOMOGRAPHY:_REST])
             value += further
-            way = way + bent
+            axis = axis + turned
         else:
             out[_HOMOGRAPHY:_REST] = 0.0
         ground = places.ground * depth
-        np.multiply(way[:, None], ground, out=out[:6].reshape(2, 3, -1))
-        towards = (way * q).sum(axis=0)
+        np.multiply(axis[:, None], ground, out=out[:6].reshape(2, 3, -1))
+        towards = (axis * q).sum(axis=0)
         np.multiply(ground[:2], -towards, out=out[6:8])
         return value, out
 
-    def _lens(self, q: Array, way: Array, out: Array) -> tuple[Array, Array]:
-        """Contribution of the lens along ways (2, N) and its derivative by q; out (6, N) takes the others."""
+    def _lens(self, q: Array, axis: Array, out: Array) -> tuple[Array, Array]:
+        """Contribution of the lens along axes (2, N) and its derivative by q; out (6, N) takes the others."""
         (k1, k2), metric = self.parameters[10:12], self._metric
         e = q - self.parameters[8:10, None]
         slope = metric @ e
         rho = (e * slope).sum(axis=0)
-        length = (way * e).sum(axis=0)
+        length = (axis * e).sum(axis=0)
         stretch = rho * k2
         growth = stretch * 2
         stretch += k1
         stretch *= rho
         growth += k1
         growth *= length
-        bent = way * stretch
+        turned = axis * stretch
         slope *= 2 * growth
-        bent += slope
-        np.negative(bent, out=out[:2])
+        turned += slope
+        np.negative(turned, out=out[:2])
         np.multiply(length, rho, out=out[2])
         np.multiply(out[2], rho, out=out[3])
         e_u, e_v = e
         np.multiply(growth, e_u * e_u - e_v * e_v, out=out[4])
         np.multiply(growth, 2 * e_u * e_v, out=out[5])
-        return length * stretch, bent
+        return length * stretch, turned
 
     @property
     def _homography(self) -> Array:

@@ -18,7 +18,7 @@ __all__ = ["Lines", "Strips", "grid_lines", "strip_pixels"]
 Single = NDArray[np.float32]
 
 _AROUND = np.array([[0, 0], [-0.5, 0], [0.5, 0], [-0.5, -0.2], [-0.5, 0.2], [0.5, -0.2], [0.5, 0.2]])
-_CLOSEST = 0.5  # px
+_CLOSEST = 0.5  # px, least distance of parallel lines, against division by 0; insensitive
 _NEIGHBOURS = np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
@@ -175,7 +175,7 @@ def strip_pixels(
     rows = int(np.ceil(2 * spread.max() + 1))
     top = np.ceil(height - spread[:, None])
     window = _Window(np.asarray(column, dtype=float), top, rows, a, top - middle[:, 1:])
-    s, d = window.seen_along(t), window.seen_along(n)
+    s, d = window.coordinates_along(t), window.coordinates_along(n)
     d -= _column(0.5 * lines.curvature) * s * s
     inside = np.abs(d) <= _column(half_width)
     inside &= (s >= _column(low)) & (s <= _column(high))
@@ -243,11 +243,11 @@ class _Window:
     a: Array
     b: Array
 
-    def seen_along(self, way: Array) -> Single:
+    def coordinates_along(self, axis: Array) -> Single:
         """(E, C rows) coordinates along directions (E, 2) from the middle."""
-        first = (self.a * way[:, :1] + self.b * way[:, 1:]).astype(np.float32)
-        down = _column(way[:, 1]) * np.arange(self.rows, dtype=np.float32)
-        return np.asarray((first[:, :, None] + down[:, None]).reshape(len(way), -1), dtype=np.float32)
+        first = (self.a * axis[:, :1] + self.b * axis[:, 1:]).astype(np.float32)
+        down = _column(axis[:, 1]) * np.arange(self.rows, dtype=np.float32)
+        return np.asarray((first[:, :, None] + down[:, None]).reshape(len(axis), -1), dtype=np.float32)
 
     def framed(self, steep: NDArray[np.bool_], size: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """(E, C rows) which pixels lie in an image of (height, width); None if all do."""

@@ -41,6 +41,7 @@ Single = NDArray[np.float32]
 # Values of a vertex's fit: offset [px] and tilt [px over the half length] of the line along c and of that
 # along r, then those of `BatchFit`.
 FIRST, SECOND = 0, 2
+# Insensitive.
 _LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this share of the line
 # Terms of the series for oblique crossings up to a cosine, and for all others; tests/test_fit_models.py
 # compares them with a rendered cross.

@@ -43,7 +43,7 @@ _NOISE = 0.05  # px; rms errors below this exclude nothing
 _MISFIT = 0.25  # squares; greatest rms error of the best arrangement, for distortion and uneven boards
 _SAMPLES = 25  # vertices of a grid used in these tests
 _NEARER = 1.5  # ratio of the squares' sizes from which on the larger of two boards is preferred
-_MOST_WAYS = 5000  # arrangements that are tried, for time; small pieces of large planes have more
+_MOST_TRIED = 5000  # arrangements that are tried, for time; small pieces of large planes have more
 _KEPT = 200  # best arrangements that are extended by a further grid, for time
 
 
@@ -115,7 +115,7 @@ class _Candidate:
     """A grid and all its possible placements on the board."""
 
     grid: Grid
-    ways: tuple[Placement, ...]
+    placements: tuple[Placement, ...]
     whole: bool  # whether it has the full size of a plane
     ends: Mapping[tuple[int, int], End]
 
@@ -131,10 +131,10 @@ class _Arrangement:
 def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> list[_Candidate]:
     """Grids with possible placements, whole planes first; at most one for each plane."""
     every = [_candidate(board, trimmed(grid, board.planes), grey) for grid in grids]
-    usable = sorted((c for c in every if c.ways), key=lambda c: (-c.whole, -int(c.grid.seen.sum())))
+    usable = sorted((c for c in every if c.placements), key=lambda c: (-c.whole, -int(c.grid.seen.sum())))
     largest = max(every, key=lambda c: int(c.grid.seen.sum()))
     if len(board.planes) == 1:
-        others = [c for c in every if not c.ways]
+        others = [c for c in every if not c.placements]
         usable = [c for c in usable if not any(_may_be_a_piece(c, other) for other in others)]
     if not usable:
         raise NoBoardError(wrong_size_message(board, largest.grid, list(largest.ends.values())))
@@ -175,55 +175,55 @@ def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidat
     ends = board_ends(grey, grid) if alone or not whole else {}
     if not alone:  # beyond a fold lies the pattern of another plane
         ends = {direction: end for direction, end in ends.items() if end is End.BOARD}
-    ways = [
-        way
+    possible = [
+        placement
         for index, plane in enumerate(board.planes)
         if not whole or sorted(grid.shape) == sorted((plane.cols, plane.rows))
-        for way in placements(grid, plane, index, ends, mirrored=not alone)
+        for placement in placements(grid, plane, index, ends, mirrored=not alone)
     ]
     if alone and (board.planes[0].cols + board.planes[0].rows) % 2 == 1:
-        ways = [way for way in ways if way.first_square_is_dark(grid.dark)]
-    return _Candidate(grid, tuple(ways), whole, ends)
+        possible = [placement for placement in possible if placement.first_square_is_dark(grid.dark)]
+    return _Candidate(grid, tuple(possible), whole, ends)
 
 
 def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement]:
     """Arrangements of all grids that one camera can see, the best one first."""
     if len(board.planes) == 1:
-        return [_Arrangement((placement,)) for placement in chosen[0].ways]
+        return [_Arrangement((placement,)) for placement in chosen[0].placements]
     flat = is_flat(np.concatenate([_corners(plane) for plane in board.planes]))
     front = board.planes[0].normal if flat else None
-    ways, before = [_Arrangement(())], 0.0
+    found, before = [_Arrangement(())], 0.0
     for count, candidate in enumerate(chosen, start=1):
         longer = [
-            (*way.placements, placement)
-            for way in ways
-            for placement in candidate.ways
-            if placement.plane not in {p.plane for p in way.placements}
+            (*one.placements, placement)
+            for one in found
+            for placement in candidate.placements
+            if placement.plane not in {p.plane for p in one.placements}
         ]
-        if len(longer) > _MOST_WAYS:
+        if len(longer) > _MOST_TRIED:
             raise NoBoardError(ambiguity_message(board, [c.grid for c in chosen], 0.0))
-        ways = [_scored(board, chosen[:count], placements, front) for placements in longer]
-        ways = sorted((way for way in ways if np.isfinite(way.rms)), key=lambda way: way.rms)
-        if not ways:
+        found = [_scored(board, chosen[:count], placements, front) for placements in longer]
+        found = sorted((one for one in found if np.isfinite(one.rms)), key=lambda one: one.rms)
+        if not found:
             raise NoBoardError("the grids found do not lie as on the board; check the board's planes")
-        if not candidate.whole and count > 2 and ways[0].rms > _CLEARLY * max(before, _NOISE):
+        if not candidate.whole and count > 2 and found[0].rms > _CLEARLY * max(before, _NOISE):
             raise NoBoardError("a grid does not lie as any plane of the board; hide what is not the board")
-        before = ways[0].rms
-        # An arrangement that is poor with two planes may be the best with three.
-        limit = (_CLEARLY if count == len(chosen) else _CLEARLY**2) * max(ways[0].rms, _NOISE)
-        ways = [way for way in ways if way.rms <= limit][: None if count == len(chosen) else _KEPT]
-    if len(chosen) > 1 and ways[0].rms > _MISFIT * min(_square(c.grid) for c in chosen):
+        before = found[0].rms
+        # An one that is poor with two planes may be the best with three.
+        limit = (_CLEARLY if count == len(chosen) else _CLEARLY**2) * max(found[0].rms, _NOISE)
+        found = [one for one in found if one.rms <= limit][: None if count == len(chosen) else _KEPT]
+    if len(chosen) > 1 and found[0].rms > _MISFIT * min(_square(c.grid) for c in chosen):
         raise NoBoardError(
-            f"the planes miss their places on the board by {ways[0].rms:.3g} px; check its origins and axes"
+            f"the planes miss their places on the board by {found[0].rms:.3g} px; check its origins and axes"
         )
-    return ways
+    return found
 
 
 def _scored(
-    board: Board, chosen: Sequence[_Candidate], way: tuple[Placement, ...], front: Array | None
+    board: Board, chosen: Sequence[_Candidate], arrangement: tuple[Placement, ...], front: Array | None
 ) -> _Arrangement:
     world, pixels = [], []
-    for candidate, placement in zip(chosen, way, strict=True):
+    for candidate, placement in zip(chosen, arrangement, strict=True):
         rows, columns = np.nonzero(candidate.grid.seen)
         some = np.unique(np.linspace(0, len(rows) - 1, _SAMPLES).astype(np.intp))
         index = np.stack([columns[some], rows[some]], axis=-1)
@@ -231,42 +231,42 @@ def _scored(
         pixels.append(candidate.grid.pixels[rows[some], columns[some]])
     fit = fit_camera(np.concatenate(world), np.concatenate(pixels), front)
     if fit.handed < 0:
-        return _Arrangement(way, np.inf)
-    return _Arrangement(way, fit.rms if len(chosen) > 1 else 0.0)  # a single plane fits any curvature
+        return _Arrangement(arrangement, np.inf)
+    return _Arrangement(arrangement, fit.rms if len(chosen) > 1 else 0.0)  # a single plane fits any curvature
 
 
 def _resolve_symmetry(
-    board: Board, chosen: Sequence[_Candidate], ways: Sequence[_Arrangement]
+    board: Board, chosen: Sequence[_Candidate], arrangements: Sequence[_Arrangement]
 ) -> tuple[tuple[Placement, ...], tuple[str, ...]]:
     """Choose among arrangements with equal geometry: by colours, then by the image."""
     grids = [candidate.grid for candidate in chosen]
-    if not all(_same_board(board, grids, ways[0], way) for way in ways[1:]):
-        raise NoBoardError(ambiguity_message(board, grids, ways[0].rms))
-    colours = [_colours(grids, way) for way in ways]
-    left = [way for way, colour in zip(ways, colours, strict=True) if colour == max(colours)]
+    if not all(_same_board(board, grids, arrangements[0], one) for one in arrangements[1:]):
+        raise NoBoardError(ambiguity_message(board, grids, arrangements[0].rms))
+    colours = [_colours(grids, one) for one in arrangements]
+    left = [one for one, colour in zip(arrangements, colours, strict=True) if colour == max(colours)]
     if len(left) == 1:
         return left[0].placements, ()
     # Ties are at 45 degrees to the axes of the image, an unusual pose.
     towards = np.array([1.0, 1.0]) if len(left) == 2 else np.array([1.0, 0.0])
 
-    def leading(way: _Arrangement) -> tuple[float, float]:
-        first, grid = min(zip(way.placements, grids, strict=True), key=lambda pair: pair[0].plane)
+    def leading(arrangement: _Arrangement) -> tuple[float, float]:
+        first, grid = min(zip(arrangement.placements, grids, strict=True), key=lambda pair: pair[0].plane)
         return round(float(first.axis(grid) @ towards), 6), -float(np.nanmean(grid.pixels))
 
     return max(left, key=leading).placements, (SYMMETRIC_BOARD,)
 
 
-def _colours(grids: Sequence[Grid], way: _Arrangement) -> tuple[bool, ...]:
+def _colours(grids: Sequence[Grid], arrangement: _Arrangement) -> tuple[bool, ...]:
     """Whether the square at vertex (0, 0) is dark, plane by plane in the board's order."""
-    pairs = sorted(zip(way.placements, grids, strict=True), key=lambda pair: pair[0].plane)
+    pairs = sorted(zip(arrangement.placements, grids, strict=True), key=lambda pair: pair[0].plane)
     return tuple(placement.first_square_is_dark(grid.dark) for placement, grid in pairs)
 
 
 def _same_board(board: Board, grids: Sequence[Grid], first: _Arrangement, second: _Arrangement) -> bool:
     """Whether two arrangements differ by a motion that maps the whole board onto itself."""
     world: list[list[Array]] = [[], []]
-    for points, way in zip(world, (first, second), strict=True):
-        for grid, placement in zip(grids, way.placements, strict=True):
+    for points, arrangement in zip(world, (first, second), strict=True):
+        for grid, placement in zip(grids, arrangement.placements, strict=True):
             c, r = grid.shape[0] - 1, grid.shape[1] - 1
             box = placement.apply([[0, 0], [c, 0], [0, r], [c, r]])
             points.append(board.planes[placement.plane].at(box))
@@ -292,4 +292,6 @@ def _corners(plane: Plane) -> Array:
 def _square(grid: Grid) -> float:
     """Typical side of a square [px]."""
     p = grid.pixels
-    return min(median(np.hypot(way[..., 0], way[..., 1])) for way in (p[1:] - p[:-1], p[:, 1:] - p[:, :-1]))
+    return min(
+        median(np.hypot(step[..., 0], step[..., 1])) for step in (p[1:] - p[:-1], p[:, 1:] - p[:, :-1])
+    )
