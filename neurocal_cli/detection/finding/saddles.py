@@ -20,12 +20,13 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Saddles", "find_saddles"]
 
+# Insensitive, apart from _RADII: doubled, the rings reach beyond squares of 6 px, whose board is not found.
 _THRESHOLD = 5.0  # standard deviations of the noise, of the steepness of a saddle
-_BORDER = 4  # px
+_BORDER = 4  # px, not searched
 _AROUND = 2  # px, within which a saddle is the steepest
 _BAND = 50_000  # pixels of a band that fits the processor's cache
 _RADII = (5.0, 3.0)  # px of the rings; the larger one is more accurate
-_RAYS = 32
+_RAYS = 32  # of a ring
 _MOST_BENT = np.radians(22)  # greatest angle between the two halves of a line through the vertex
 _MOST_DIFFERENT = np.radians(14)  # greatest angle between ports from the two rings
 _LEAST_CURVATURE = 3.0  # standard deviations of the noise, of the weaker principal curvature ...

@@ -15,7 +15,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Stretched", "stretch"]
 
-_FACTOR = 2.0
+_FACTOR = 2.0  # of the stretch
 _ANISOTROPY = 1.8  # least ratio of the gradients across and along the squares
 _AROUND = 12  # px; beyond the outermost saddles
 _STRAY = 3.0  # times the median distance from the middle; farther saddles are ignored

@@ -15,7 +15,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["refine_saddles"]
 
-_LONGEST_STEP = 1.5  # px
+_LONGEST_STEP = 1.5  # px; insensitive, tests/test_finding.py
 
 
 @lru_cache(maxsize=32)

@@ -20,7 +20,7 @@ __all__ = ["VertexCheck", "check_vertices"]
 _INTO = 0.3  # squares; from the vertex into the four squares around it
 _ALONG, _ASIDE = 0.36, 0.16  # squares; along its edges, and to either side of them
 _LEAST_EVENNESS = 0.6  # a visible vertex has 0.9 and more, even if blurred or noisy
-_LEAST_EDGE = 0.3
+_LEAST_EDGE = 0.3  # of the contrast, across every edge
 
 
 @dataclass(frozen=True, eq=False)

