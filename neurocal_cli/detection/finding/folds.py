@@ -1,92 +1,75 @@
-"""Lattices that run over a fold from one plane to another are cut there.
+"""Splitting a lattice that covers two planes at the fold between them.
 
-Along a line of vertices in one plane second differences change slowly, however tilted the plane and
-bent the lens. At a fold they jump: at one vertex if the fold goes through it, else at the two
-beside it.
+In: a lattice. Out: one lattice for each plane. Along a line of vertices on one plane, second differences
+change slowly, for any tilt and any lens distortion. At a fold they jump: at one vertex if the fold goes
+through it, else at the two vertices beside it.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.grow import Lattice, cropped
+from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.medians import median, quantile
 from neurocal_cli.geometry import Array
 
-__all__ = ["bend", "joined", "restricted", "unfolded"]
+__all__ = ["largest_second_difference", "split_at_folds"]
 
-# The least bend that is a fold [squares] and its ratio to the bends of the rows far from it: paper
-# is bent too, and the less the better the board is otherwise.
+# Least second difference of a fold [squares], and its least ratio to those of distant rows; paper is not
+# flat either. Insensitive, as all constants here; FOLDED and
+# WHOLE in tests/test_finding.py repeat this.
 _FOLDS = ((0.13, 4.0), (0.06, 12.0))
-_BENT_PX = 0.2  # px; what imprecise vertices add to it
-_UNKNOWN = 0.03  # squares; the bend of the rows far from it where there is none
+_VERTEX_ERROR = 0.2  # px, that errors of the vertices add
+_UNKNOWN = 0.03  # squares; second difference of distant rows where there are none
 _LEAST_ROWS = 4
-_BETWEEN = 1.4  # what a bend shared by two rows counts more, to be as large as that of one row
-_ONE_SIDED = 0.7  # what a bend counts that is compared with one side only
+_BETWEEN = 1.4  # factor that makes a jump shared by two rows comparable with that of one row
+_ONE_SIDED = 0.7  # weight of a jump that can be compared with one side only
 
 
-def unfolded(lattice: Lattice) -> list[Lattice]:
-    """Cut a lattice into the parts that are joined and have no fold.
+def split_at_folds(lattice: Lattice) -> list[Lattice]:
+    """Split a lattice into connected parts without a fold.
 
-    Vertices on a fold go to neither side: they belong to both planes, and their edges bend there.
+    Vertices on a fold are dropped: they belong to both planes, and their edges change direction there.
     """
-    whole = joined(lattice)
+    whole = lattice.connected_parts()
     if len(whole) != 1:
-        return [part for piece in whole for part in unfolded(piece)]
+        return [part for piece in whole for part in split_at_folds(piece)]
     lattice = whole[0]
-    row, col = _folds(lattice)
+    row, col = _sharpest_folds(lattice)
     if row[1] == 0 and col[1] == 0:
         return [lattice]
     pixels = lattice.pixels if row[1] >= col[1] else lattice.pixels.transpose(1, 0, 2)
     position = max(row, col, key=lambda fold: fold[1])[0]
     index = np.arange(len(pixels))
     if position in (1, len(pixels) - 2):
-        # A fold, or an outermost row that is wrong: only the latter is certain not to belong here.
+        # Either a fold or a wrong outermost row: drop the outermost row only.
         position = 0.0 if position == 1 else len(pixels) - 1
     parts = []
     for side in (index < position - 0.25, index > position + 0.25):
         kept = np.where(side[:, None, None], pixels, np.nan)
         if pixels is not lattice.pixels:
             kept = kept.transpose(1, 0, 2)
-        part = restricted(lattice, np.isfinite(kept[..., 0]))
-        parts += unfolded(part) if part.seen.any() else []
+        part = lattice.subset(np.isfinite(kept[..., 0]))
+        parts += split_at_folds(part) if part.seen.any() else []
     return parts
 
 
-def restricted(lattice: Lattice, kept: NDArray[np.bool_]) -> Lattice:
-    """Some of a lattice's vertices."""
-    pixels = np.where(kept[..., None], lattice.pixels, np.nan)
-    return cropped(replace(lattice, pixels=pixels, contrast=np.where(kept, lattice.contrast, np.nan)))
-
-
-def joined(lattice: Lattice) -> list[Lattice]:
-    """Parts whose vertices are neighbours of each other along rows and columns."""
-    count, label = cv2.connectedComponents(lattice.seen.astype(np.uint8), connectivity=4)
-    if count == 2:
-        return [cropped(lattice)]
-    return [restricted(lattice, label == k) for k in range(1, count)]
-
-
-def _folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The sharpest folds along a row and along a column, see `_fold`."""
-    width = max(median(lattice.known[2].width), 1.0)
+def _sharpest_folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The sharpest folds along a row and along a column; see `_fold`."""
+    width = max(median(lattice.predicted[2].width), 1.0)
     along_columns, along_rows = _second_differences(lattice)
     return _fold(along_columns, width), _fold(along_rows, width)
 
 
-def bend(lattice: Lattice) -> float:
-    """How much the most bent row or column of a lattice is bent, folds included [squares]."""
+def largest_second_difference(lattice: Lattice) -> float:
+    """Largest median second difference of any row or column [squares], folds included."""
     return max(float(_size(second).max()) for second in _second_differences(lattice))
 
 
 def _second_differences(lattice: Lattice) -> tuple[Array, Array]:
-    """Those along columns (rows, cols, 2) and along rows (cols, rows, 2) [squares]; nan where unknown."""
+    """Those along columns (rows, cols, 2) and along rows (cols, rows, 2) [squares]; NaN where unknown."""
     pixels = lattice.pixels
-    row, col, at = lattice.known
+    row, col, at = lattice.predicted
     along = []
     for lines, index in ((pixels, (row, col)), (pixels.swapaxes(0, 1), (col, row))):
         second = np.full(lines.shape, np.nan)
@@ -97,12 +80,12 @@ def _second_differences(lattice: Lattice) -> tuple[Array, Array]:
 
 
 def _fold(second: Array, width: float) -> tuple[float, float]:
-    """Find the sharpest bend that is a fold.
+    """Find the sharpest fold.
 
     Parameters
     ----------
     second : (rows, cols, 2) array [squares]
-        Second differences along the columns, nan where unknown.
+        Second differences along the columns, NaN where unknown.
     width : float [px]
         Of the squares.
 
@@ -125,14 +108,14 @@ def _fold(second: Array, width: float) -> tuple[float, float]:
     others = np.abs(np.arange(2 * rows) - best) > 3
     far_off = size[others & (size > 0)]
     usual = quantile(far_off, 0.25) if len(far_off) else _UNKNOWN
-    least = (max(bend + _BENT_PX / width, ratio * usual) for bend, ratio in _FOLDS)
-    if size[best] < min(least):
+    least = min(max(fold + _VERTEX_ERROR / width, ratio * usual) for fold, ratio in _FOLDS)
+    if size[best] < least:
         return 0.0, 0.0
     return 0.5 * best, float(size[best])
 
 
 def _against_one_or_both(values: Array, first: Array, second: Array) -> Array:
-    """Differences from the mean of two arrays, reduced where one of them is unknown."""
+    """Differences from the mean of two arrays, with less weight where one of them is unknown."""
     both = values - 0.5 * (first + second)
     one = _ONE_SIDED * (values - np.where(np.isnan(first), second, first))
     return np.where(np.isnan(both), one, both)

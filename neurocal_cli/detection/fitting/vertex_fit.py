@@ -1,12 +1,14 @@
 """Maximum-likelihood fits of the vertices, where two edges cross.
 
-With z1, z2 the distances from the two lines in sigma, towards growing r and growing c, the light is
+In: the map, levels and blur of the fitted edges. Out: `BatchFit` with offset and tilt of both lines through
+each vertex. With z1, z2 the distances from the two lines in sigma, towards growing r and growing c, the
+light is
 
     x = +-(E(z1) E(z2) + 4 rho phi(z1) phi(z2) + ...) Q
 
-with the sign of the square between them, rho the cosine between the normals, and Q fading the edges out
-towards the parallel lines on both sides where these are near. The pixels are those of two strips along
-the two lines, each taking the pixels that are nearer to its own line: all that carry information.
+with the sign of the square between them, rho the cosine between the normals, and Q the effect of the
+parallel lines on both sides. The pixels are those of two strips along the two lines, each with the pixels
+that are nearer to its own line.
 """
 
 from __future__ import annotations
@@ -17,19 +19,19 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.box import sharp_profile
-from neurocal_cli.detection.fitting.newton import (
-    Fit,
-    Linear,
+from neurocal_cli.detection.fitting.batched_newton import (
+    BatchFit,
+    LevelPrior,
+    Linearised,
     Part,
-    Prior,
-    Shape,
-    gauss_newton,
+    ProfileShape,
+    fit_batch,
     rows_for,
 )
-from neurocal_cli.detection.fitting.profile import Real, erf_and_density, response
+from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, response
+from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
-from neurocal_cli.detection.fitting.strips import Lines, gather, grid_lines, packed
+from neurocal_cli.detection.fitting.strips import Lines, grid_lines, packed, strip_pixels
 from neurocal_cli.geometry import Array
 
 __all__ = ["FIRST", "SECOND", "VertexData", "fit_vertices", "linearised", "vertex_data", "vertex_lines"]
@@ -37,24 +39,26 @@ __all__ = ["FIRST", "SECOND", "VertexData", "fit_vertices", "linearised", "verte
 Single = NDArray[np.float32]
 
 # Values of a vertex's fit: offset [px] and tilt [px over the half length] of the line along c and of that
-# along r, then those of `Fit`.
+# along r, then those of `BatchFit`.
 FIRST, SECOND = 0, 2
-_LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, and at most, as a share of the line
-# Terms of the series for oblique crossings up to a cosine, and for all others.
+# Insensitive.
+_LAST, _MOST_LAST = 1.5, 0.1  # sigma left out at the board's end, at most this share of the line
+# Terms of the series for oblique crossings up to a cosine, and for all others; tests/test_fit_models.py
+# compares them with a rendered cross.
 _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
-_ALONE = 9.0  # sigma to the next parallel line, beyond which it cannot be noticed
+_ALONE = 9.0  # sigma; a parallel line at this distance has no effect
 
 
 @dataclass(frozen=True, eq=False)
 class VertexData:
-    """What the fits need of the pixels; (V, N) float32 arrays.
+    """The pixels as the fits need them; (V, N) float32 arrays.
 
     Attributes
     ----------
     s1, d1, s2, d2 : arrays [px]
         Tangential and normal coordinates of both lines.
     value : array [DN]
-        Less the slopes' share of A.
+        Minus the slope of A.
     gain : array
         B(u, v) relative to the vertex's own.
     Q : array
@@ -119,13 +123,13 @@ def vertex_data(
     contrast : (V,) array [DN]
         B where the slopes hold.
     last : (V, 2, 2) bool array
-        Which ends of the two lines are the board's: at a fold, what blur brings there is another plane's.
+        Which ends of the two lines are the board's. At a fold, another plane's light is blurred into these.
     """
     parts = []
     for k in (0, 1):
         half = np.minimum(reach * sigma, 0.5 * lines[k].width)
         trim = np.minimum(_LAST * sigma, _MOST_LAST * lines[k].length)[:, None] * last[:, k]
-        parts.append(gather(image, lines[k], half, trim))
+        parts.append(strip_pixels(image, lines[k], half, trim))
     u, v, value, inside = (
         np.concatenate([getattr(part, name) for part in parts], axis=1)
         for name in ("u", "v", "value", "inside")
@@ -148,7 +152,7 @@ def vertex_data(
 
 
 def _faded(lines: tuple[Lines, Lines], distances: tuple[Single, Single], sigma: Array) -> Single:
-    """What the parallel lines on both sides leave of the edges, where they are near."""
+    """The effect of near parallel lines on both sides of the edges."""
     Q = np.ones_like(distances[0])
     for line, d in zip(lines, distances, strict=True):
         for k, side in ((0, 1), (1, -1)):
@@ -167,15 +171,20 @@ def _coordinates(lines: Lines, u: Single, v: Single) -> tuple[Single, Single]:
 
 
 def fit_vertices(
-    data: VertexData, start: Array, prior: Prior, half_length: tuple[Array, Array], shape: Shape, steps: int
-) -> Fit:
-    """Gauss-Newton steps of all vertices at once.
+    data: VertexData,
+    start: Array,
+    prior: LevelPrior,
+    half_length: tuple[Array, Array],
+    shape: ProfileShape,
+    steps: int,
+) -> BatchFit:
+    """Fit all vertices at once.
 
     Parameters
     ----------
     data : VertexData
     start : (V, 7) array
-        Offset and tilt of the first and of the second line, and the values of `Fit`.
+        Offset and tilt of the first and of the second line, and the values of `BatchFit`.
     prior : Prior
     half_length : pair of (V,) arrays [px]
     shape : Shape
@@ -187,16 +196,18 @@ def fit_vertices(
         data.s2 / half_length[1].astype(np.float32)[:, None],
     )
 
-    def model_of(part: Part) -> Callable[[Array], Linear]:
-        pixels, form = data.part(part), shape.part(part)
+    def model_of(part: Part) -> Callable[[Array], Linearised]:
+        pixels, part_shape = data.part(part), shape.part(part)
         some = (levers[0][part], levers[1][part])
-        return lambda values: linearised(pixels, some, values, form)
+        return lambda values: linearised(pixels, some, values, part_shape)
 
-    return gauss_newton(model_of, start, prior, np.count_nonzero(data.root, axis=1), steps)
+    return fit_batch(model_of, start, prior, np.count_nonzero(data.root, axis=1), steps)
 
 
-def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, shape: Shape) -> Linear:
-    """The model and its derivatives; ``levers`` are s over the half lengths."""
+def linearised(
+    data: VertexData, levers: tuple[Single, Single], values: Array, shape: ProfileShape
+) -> Linearised:
+    """The model and its derivatives; levers are s over the half lengths."""
     offset1, tilt1, offset2, tilt2, mean, contrast, sigma = (
         x.astype(data.value.dtype)[:, None] for x in values.T
     )
@@ -209,7 +220,7 @@ def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, s
     series, bent1, bent2 = _crossed(z1, z2, rho, density1 * density2)
     x = np.asarray((E1 * E2 + series) * data.Q, dtype=data.value.dtype)
     by_z1, by_z2 = (slope1 * E2 + bent1) * data.Q, (slope2 * E1 + bent2) * data.Q
-    F, steep = response(x, shape.bend)
+    F, steep = response(x, shape.nonlinearity)
     gain = data.gain * data.root
     factor = -contrast / sigma * steep * gain
     by_z1 *= factor
@@ -225,14 +236,14 @@ def linearised(data: VertexData, levers: tuple[Single, Single], values: Array, s
         by[6] -= factor * (spread1 * E2 + E1 * spread2) * data.Q
     residual[...] = (data.value - mean) * data.root - contrast * by[5]
     z = np.where(np.abs(z1) < np.abs(z2), z1, z2)
-    return Linear(rows, z, x)
+    return Linearised(rows, z, x)
 
 
 def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, Real]:
-    """What the angle between two lines adds to E(z1) E(z2), and its derivatives by z1 and z2.
+    """The effect of the angle between two lines on E(z1) E(z2), and its derivatives by z1 and z2.
 
     The tetrachoric series of two correlated normal variables, 4 phi phi sum_n rho^n / n! He_{n-1} He_{n-1},
-    the longer the more oblique the lines are.
+    with more terms for more oblique lines.
     """
     most = float(np.abs(rho).max(initial=0.0))
     terms = next((n for n, limit in _TERMS if most < limit), _MOST_TERMS)

@@ -1,4 +1,4 @@
-"""How far measured points lie from a smooth map of their plane: a look at noise, without a camera."""
+"""Residuals of measured points from a smooth map of their plane: a view of the noise without a camera."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Measured
 from neurocal_cli.geometry import Array
 
-__all__ = ["residuals"]
+__all__ = ["plane_residuals"]
 
-_POINTS_A_TERM = 6  # that a coefficient of the lens's part must have to be fitted
+_POINTS_A_TERM = 6  # least number of points for each coefficient of the polynomial; for pictures only
 
 
-def residuals(measured: Measured) -> Array:
+def plane_residuals(measured: Measured) -> Array:
     """Measured pixels minus those of a homography and a polynomial fitted to them.
 
-    The polynomial, of the fifth degree or what the number of points allows, takes up the lens.
+    The polynomial models the distortion; its degree is five, or less for few points.
 
     Parameters
     ----------

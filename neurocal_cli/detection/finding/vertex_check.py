@@ -1,4 +1,8 @@
-"""Whether a picture looks like a chessboard where a vertex is expected."""
+"""Whether the image around a point looks like a vertex.
+
+In: points, the steps of the grid there, and the expected colours. Out: contrast, evenness, and a decision for
+each point, from twelve samples: inside the four squares and on both sides of the four edges.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +11,21 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.levels import Level, sampled
-from neurocal_cli.detection.finding.predict import Expected
+from neurocal_cli.detection.finding.levels import Level, interpolate
+from neurocal_cli.detection.finding.predict import PredictedVertices
 from neurocal_cli.geometry import Array
 
-__all__ = ["Look", "look"]
+__all__ = ["VertexCheck", "check_vertices"]
 
 _INTO = 0.3  # squares; from the vertex into the four squares around it
 _ALONG, _ASIDE = 0.36, 0.16  # squares; along its edges, and to either side of them
-_LEAST_EVEN = 0.6  # a board in plain sight has 0.9 and more, blurred or noisy or not
-_LEAST_EDGE = 0.3
+_LEAST_EVENNESS = 0.6  # a visible vertex has 0.9 and more, even if blurred or noisy
+_LEAST_EDGE = 0.3  # of the contrast, across every edge
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
-    """How places look.
+class VertexCheck:
+    """What the samples around points say.
 
     Attributes
     ----------
@@ -34,8 +38,8 @@ class Look:
     """
 
     contrast: Array
-    even: Array
-    like: NDArray[np.bool_]
+    evenness: Array
+    is_vertex: NDArray[np.bool_]
 
 
 def _offsets() -> Array:
@@ -48,33 +52,33 @@ def _offsets() -> Array:
 
 
 _OFFSETS = _offsets()
-_CONTRAST = np.array([0.5, -0.5, 0.5, -0.5] + [0.0] * 8)  # bright less dark squares
+_CONTRAST = np.array([0.5, -0.5, 0.5, -0.5] + [0.0] * 8)  # mean of bright minus mean of dark squares
 _STEPS = np.concatenate([np.zeros((4, 4)), np.diag([1.0, -1, 1, -1]), np.diag([-1.0, 1, -1, 1])])  # at edges
 
 
-def look(level: Level, points: Array, at: Expected, dark: Array) -> Look:
-    """Look at the squares and edges around vertices.
+def check_vertices(level: Level, points: Array, predicted: PredictedVertices, dark: Array) -> VertexCheck:
+    """Sample the squares and edges around points.
 
     Parameters
     ----------
     level : Level
     points : (N, 2) array [px]
     at : Expected
-        For the directions of the edges.
+        The steps of the grid at the points.
     dark : (N,) array of +-1
         +1 where the square towards growing c and r is dark.
     """
-    places = at.around(_OFFSETS, points)
-    value = sampled(level.smooth, places)
+    places = predicted.around(_OFFSETS, points)
+    value = interpolate(level.smooth, places)
     value *= -dark[:, None]
     contrast = value @ _CONTRAST
     scale = np.maximum(np.abs(contrast), 1e-9)
     flat = np.minimum(value[:, 0], value[:, 2]) - np.maximum(value[:, 1], value[:, 3])
     flat /= scale
-    like = (contrast > 0) & (flat > _LEAST_EVEN)
-    like &= (value @ _STEPS).min(axis=1) > _LEAST_EDGE * contrast
+    is_vertex = (contrast > 0) & (flat > _LEAST_EVENNESS)
+    is_vertex &= (value @ _STEPS).min(axis=1) > _LEAST_EDGE * contrast
     size = np.array(level.image.shape[::-1])
     if places.min() <= -1 or (places.max(axis=(0, 1)) >= size).any():
-        # The places beyond the border repeat it and tell nothing.
-        like &= ((places > -1) & (places < size)).all(axis=(1, 2))
-    return Look(contrast, flat, like)
+        # Samples beyond the border only repeat it.
+        is_vertex &= ((places > -1) & (places < size)).all(axis=(1, 2))
+    return VertexCheck(contrast, flat, is_vertex)

@@ -1,4 +1,7 @@
-"""Saddle points of the brightness to a fraction of a pixel, by Newton's method on smoothed derivatives."""
+"""Sub-pixel positions of saddle points, by Newton's method on smoothed derivatives.
+
+In: an image and points about a pixel from saddle points. Out: the saddle points, NaN where there is none.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,9 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.finding.levels import Image
 from neurocal_cli.geometry import Array
 
-__all__ = ["settle"]
+__all__ = ["refine_saddles"]
 
-_LONGEST_STEP = 1.5  # px
+_LONGEST_STEP = 1.5  # px; insensitive, tests/test_finding.py
 
 
 @lru_cache(maxsize=32)
@@ -38,7 +41,7 @@ def _window(half: int, width: int) -> NDArray[np.intp]:
     return (offset[:, None] * width + offset).ravel()
 
 
-def settle(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
+def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
     """Move points to the saddle points next to them.
 
     Parameters
@@ -53,20 +56,20 @@ def settle(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
     Returns
     -------
     points : (N, 2) array [px]
-        nan where there is no saddle point or the window leaves the image.
+        NaN where there is no saddle point or the window leaves the image.
     """
     half, _ = _derivatives(sigma)
     height, width = image.shape
     if min(height, width) < 2 * half + 1:
         return np.full(start.shape, np.nan)
-    # Both coordinates in rows: sums over many short rows take longer.
+    # Coordinates in rows: sums over many short rows take longer.
     given = start.T
     low, high = half, np.array([[width - 1 - half], [height - 1 - half]])
-    framed = (given >= low) & (given <= high)
-    good = framed[0] & framed[1]
+    padded = (given >= low) & (given <= high)
+    good = padded[0] & padded[1]
     centre = np.rint(np.where(good, given, low))
     step, saddle = _newton(image, centre, sigma)
-    # A step is the same from wherever a pixel is nearest: only those that lead to another one go on.
+    # Derivatives are those of the nearest pixel: only points that moved to another one go on.
     for _ in range(rounds - 1):
         ahead = _within(centre + step, low, high)
         moved = np.flatnonzero((ahead[0] != centre[0]) | (ahead[1] != centre[1]))
@@ -80,12 +83,12 @@ def settle(image: Image, start: Array, sigma: float, rounds: int = 3) -> Array:
 
 
 def _within(point: Array, low: int, high: Array) -> Array:
-    """Nearest whole pixels (2, N) whose windows lie in the image."""
+    """Nearest pixels (2, N) whose windows lie in the image."""
     return np.minimum(np.maximum(np.rint(point), low), high)
 
 
 def _newton(image: Image, centre: Array, sigma: float) -> tuple[Array, NDArray[np.bool_]]:
-    """Steps (2, N) from whole pixels (2, N) to where the gradient vanishes, and whether that is a saddle."""
+    """Newton steps (2, N) from pixels (2, N) to a zero of the gradient, and whether it is a saddle."""
     width = image.shape[1]
     half, kernels = _derivatives(sigma)
     place = (centre[1] * width + centre[0]).astype(np.intp)

@@ -1,7 +1,7 @@
-"""How well points of several planes fit one camera, whatever its parameters: a linear test.
+"""How well points of several planes fit one projective camera, by the direct linear transform.
 
-No lens distortion is modelled: its few pixels are small beside the squares by which wrong
-arrangements miss.
+It tests arrangements of grids in `identify`. Distortion is not modelled: its few pixels are small compared
+with the squares by which wrong arrangements miss.
 """
 
 from __future__ import annotations
@@ -12,10 +12,10 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["CameraFit", "fit_camera", "is_flat", "motion"]
+__all__ = ["CameraFit", "fit_camera", "is_flat", "rigid_motion"]
 
-_FLAT = 1e-6  # smallest extent over the largest, of points in one plane
-_WEAK = 3.0  # how many times worse a camera without perspective must fit for perspective to be certain
+_FLAT = 1e-6  # ratio of smallest and largest extent of points in one plane: rounding errors
+_WEAK = 3.0  # ratio by which an affine camera must fit worse for perspective to be certain
 
 
 @dataclass(frozen=True)
@@ -26,8 +26,8 @@ class CameraFit:
     ----------
     rms : float [px]
     handed : int
-        1: a camera, -1: only its mirror image sees the points so; 0: too little perspective, or all
-        points in a plane: either.
+        1 for a camera, -1 for the mirror image of one, 0 if undecided: too little perspective, or all points
+        in one plane.
     """
 
     rms: float
@@ -67,8 +67,8 @@ def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> Camer
     return CameraFit(rms, int(sign * np.sign(np.linalg.det(P[:, :3]))))
 
 
-def motion(first: Array, second: Array) -> tuple[Array, Array] | None:
-    """Rotation R and shift t with ``second = first R^T + t``; None if there are none.
+def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:
+    """Rotation R and translation t with ``second = first R^T + t``; None if no motion fits.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def _plane_coordinates(world: Array, front: Array | None) -> Array:
 
 
 def _linear_camera(points: Array, pixels: Array) -> tuple[Array, float]:
-    """Matrix (3, d + 1) that takes points (N, d) to pixels, and its rms error [px]."""
+    """Matrix (3, d + 1) that projects points (N, d) to pixels, and its rms error [px]."""
     T, x = _scaled(points)
     S, d = _scaled(pixels)
     zeros = np.zeros_like(x)

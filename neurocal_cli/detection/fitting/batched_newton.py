@@ -1,4 +1,12 @@
-"""Gauss-Newton steps of many small fits at once, and what comes out of them."""
+"""Damped Gauss-Newton on thousands of fits of five to seven values at once, in float32.
+
+This is not the package's least-squares core, because its problems are different: one image has hundreds of
+independent fits to hundreds of pixels each. Arrays hold all fits side by side, pixels are float32 to halve
+memory traffic, and fits that have not converged with the others go on by themselves. The small
+systems of normal equations are solved in float64.
+
+In: a model with derivatives, a start, a prior. Out: `BatchFit` with values, Fisher information and chi2.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +22,15 @@ from neurocal_cli.geometry import Array
 __all__ = [
     "BLUR",
     "CONTRAST",
+    "LEAST_BLUR",
     "MEAN",
     "MORE_STEPS",
-    "Fit",
-    "Linear",
+    "BatchFit",
+    "LevelPrior",
+    "Linearised",
     "Part",
-    "Prior",
-    "Shape",
-    "gauss_newton",
+    "ProfileShape",
+    "fit_batch",
     "rows_for",
 ]
 
@@ -30,17 +39,18 @@ Part = NDArray[np.intp] | slice  # of the fits
 
 # The last three values of every fit: mean level and half contrast [DN], sigma_t [px].
 MEAN, CONTRAST, BLUR = -3, -2, -1
-_LEAST_BLUR = 0.2905  # px; the pixel's box alone has 0.2887
-_MOST, _SETTLED = 0.9, 0.5  # share of the fits whose last step was less, in standard deviations
-MORE_STEPS = 20  # of those that have not settled with the others
-_DAMPING, _LEAST_DAMPING = 1.0, 0.01
-_SINGLE = 1e-6  # relative error of sums
-_NOTHING = 1e-9  # information that keeps fits without pixels from dividing by 0
+LEAST_BLUR = 0.2905  # px; a pixel's box alone has sqrt(1/12) = 0.2887
+# Insensitive.
+_MOST, _CONVERGED = 0.9, 0.5  # share of the fits whose last step is below so many standard deviations
+MORE_STEPS = 20  # at most, of fits that have not converged with the others
+_DAMPING, _LEAST_DAMPING = 1.0, 0.01  # first and last damping after a step that raised the cost
+_FLOAT32 = 1e-6  # relative error of float32 sums
+_NOTHING = 1e-9  # information that keeps fits without pixels regular
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
-    """What is known of level, contrast and blur beforehand.
+class LevelPrior:
+    """Gaussian prior of mean level, half contrast and blur.
 
     Attributes
     ----------
@@ -51,38 +61,40 @@ class Prior:
     mean: Array
     precision: Array
 
-    def part(self, which: NDArray[np.intp]) -> Prior:
-        """That of some fits."""
-        return Prior(self.mean[which], self.precision[which])
+    def part(self, which: NDArray[np.intp]) -> LevelPrior:
+        """The prior of some fits."""
+        return LevelPrior(self.mean[which], self.precision[which])
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
-    """Shape of the profiles; see `fit_profile`.
+class ProfileShape:
+    """Shape of the edges' profiles; see `edge_profile`.
 
     Attributes
     ----------
     tails : (E, 2) array
         a_3 and a_5 of each edge.
     bend : (RESPONSE_TERMS,) array
-        b_0, b_1, ... of all edges.
+        b_0, b_1, ... of the response, the same for all edges.
     half : (E, 2) array or None [px]
-        Of pixels along the edges' normals (see `fit_box`), where these are so sharp that it matters;
-        (V, 2, 2) of both lines through vertices.
+        Half widths of the pixel's box along the edges' normals (see `pixel_box`), for edges so sharp that
+        they matter; (V, 2, 2) of both lines through vertices.
     """
 
     tails: Array
-    bend: Array
+    nonlinearity: Array
     half: Array | None = None
 
-    def part(self, which: Part) -> Shape:
+    def part(self, which: Part) -> ProfileShape:
         """That of some fits."""
-        return Shape(self.tails[which], self.bend, None if self.half is None else self.half[which])
+        return ProfileShape(
+            self.tails[which], self.nonlinearity, None if self.half is None else self.half[which]
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
-    """A model at some values.
+class Linearised:
+    """A model linearised at some values.
 
     Attributes
     ----------
@@ -103,22 +115,22 @@ class Linear:
         return self.rows[:, 0]
 
     def products(self, count: int) -> Array:
-        """(E, P + 1, P + 1) sums over pixels, for P values: chi2, the gradient beside it, the information."""
+        """(E, P + 1, P + 1) sums over pixels for P values: chi2, the gradient beside it, the information."""
         return (self.rows @ self.rows.swapaxes(1, 2))[:, : count + 1, : count + 1].astype(float)
 
-    def part(self, which: NDArray[np.intp]) -> Linear:
+    def part(self, which: NDArray[np.intp]) -> Linearised:
         """That of some fits."""
-        return Linear(self.rows[which], self.z[which], self.x[which])
+        return Linearised(self.rows[which], self.z[which], self.x[which])
 
-    def put(self, which: NDArray[np.intp], part: Linear) -> None:
-        """Replace that of some fits, in place."""
+    def put(self, which: NDArray[np.intp], part: Linearised) -> None:
+        """Replace the part of some fits, in place."""
         self.rows[which], self.z[which], self.x[which] = part.rows, part.z, part.x
 
 
 def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) -> NDArray[np.floating]:
-    """Room (E, R, N) for the rows of a model: R a multiple of eight, beyond the values 0.
+    """An array (E, R, N) for the rows of a model, R padded with zeros to a multiple of eight.
 
-    The linear algebra library takes twice as long for six rows as for eight.
+    Products of six rows take twice as long as those of eight in OpenBLAS.
     """
     used = 1 + values
     rows = np.empty((count, -(-used // 8) * 8, pixels), dtype=kind)
@@ -127,18 +139,18 @@ def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) 
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class BatchFit:
     """Fitted values.
 
     Attributes
     ----------
     values : (E, P) array
-        Places first, the last three as `MEAN`, `CONTRAST`, `BLUR` say.
+        Coordinates first; the last three are at `MEAN`, `CONTRAST`, `BLUR`.
     information : (E, P, P) array
-        Fisher's, from the pixels alone.
+        Fisher information of the pixels, without the prior.
     prior : Prior
     chi2, count : (E,) arrays
-        Weighted squares of the residuals, and number of pixels.
+        Weighted sum of squared residuals, and number of pixels.
     step : (E,) array
         The last step, in standard deviations.
     linear : Linear
@@ -147,11 +159,11 @@ class Fit:
 
     values: Array
     information: Array
-    prior: Prior
+    prior: LevelPrior
     chi2: Array
     count: NDArray[np.int64]
     step: Array
-    linear: Linear
+    linear: Linearised
 
     @cached_property
     def covariance(self) -> Array:
@@ -159,30 +171,30 @@ class Fit:
         total = self.information.copy()
         total[:, MEAN:, MEAN:] += self.prior.precision
         diagonal = np.einsum("eii->ei", total)  # a view
-        # Sums of single precision are not exactly positive where the values can hardly be told apart.
-        diagonal *= 1 + _SINGLE
+        # float32 sums may be slightly indefinite where values are strongly correlated.
+        diagonal *= 1 + _FLOAT32
         diagonal += _NOTHING
         return np.asarray(np.linalg.inv(total), dtype=float)
 
     @property
-    def unsettled(self) -> Array:
-        """(E,) by which variances grow for what a last step of some standard deviations leaves open."""
+    def variance_growth(self) -> Array:
+        """(E,) factor on variances for fits whose last step was longer than a standard deviation."""
         return np.where(self.step > 1, 1 + self.step**2, 1.0)
 
-    def scaled(self, noise: float) -> Fit:
-        """The same fits, the pixels' variance being another by a factor."""
+    def scaled(self, noise: float) -> BatchFit:
+        """The same fits for a variance of the pixels that is larger by a factor."""
         return replace(self, information=self.information / noise, chi2=self.chi2 / noise)
 
 
-def gauss_newton(
-    model_of: Callable[[Part], Callable[[Array], Linear]],
+def fit_batch(
+    model_of: Callable[[Part], Callable[[Array], Linearised]],
     start: Array,
-    prior: Prior,
+    prior: LevelPrior,
     count: NDArray[np.int64],
     steps: int,
     more: int = MORE_STEPS,
-) -> Fit:
-    """All fits at once, then those that have not settled by themselves.
+) -> BatchFit:
+    """Fit all at once, and then those that have not converged by themselves.
 
     Parameters
     ----------
@@ -194,40 +206,40 @@ def gauss_newton(
     count : (E,) array
         Of the pixels.
     steps, more : int
-        Of all, and then of those that have not settled, at most.
+        Greatest number, of all fits and of those that have not converged.
     """
     model = model_of(slice(None))
     state = _State.of(model, start, prior)
-    # What most fits still lack is little; those that cannot settle must not hold up the others.
-    state.settle(model, prior, steps, _MOST)
-    restless = np.flatnonzero(state.size >= _SETTLED)
-    if len(restless) and more:
-        part = state.part(restless)
-        part.settle(model_of(restless), prior.part(restless), more, 1.0)
-        state.put(restless, part)
+    # A few fits that cannot converge must not hold up the others.
+    state.iterate(model, prior, steps, _MOST)
+    unconverged = np.flatnonzero(state.size >= _CONVERGED)
+    if len(unconverged) and more:
+        part = state.part(unconverged)
+        part.iterate(model_of(unconverged), prior.part(unconverged), more, 1.0)
+        state.put(unconverged, part)
     information, chi2 = state.products[:, 1:, 1:], state.products[:, 0, 0]
-    return Fit(state.values, information, prior, chi2, count, state.size, state.linear)
+    return BatchFit(state.values, information, prior, chi2, count, state.size, state.linear)
 
 
 @dataclass(eq=False)
 class _State:
-    """Fits on their way: values, model there and its products, cost, damping, and size of the last step."""
+    """Fits between steps: values, model there, its products, cost, damping, and size of the last step."""
 
     values: Array
-    linear: Linear
+    linear: Linearised
     products: Array
     cost: Array
     damping: Array
     size: Array
 
     @classmethod
-    def of(cls, model: Callable[[Array], Linear], values: Array, prior: Prior) -> _State:
+    def of(cls, model: Callable[[Array], Linearised], values: Array, prior: LevelPrior) -> _State:
         linear = model(values)
         products, none = linear.products(values.shape[1]), np.zeros(len(values))
         return cls(values, linear, products, _cost(products, values, prior), none, none)
 
     def part(self, which: NDArray[np.intp]) -> _State:
-        """Some of the fits, to go on with."""
+        """Some of the fits."""
         return _State(
             self.values[which],
             self.linear.part(which),
@@ -238,20 +250,22 @@ class _State:
         )
 
     def put(self, which: NDArray[np.intp], part: _State) -> None:
-        """Take over what has become of some of the fits."""
+        """Copy the results of some fits back."""
         self.values[which], self.size[which] = part.values, part.size
         self.linear.put(which, part.linear)
         self.products[which] = part.products
 
-    def settle(self, model: Callable[[Array], Linear], prior: Prior, steps: int, most: float) -> None:
-        """Levenberg-Marquardt steps until a share of the fits has settled."""
+    def iterate(
+        self, model: Callable[[Array], Linearised], prior: LevelPrior, steps: int, most: float
+    ) -> None:
+        """Levenberg-Marquardt steps until a share of the fits has converged."""
         for _ in range(steps):
             tried = _moved(self.values, self._step(prior))
             ahead = model(tried)
             products = ahead.products(tried.shape[1])
             cost = _cost(products, tried, prior)
-            # Edges sharper than a pixel bend the model within a step: one that leads up is taken back.
-            worse = ~(cost <= self.cost * (1 + _SINGLE) + _SINGLE)
+            # Edges sharper than a pixel are not linear within a step: undo steps that raise the cost.
+            worse = ~(cost <= self.cost * (1 + _FLOAT32) + _FLOAT32)
             if worse.any():
                 back = np.flatnonzero(worse)
                 tried[back], cost[back] = self.values[back], self.cost[back]
@@ -262,11 +276,11 @@ class _State:
                 longer = np.where(self.damping > _LEAST_DAMPING, 0.1 * self.damping, 0.0)
                 self.damping = np.where(worse, shorter, longer)
             self.values, self.linear, self.products, self.cost = tried, ahead, products, cost
-            if (self.size < _SETTLED).mean() >= most:
+            if (self.size < _CONVERGED).mean() >= most:
                 break
 
-    def _step(self, prior: Prior) -> Array:
-        """The next step; `size` becomes that of the undamped one."""
+    def _step(self, prior: LevelPrior) -> Array:
+        """The next step; sets `size` to the length of the undamped one."""
         information, gradient = self.products[:, 1:, 1:].copy(), self.products[:, 1:, 0].copy()
         pull = self.values[:, MEAN:] - prior.mean
         gradient[:, MEAN:] -= (prior.precision @ pull[:, :, None])[:, :, 0]
@@ -274,9 +288,9 @@ class _State:
         diagonal = np.einsum("eii->ei", information)  # a view
         diagonal += _NOTHING
         step = _solved(information, gradient)
-        sharpest = (self.values[:, BLUR] <= _LEAST_BLUR) & (step[:, BLUR] < 0)
+        sharpest = (self.values[:, BLUR] <= LEAST_BLUR) & (step[:, BLUR] < 0)
         if sharpest.any():
-            # A blur at its limit stays there: the others are found as if it were known.
+            # A blur at its limit is held there while the other values are solved for.
             information[sharpest, BLUR] = 0.0
             information[sharpest, :, BLUR] = 0.0
             gradient[sharpest, BLUR] = 0.0
@@ -290,7 +304,7 @@ class _State:
         return step
 
 
-def _cost(products: Array, values: Array, prior: Prior) -> Array:
+def _cost(products: Array, values: Array, prior: LevelPrior) -> Array:
     pull = values[:, MEAN:] - prior.mean
     return np.asarray(products[:, 0, 0] + np.einsum("ei,eij,ej->e", pull, prior.precision, pull))
 
@@ -300,11 +314,11 @@ def _solved(information: Array, gradient: Array) -> Array:
 
 
 def _moved(values: Array, step: Array) -> Array:
-    """Values after a step, kept from leaving the range where the model is nearly linear."""
+    """Values after a step that is limited to where the model is nearly linear."""
     sigma = values[:, BLUR]
     most = sigma[:, None]
     moved = values + step
     moved[:, :MEAN] = values[:, :MEAN] + np.minimum(np.maximum(step[:, :MEAN], -most), most)
-    least = np.maximum(0.6 * sigma, _LEAST_BLUR)
+    least = np.maximum(0.6 * sigma, LEAST_BLUR)
     moved[:, BLUR] = np.minimum(np.maximum(moved[:, BLUR], least), 1.6 * sigma)
     return moved

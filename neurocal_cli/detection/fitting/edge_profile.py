@@ -1,15 +1,16 @@
-"""The profile of a blurred edge, from -1 on the dark side to +1 on the light one.
+"""The profile of a blurred edge, from -1 on the dark side to +1 on the light side.
 
 With z the distance from the edge in units of sigma_t, ``sigma_t^2 = psf^2 + 1/12``,
 
     E(z) = erf(z / sqrt 2) + phi(z) (a_3 He_3(z) + a_5 He_5(z))
 
-where phi is the normal density and He_k are Hermite's polynomials (Gram-Charlier's series): the blur's
-tails, the pixel's box (known, see `box_kurtosis`), sharpening. A response that is not linear then makes
+where phi is the normal density and He_k are Hermite polynomials (Gram-Charlier series). The coefficients
+describe the tails of the blur, the pixel's box (see `box_kurtosis`) and sharpening. A nonlinear response,
+by gamma or clipping, then maps the light x between the levels -1 and +1 to
 
     F(x) = x + (1 - x^2) (b_0 + b_1 x + b_2 x^2 + ...)
 
-of the light x between the levels -1 and +1: gamma, clipping. Both are the same along all edges of an image.
+Both are the same along all edges of an image.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ Real = NDArray[np.floating]
 RESPONSE_TERMS = 6
 
 # erf(x) = 1 - exp(-x^2) sum_k C_k t^k, t = 1 / (1 + p x): the form of Hastings (Abramowitz and Stegun
-# 7.1.26) with seven terms, which Lawson's method has made minimax: at most 7.3e-10 off.
+# 7.1.26) with seven terms, made minimax by Lawson's method: the error is at most 7.3e-10, which
+# tests/test_fit_models.py checks. For the pixels of 93 edges, error function and density take 0.13 ms;
+# scipy.special.erf takes 1.0 ms, and 0.1 s to import.
 _P = 0.34
 _C = (
     0.180147914252,
@@ -77,7 +80,7 @@ def erf_and_density(z: Real) -> tuple[Real, Real]:
 
 
 def with_sign(size: Real, of: Real) -> Real:
-    """What is positive with the sign of something else, in place: by its bit, numpy's copysign being slow."""
+    """Give a positive array the sign of another, in place; by its bit, because `numpy.copysign` is slower."""
     kind, sign = _SIGN_BITS[of.dtype.itemsize]
     bits = size.view(kind)
     bits |= of.view(kind) & sign
@@ -106,7 +109,7 @@ def profile(z: Real, tails: Real) -> tuple[Real, Real, Real]:
 
 
 def tails_of(z: Real, density: Real, tails: Real) -> tuple[Real, Real]:
-    """What tails (E, 2) add to a profile at z (E, N), and its derivative."""
+    """The contribution of the tails (E, 2) to a profile at z (E, N), and its derivative."""
     square = z * z
     # By powers of z^2; d/dz phi He_k = -phi He_{k+1}.
     value, slope = ((tails @ powers).astype(z.dtype) for powers in (_ODD_POWERS, _EVEN_POWERS))
@@ -123,7 +126,7 @@ _EVEN_POWERS = np.array([[-3.0, 6.0, -1.0, 0.0], [15.0, -45.0, 15.0, -1.0]])
 
 
 def _polynomial(x: Real, coefficients: Real) -> Real:
-    """Polynomials of x (E, N) with coefficients (E, K) of their own, the constant first."""
+    """Polynomials of x (E, N) with coefficients (E, K), the constant first."""
     value = x * coefficients[:, -1:]
     for k in range(coefficients.shape[1] - 2, 0, -1):
         value += coefficients[:, k, None]
@@ -140,9 +143,9 @@ def tail_terms(z: Real, density: Real, out: Real) -> None:
     np.multiply(odd, square * (square - 10) + 15, out=out[:, 1])
 
 
-def response(x: Real, bend: Array) -> tuple[Real, Real]:
+def response(x: Real, coefficients: Array) -> tuple[Real, Real]:
     """F(x) and its derivative, for coefficients b_0, b_1, ..."""
-    last, *others = (x.dtype.type(coefficient) for coefficient in bend[::-1])
+    last, *others = (x.dtype.type(coefficient) for coefficient in coefficients[::-1])
     rest, steep = np.full_like(x, last), np.zeros_like(x)
     for coefficient in others:
         steep *= x
@@ -168,7 +171,7 @@ def response_terms(x: Real, scale: Real, out: Real) -> None:
 
 
 def box_kurtosis(normal: Array, sigma: Array) -> Array:
-    """Coefficient a_3 that the pixel's box makes, ``(n_u^4 + n_v^4) / (1440 sigma_t^4)``.
+    """Coefficient a_3 of the pixel's box, ``(n_u^4 + n_v^4) / (1440 sigma_t^4)``.
 
     From the fourth cumulant -(n_u^4 + n_v^4)/120 of the box seen along the normal, by Edgeworth's series.
 

@@ -1,37 +1,38 @@
-"""The profile of an edge so sharp that its blur is mostly the pixel's own box, exactly.
+"""The exact profile of an edge so sharp that its blur is mostly the pixel's own box.
 
 With psf the blur's standard deviation [px], x a distance from the edge [px], e = erf(x / (psf sqrt 2)) and
 p the normal density of x / psf, the light of a step and its integrals are
 
     e,    G = x e + 2 psf p,    H = (x^2 + psf^2) e / 2 + psf x p.
 
-Seen along the edge's normal, the pixel is two boxes one after the other, of half widths a = |n_u| / 2 and
-b = |n_v| / 2: E is the second difference of H over 4 a b, its slope that of G, and since dH/dpsf = psf e the
-difference of e tells the rest. What the step leaves without any blur, a trapezoid, is taken out of these
-differences, which would lose their digits to it.
+Along the edge's normal, the pixel is the convolution of two boxes with half widths a = |n_u| / 2 and
+b = |n_v| / 2. E is therefore the second difference of H over 4 a b, its slope that of G, and since
+dH/dpsf = psf e, its derivative by psf that of e. The profile without blur, a ramp with rounded ends, is
+computed separately, against cancellation in these differences.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.detection.fitting.profile import Real, erf_and_density, profile, tails_of, with_sign
+from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, profile, tails_of, with_sign
 from neurocal_cli.geometry import Array
 
 __all__ = ["PIXEL", "box_profile", "half_widths", "sharp_profile"]
 
 PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
+# Against division by 0 in blurs and boxes that cannot be measured; insensitive.
 _LEAST_PSF = 0.02  # px
 _LEAST_HALF = 5e-3  # px
 
 
 def half_widths(normal: Array) -> Array:
-    """Half widths (E, 2) of the two boxes [px] that pixels are along unit normals (E, 2); wider one first."""
+    """Half widths (E, 2) of the two boxes [px] of a pixel along unit normals (E, 2); the wider one first."""
     return np.asarray(np.maximum(np.sort(0.5 * np.abs(normal), axis=1)[:, ::-1], _LEAST_HALF))
 
 
 def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
-    """Light between -1 and +1, and what it changes by.
+    """Light between -1 and +1, and its derivatives.
 
     Parameters
     ----------
@@ -74,17 +75,17 @@ def box_profile(d: Real, sigma: Real, half: Array) -> tuple[Real, Real, Real]:
 def sharp_profile(
     z: Real, sigma: Real, tails: Real, half: Array | None
 ) -> tuple[Real, Real, Real | None, Real]:
-    """E(z), its derivative by z, how it changes with sigma but for being stretched, and the normal density.
+    """E(z), its derivative by z, the excess derivative by log sigma, and the normal density.
 
-    The derivative of E(d / sigma) by the logarithm of sigma is -z times that by z, and for the pixel's box,
-    which does not grow with the blur, the third result as well.
+    The derivative of E(d / sigma) by log sigma is -z times that by z. The box of the pixel does not grow
+    with the blur, which adds the third result.
 
     Parameters
     ----------
     z : (E, N) array
     sigma : (E, 1) array [px]
     tails : (E, 2) array
-        As `profile` has them.
+        As in `profile`.
     half : (E, 2) array or None [px]
         None for `profile` itself.
     """

@@ -1,13 +1,14 @@
-"""Maximum-likelihood fits of straight or evenly curved edges to all the pixels around them.
+"""Maximum-likelihood fits of edges, straight or of known curvature, to all the pixels around them.
 
-The light around an edge, with (s, d) the coordinates of `Lines` and z = (d - offset - tilt s) / sigma,
+In: lines, strips of pixels, levels. Out: `BatchFit` with offset, tilt, levels and blur of each edge. With
+(s, d) the coordinates of `Lines` and z = (d - offset - tilt s) / sigma, the light around an edge is
 
     I = A(u, v) + B(u, v) F(x),   x = E(z) Q + phi(z) R
 
-A and B are mean level and half contrast, with slopes that are fixed; E and F are `fit_profile.profile` and
-`response`; Q fades the edge out towards other lines, a product of erf(t) in the distances t from those that
-cross it at both ends and from its two parallel neighbours; R corrects that for the crossing angle: blurring
-sign(z) sign(t) gives erf erf + 4 rho phi phi + ... with rho the cosine between the normals.
+A and B are mean level and half contrast, with fixed slopes; E and F are `edge_profile.profile` and
+`response`. Q is the effect of other lines: a product of erf(t), with t the distances from the lines that
+cross the edge at both ends and from its two parallel neighbours. R corrects Q for the crossing angle:
+blurring sign(z) sign(t) gives erf erf + 4 rho phi phi + ... with rho the cosine between the normals.
 """
 
 from __future__ import annotations
@@ -18,19 +19,19 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.box import sharp_profile
-from neurocal_cli.detection.fitting.newton import (
+from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     MORE_STEPS,
-    Fit,
-    Linear,
+    BatchFit,
+    LevelPrior,
+    Linearised,
     Part,
-    Prior,
-    Shape,
-    gauss_newton,
+    ProfileShape,
+    fit_batch,
     rows_for,
 )
-from neurocal_cli.detection.fitting.profile import erf_and_density, response
+from neurocal_cli.detection.fitting.edge_profile import erf_and_density, response
+from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.strips import Lines, Strips
 from neurocal_cli.geometry import Array
 
@@ -49,19 +50,20 @@ __all__ = [
 Single = NDArray[np.float32]
 
 OFFSET, TILT = 0, 1  # the first two values of an edge's fit
-_ALONE = 9.0  # sigma to the next parallel line, beyond which it cannot be noticed
+# Insensitive.
+_ALONE = 9.0  # sigma; a parallel line at this distance has no effect
 _BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeData:
-    """What the fits need of the pixels, (E, N) float32 arrays.
+    """The pixels as the fits need them, (E, N) float32 arrays.
 
     Attributes
     ----------
     s, d : arrays [px]
     value : array [DN]
-        Less the slopes' share of A.
+        Minus the slope of A.
     gain : array
         B(u, v) relative to the edge's own.
     Q, R : arrays
@@ -82,7 +84,7 @@ class EdgeData:
 
     @property
     def count(self) -> NDArray[np.int64]:
-        """(E,) number of pixels that are used."""
+        """(E,) number of pixels used."""
         return np.count_nonzero(self.root, axis=1)
 
     def part(self, which: Part) -> EdgeData:
@@ -91,10 +93,10 @@ class EdgeData:
 
 
 def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> tuple[Array, Array, Array]:
-    """Offset, tilt and blur of edges in closed form, from anywhere in the strip.
+    """Offset, slope and blur of edges in closed form, for an edge anywhere in its strip.
 
     With e = (I - A) / B, the mean of e over a strip is -offset / half_width, and that of 1 - e^2 is
-    4 sigma / sqrt(pi) over the width. Crude, but without a start.
+    4 sigma / sqrt(pi) over the width. Inaccurate, but needs no start.
 
     Parameters
     ----------
@@ -137,7 +139,7 @@ def edge_data(
     contrast : (E,) array [DN]
         B where the slopes hold.
     nearest : (E,) array
-        Pixels nearer than so many sigma to the crossing lines are left out.
+        Least distance of a pixel from the crossing lines, in sigma.
     """
     Q = np.ones_like(strips.s)
     R = np.zeros_like(strips.s)
@@ -170,42 +172,42 @@ def edge_data(
 def fit_edges(
     data: EdgeData,
     start: Array,
-    prior: Prior,
+    prior: LevelPrior,
     half_length: Array,
-    shape: Shape,
+    shape: ProfileShape,
     steps: int,
     more: int = MORE_STEPS,
-) -> Fit:
-    """Gauss-Newton steps of all edges at once.
+) -> BatchFit:
+    """Fit all edges at once.
 
     Parameters
     ----------
     data : EdgeData
     start : (E, 5) array
-        Offset [px], tilt [px over the half length], and the values of `Fit`.
+        Offset [px], tilt [px over the half length], and the values of `BatchFit`.
     prior : Prior
     half_length : (E,) array [px]
     shape : Shape
     steps, more : int
-        See `gauss_newton`.
+        As in `fit_batch`.
     """
     lever = data.s / half_length.astype(np.float32)[:, None]
 
-    def model_of(part: Part) -> Callable[[Array], Linear]:
-        pixels, levers, form = data.part(part), lever[part], shape.part(part)
-        return lambda values: linearised(pixels, levers, values, form)
+    def model_of(part: Part) -> Callable[[Array], Linearised]:
+        pixels, levers, part_shape = data.part(part), lever[part], shape.part(part)
+        return lambda values: linearised(pixels, levers, values, part_shape)
 
-    return gauss_newton(model_of, start, prior, data.count, steps, more)
+    return fit_batch(model_of, start, prior, data.count, steps, more)
 
 
 def light_at(data: EdgeData, values: Array) -> Single:
-    """About the light x (E, N) between the levels, for weights that change slowly with it."""
+    """The light x (E, N) between the levels, approximately, for weights that vary slowly with it."""
     offset, sigma = (values[:, k, None].astype(np.float32) for k in (OFFSET, BLUR))
     return np.asarray(erf_and_density((data.d - offset) / sigma)[0] * data.Q, dtype=np.float32)
 
 
-def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Linear:
-    """The model and its derivatives; ``lever`` is s over the half length."""
+def linearised(data: EdgeData, lever: Single, values: Array, shape: ProfileShape) -> Linearised:
+    """The model and its derivatives; lever is s over the half length."""
     offset, tilt, mean, contrast, sigma = np.ascontiguousarray(values.T, data.value.dtype)[:, :, None]
     z = data.d - offset
     z -= tilt * lever
@@ -222,8 +224,8 @@ def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Li
     rows = rows_for(len(z), 5, z.shape[1], x.dtype)
     residual, by_offset, by_tilt, by_mean, by_contrast, by_blur = rows.swapaxes(0, 1)[:6]
     factor = gain * (-contrast / sigma)
-    if shape.bend.any():
-        F, steep = response(x, shape.bend)
+    if shape.nonlinearity.any():
+        F, steep = response(x, shape.nonlinearity)
         factor *= steep
     else:
         F = x
@@ -239,11 +241,11 @@ def linearised(data: EdgeData, lever: Single, values: Array, shape: Shape) -> Li
     np.subtract(data.value, mean, out=residual)
     residual *= data.root
     residual -= contrast * by_contrast
-    return Linear(rows, z, x)
+    return Linearised(rows, z, x)
 
 
 def with_weight(data: EdgeData, weight: Single) -> EdgeData:
-    """The same pixels with other weights [1/DN^2]; those not used stay unused."""
+    """The same pixels with other weights [1/DN^2]; unused ones stay unused."""
     root = np.sqrt(weight)
     root *= data.root > 0
     return replace(data, root=root)

@@ -1,4 +1,4 @@
-"""Why an image gives no points: what is said when its grids cannot be laid on the board."""
+"""Messages about images whose grids cannot be located on the board."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.errors import NeurocalError
 
-__all__ = ["LOOKS_THE_SAME", "NoBoardError", "another_size", "several_ways"]
+__all__ = ["SYMMETRIC_BOARD", "NoBoardError", "ambiguity_message", "wrong_size_message"]
 
-LOOKS_THE_SAME = (
+SYMMETRIC_BOARD = (
     "the board looks the same after a turn, so its first corner depends on its orientation in the image; to "
     "get the same point ids in all images, use a board with an even number of inner vertices on one side and "
     "an odd number on the other"
@@ -19,11 +19,11 @@ LOOKS_THE_SAME = (
 
 
 class NoBoardError(NeurocalError):
-    """An image that does not show the board, or not enough of it to tell where its points are."""
+    """An image does not show the board, or not enough of it to locate its points."""
 
 
-def another_size(board: Board, grid: Grid, ends: Sequence[End]) -> str:
-    """What to say of a grid that has no place on the board."""
+def wrong_size_message(board: Board, grid: Grid, ends: Sequence[End]) -> str:
+    """The message about a grid that has no place on the board."""
     wanted = _sizes(board)
     shape = grid.shape
     if len(board.planes) == 1:
@@ -39,8 +39,8 @@ def another_size(board: Board, grid: Grid, ends: Sequence[End]) -> str:
     )
 
 
-def several_ways(board: Board, grids: Sequence[Grid], rms: float) -> str:
-    """What to say of grids that can lie on the board in more ways than one, the best to `rms` px."""
+def ambiguity_message(board: Board, grids: Sequence[Grid], rms: float) -> str:
+    """The message about grids with several arrangements, the best one with an rms error [px]."""
     sizes = [sorted((plane.cols, plane.rows)) for plane in board.planes]
     part = next((grid for grid in grids if sorted(grid.shape) not in sizes), None)
     if part is not None:

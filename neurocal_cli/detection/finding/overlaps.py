@@ -1,27 +1,30 @@
-"""Vertices that two lattices claim: copies of a lattice, and the vertices on a fold."""
+"""Vertices that belong to two lattices: copies of a lattice, and rows beyond a fold.
+
+In: the lattices of a level. Out: lattices that share no vertices.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
-from neurocal_cli.detection.finding.grow import Lattice, cropped, framed, frontier
-from neurocal_cli.detection.finding.predict import expected
+from neurocal_cli.detection.finding.grow import frontier
+from neurocal_cli.detection.finding.lattice import Lattice
+from neurocal_cli.detection.finding.predict import predict_vertices
 from neurocal_cli.geometry import Array
 
-__all__ = ["disputed", "distinct", "touching"]
+__all__ = ["any_overlap", "drop_duplicates", "trim_overlaps"]
 
+# Insensitive; FOLDED and "two boards" in tests/test_finding.py repeat this.
 _SAME = 0.25  # of a square's width; between vertices that are the same
 _MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on ...
 _MEETS_PARTLY = 0.22  # ... if few of its row are seen
 _MOSTLY = 0.6  # share of a row
 _COPY = 0.5  # share of vertices in another lattice
-_BESIDE = 2.0  # squares; farther from each other lattices have nothing in dispute
+_BESIDE = 2.0  # squares; lattices farther apart share no vertices
 
 
-def distinct(lattices: list[Lattice]) -> list[Lattice]:
-    """Leave out lattices most of whose vertices are in a larger one."""
+def drop_duplicates(lattices: list[Lattice]) -> list[Lattice]:
+    """Drop lattices most of whose vertices belong to a larger one."""
     kept: list[Lattice] = []
     for lattice in sorted(lattices, key=lambda x: -int(x.seen.sum())):
         points = lattice.pixels[lattice.seen]
@@ -31,8 +34,8 @@ def distinct(lattices: list[Lattice]) -> list[Lattice]:
     return kept
 
 
-def touching(lattices: list[Lattice]) -> bool:
-    """Whether any two lattices come so near each other that they may claim the same vertices."""
+def any_overlap(lattices: list[Lattice]) -> bool:
+    """Whether any two lattices are near enough to share vertices."""
     boxes = []
     for lattice in lattices:
         points, room = lattice.pixels[lattice.seen], _BESIDE * _longest(lattice)
@@ -51,48 +54,47 @@ def _longest(lattice: Lattice) -> float:
     return float(np.nanmax(np.hypot(*sides.T)))
 
 
-def disputed(lattices: list[Lattice]) -> list[Lattice]:
-    """Take outermost rows off a lattice that lie in another one, or where another one goes on.
+def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
+    """Remove outermost rows of a lattice that lie on another lattice or on its next row.
 
-    Of two planes that meet at a fold each may have grown to the fold and a little beyond it.
+    A lattice of one plane may have grown across a fold into the other plane.
     """
     result = list(lattices)
     if len(result) < 2:
         return result
     for _ in range(2):
-        claims = [_claim(x) for x in result]
+        places = [_vertices_and_next(x) for x in result]
         for i, lattice in enumerate(result):
-            for j, claim in enumerate(claims):
+            for j, place in enumerate(places):
                 if i != j:
-                    lattice = _trimmed(lattice, claim)
+                    lattice = _trimmed(lattice, place)
             result[i] = lattice
     return result
 
 
-def _claim(lattice: Lattice) -> tuple[Array, float]:
-    """Vertices of a lattice and where it would go on (N, 2), and its squares' width."""
-    wider, _ = framed(lattice)
+def _vertices_and_next(lattice: Lattice) -> tuple[Array, float]:
+    """Vertices of a lattice and of its next rows (N, 2), and the width of its squares."""
+    wider, _ = lattice.padded()
     row, col = frontier(wider)
-    at = expected(wider.pixels, row, col)
-    return np.concatenate([lattice.pixels[lattice.seen], at.points]), lattice.width
+    predicted = predict_vertices(wider.pixels, row, col)
+    return np.concatenate([lattice.pixels[lattice.seen], predicted.points]), lattice.width
 
 
-def _trimmed(lattice: Lattice, claim: tuple[Array, float]) -> Lattice:
-    points, width = claim
+def _trimmed(lattice: Lattice, place: tuple[Array, float]) -> Lattice:
+    points, width = place
     seen = lattice.seen
     away = np.full(seen.shape, np.inf)
     away[seen] = _distance(lattice.pixels[seen], points) / min(width, lattice.width)
     drop = np.zeros_like(seen)
     for line, inner in _OUTERMOST:
         known = int(seen[line].sum())
-        # A row that is not whole is likelier to be where a plane ends.
+        # An incomplete row is more likely to lie beyond the end of its plane.
         meets = _MEETS if known > 0.75 * seen[inner].sum() else _MEETS_PARTLY
         if known and (away[line][seen[line]] < meets).mean() >= _MOSTLY:
             drop[line] = seen[line]
     if not drop.any():
         return lattice
-    pixels = np.where(drop[..., None], np.nan, lattice.pixels)
-    return cropped(replace(lattice, pixels=pixels, contrast=np.where(drop, np.nan, lattice.contrast)))
+    return lattice.subset(seen & ~drop)
 
 
 _OUTERMOST = (
