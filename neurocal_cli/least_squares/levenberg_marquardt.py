@@ -216,6 +216,7 @@ class LevenbergMarquardt:
         self.damping, self.growth = np.full(G, options.damping), np.full(G, options.grow)
         self.floor = np.zeros(G) + floor
         self.limit = np.full(G, options.max_iterations) if limit is None else limit
+        self.soonest = int(self.limit.min(initial=options.max_iterations))  # that any group may end there
         self.iteration = 0
         self.outcome = Outcome(np.zeros(G, dtype=np.int64), np.zeros(G, dtype=np.int8), np.zeros(G))
         exact, out = self.cost <= self.floor, self.limit <= 0
@@ -245,18 +246,23 @@ class LevenbergMarquardt:
         self.damping = np.maximum(self.damping * np.where(better, shrink, self.growth), options.least_damping)
         self.growth = np.where(better, options.grow, options.accelerate * self.growth)
         self.cost = np.where(better, after, before)
-        gain = promised if options.by_promise else gained
-        converged = better & (gain < options.tolerance * before + options.negligible)
-        flat = sensible & ~better & (np.abs(promised) < options.flat * before)
-        exact = self.cost <= self.floor
-        settled = converged | flat | exact
-        stuck = ~better & (self.damping > options.largest_damping)
-        done = settled | stuck | (self.limit <= self.iteration)
+        converged = (promised if options.by_promise else gained) < self._last_gain(before)
+        flat = sensible & (np.abs(promised) < options.flat * before)
+        settled, exact = np.where(better, converged, flat), self.cost <= self.floor
+        stuck = (self.damping > options.largest_damping) & ~better
+        done = settled | exact | stuck
+        if self.iteration >= self.soonest:
+            done |= self.limit <= self.iteration
         if done.any():
             stop = np.zeros(len(done), dtype=np.int8)
-            stop[stuck], stop[flat] = Stop.STUCK, Stop.FLAT
-            stop[converged], stop[exact] = Stop.CONVERGED, Stop.EXACT
+            stop[stuck], stop[settled & ~better] = Stop.STUCK, Stop.FLAT
+            stop[settled & better], stop[exact] = Stop.CONVERGED, Stop.EXACT
             self._retire(done, stop)
+
+    def _last_gain(self, cost: Array) -> Array:
+        """What an accepted step must gain to be followed by another."""
+        share = self.options.tolerance * cost
+        return share + self.options.negligible if self.options.negligible else share
 
     def renew(self) -> None:
         """Take up the costs of a problem that has changed by itself; all groups must be active."""
