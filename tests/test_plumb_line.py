@@ -347,12 +347,12 @@ def detected(real_files: RealFiles) -> Detected:
 
     @cache
     def points(pattern: str, cols: int, rows: int, square: float) -> Correspondences:
-        from neurocal_cli.detection.batch import Task, examine_all
+        from neurocal_cli.detection.batch import DetectionOptions, detect_files
         from neurocal_cli.detection.detect import gather
 
         board = Board.single(cols, rows, square)
         paths = [str(path) for path in real_files(pattern)]
-        outcomes = examine_all(paths, Task(board, "midpoints", None, False, True), 1)
+        outcomes = detect_files(paths, DetectionOptions(board, "midpoints", None, False, True), 1)
         found = {f"v{n}": o.detection for n, o in enumerate(outcomes) if o.detection is not None}
         return gather(found, board.unit)
 

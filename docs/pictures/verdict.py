@@ -8,7 +8,6 @@ import numpy as np
 from style import BLUE, GREEN, ORANGE, SAMPLES, figure, save
 
 from neurocal_cli import Correspondences, calibrate, read_points
-from neurocal_cli.verdict.assessment import judged
 
 
 def main() -> None:
@@ -29,16 +28,16 @@ def main() -> None:
     limits = (1.3, 1.6, np.sqrt(6.0))
     for number, (title, points) in enumerate(sets.items()):
         found = calibrate(points, distortion="none", outliers="keep")
-        verdict = judged(found)
+        verdict = found.verdict
+        assert verdict is not None
         m = verdict.measures
         values = (m["held_out_px"] / found.rmse_px, m["contradiction"], np.sqrt(m["disagreement"]))
-        word = getattr(verdict, "word", "")
         axes.barh(
             np.arange(3) + 0.27 * (number - 1),
             values,
             0.24,
             color=(BLUE, ORANGE, "#862e9c")[number],
-            label=f"{title}: {word}",
+            label=f"{title}: {verdict.word}",
         )
     for row, limit in enumerate(limits):
         axes.plot([limit] * 2, [row - 0.42, row + 0.42], color=GREEN, linewidth=2.2)
