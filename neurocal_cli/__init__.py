@@ -10,10 +10,10 @@ network, training                     the calibrating network and its trainers
 bundle_adjustment                     the reprojection error of all views, its minimum, its covariance
 initialisation                        from random weights to a camera
 distortion                            which distortion model the data support; undistortion
-calibrating, methods                  `calibrate`: the fit, without outliers, as a result
+pipeline, methods                     `calibrate`: the fit, without outliers, as a result
 verdict, evaluation, report           what a result is worth
 stereo, zoom_lens, plots              two cameras; a camera whose zoom and focus move; pictures
-simulation                            synthetic images and zoom lenses with their exact truth
+simulation                            synthetic images and zoom lenses with their exact truth; not installed
 io, detection                         files; points from images
 commands                              the command line
 ====================================  ==================================================================
@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from neurocal_cli.board import Board
     from neurocal_cli.calibration import Calibration
+    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.camera.pinhole import Intrinsics, Pose
     from neurocal_cli.detection.detect import detect_points
     from neurocal_cli.distortion.remapping import undistort_image
@@ -61,6 +62,7 @@ _HOMES = {
     "ZoomLens": "zoom_lens.zoom_lens",
     "Board": "board",
     "Calibration": "calibration",
+    "Camera": "camera.camera",
     "Correspondences": "points",
     "Intrinsics": "camera.pinhole",
     "NeurocalError": "errors",
@@ -97,6 +99,7 @@ _HOMES = {
 __all__ = [
     "Board",
     "Calibration",
+    "Camera",
     "Correspondences",
     "Intrinsics",
     "NeurocalError",

@@ -2,25 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import cached_property
 
 import numpy as np
 
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Calibration", "NetworkRecord", "Rejected", "StopReason", "StraightLines", "Verdict", "ViewResult"]
+__all__ = [
+    "Calibration",
+    "NetworkRecord",
+    "Rejected",
+    "StopReason",
+    "StraightLines",
+    "Verdict",
+    "ViewResult",
+    "camera_of",
+]
 
 
 class StopReason(str, Enum):
     """Why training stopped; the value is the sentence to show."""
 
-    CONVERGED = "converged: the pixel error cannot be lowered further"
-    MAX_ITERATIONS = "stopped at the limit of iterations before the pixel error settled"
-    NO_AGREEMENT = "the starts were spent before two of them agreed"
+    CONVERGED = "converged: the reprojection error is at a minimum"
+    MAX_ITERATIONS = "stopped at the maximum number of iterations before the reprojection error settled"
+    NO_AGREEMENT = "no two of the random starts agreed"
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +181,8 @@ class Calibration:
     points : Correspondences
         What it was calibrated from, without what was rejected.
     rejected : Rejected
-    verdict : Verdict or None
-        Of `verdict.assessment.judged`; None before it.
+    judgement : Verdict or callable, optional
+        The verdict as a file has it, or what reaches it from this calibration; see `verdict`.
     lens_choice : dict of float by lens model [px]
         The models that ``distortion="auto"`` chose from and their rms error on data left out.
     covariance : (n, n) array
@@ -202,12 +215,26 @@ class Calibration:
     warnings: tuple[str, ...] = ()
     rejected: Rejected = field(default_factory=Rejected)
     lens_choice: Mapping[str, float] = field(default_factory=dict)
-    verdict: Verdict | None = None
+    judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """What the data say of this calibration beyond its error, reached when it is first read.
+
+        None where it has no points of its own to be judged by.
+        """
+        return self.judgement(self) if callable(self.judgement) else self.judgement
 
     @property
     def n_rejected(self) -> int:
         """Points that were set aside."""
         return len(self.rejected)
+
+    @property
+    def camera(self) -> Camera:
+        """The camera alone."""
+        distortion = Distortion(self.distortion_model, self.distortion)
+        return Camera(self.intrinsics, distortion, self.image_size, self.camera_name)
 
     @property
     def K(self) -> Array:
@@ -238,3 +265,24 @@ class Calibration:
     def projections(self) -> dict[str, Array]:
         """(3, 4) matrix P = A [R | t] of each view, paper eq. (1)."""
         return {name: self.K @ view.pose.D for name, view in self.views.items()}
+
+
+def camera_of(given: Camera | Calibration | Intrinsics | Array) -> Camera:
+    """Take a camera in any of the forms that users have it in; a matrix has no distortion.
+
+    Raises
+    ------
+    UsageError
+        Something else.
+    InputError
+        A matrix that is no camera's.
+    """
+    if isinstance(given, Camera):
+        return given
+    if isinstance(given, Calibration):
+        return given.camera
+    if isinstance(given, Intrinsics):
+        return Camera(given)
+    if isinstance(given, (np.ndarray, list, tuple)):
+        return Camera(Intrinsics.from_matrix(np.asarray(given)))
+    raise UsageError("the camera must be a Camera, a Calibration, an Intrinsics or a 3 x 3 matrix")

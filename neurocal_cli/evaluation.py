@@ -13,10 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.problem import KnownCamera
-from neurocal_cli.bundle_adjustment.units import see
-from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.calibration import Calibration, camera_of
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
@@ -88,15 +86,14 @@ class CameraEvaluation:
 
 
 def evaluate_camera(
-    calibration: Calibration | KnownCamera | Intrinsics, points: Correspondences | None = None
+    calibration: Calibration | Camera | Intrinsics, points: Correspondences | None = None
 ) -> CameraEvaluation:
     """Reprojection error of a calibrated camera.
 
     Parameters
     ----------
-    calibration : Calibration, or a camera without poses
-        With intrinsic parameters, or a camera file's intrinsics and lens, the pose of every view is
-        fitted.
+    calibration : Calibration, Camera or Intrinsics
+        Of a camera without poses, the pose of every view is fitted.
     points : Correspondences, optional
         Default: the points that the camera was calibrated from.
 
@@ -117,22 +114,25 @@ def evaluate_camera(
     if isinstance(calibration, Calibration):
         points = calibration.points if points is None else points
         if not len(points):
-            raise InputError("the calibration holds no points of its own; give the points to judge it by")
+            raise InputError("the calibration has no points of its own; give the points to evaluate it on")
         warnings += _compare(calibration, points)
         seed = calibration.seed
         poses = {name: view.pose for name, view in calibration.views.items()}
     elif points is None:
-        raise InputError("intrinsic parameters hold no points; give the points to judge them by")
+        raise InputError("intrinsic parameters have no points; give the points to evaluate them on")
     fitted = np.array([name not in poses for name in points.view_names])
     if fitted.any():
         new_poses, problems = _fit_poses(calibration, points.select(fitted[points.view_index]), seed)
         poses.update(new_poses)
         warnings += problems
-    predicted, in_front = _predict(calibration, [poses[name] for name in points.view_names], points)
+    camera = camera_of(calibration)
+    predicted, in_front = _predict(camera, [poses[name] for name in points.view_names], points)
     residuals = np.where(in_front[:, None], predicted - points.pixels, np.nan)
     if not in_front.all():
         n_behind = np.count_nonzero(~in_front)
-        warnings.append(f"{n_behind} of {len(points)} points lie behind the camera and are in no average")
+        warnings.append(
+            f"{n_behind} of {len(points)} points lie behind the camera and are left out of all averages"
+        )
     return _measure(residuals, points, fitted, tuple(warnings))
 
 
@@ -147,13 +147,13 @@ def _compare(calibration: Calibration, points: Correspondences) -> list[str]:
     if points.unit == calibration.unit or calibration.views.keys().isdisjoint(points.view_names):
         return []
     return [
-        f"the points are in {points.unit}, the poses of the calibration in {calibration.unit}; "
-        "the error means nothing unless the two are the same"
+        f"the points are in {points.unit}, but the poses of the calibration are in {calibration.unit}; "
+        "the error is wrong unless these are the same unit"
     ]
 
 
 def _fit_poses(
-    camera: KnownCamera | Intrinsics, points: Correspondences, seed: int
+    camera: Calibration | Camera | Intrinsics, points: Correspondences, seed: int
 ) -> tuple[dict[str, Pose], list[str]]:
     """Type 3: poses of views that the calibration does not know, and what to warn of."""
     from neurocal_cli.methods import fit_poses  # the trainers: only when there is something to train
@@ -162,20 +162,15 @@ def _fit_poses(
     poses = {name: view.pose for name, view in fit.views.items()}
     warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
     if not fit.converged:
-        warnings.append(f"the poses of the new views did not settle: {fit.stop_reason}")
+        warnings.append(f"the poses of the new views did not converge: {fit.stop_reason}")
     return poses, warnings
 
 
-def _predict(
-    known: KnownCamera | Intrinsics, poses: list[Pose], points: Correspondences
-) -> tuple[Array, NDArray[np.bool_]]:
+def _predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:
     """Pixels of all the points, each through the pose of its view, and which lie in front."""
     R = np.stack([pose.R for pose in poses])[points.view_index]
     t = np.stack([pose.t for pose in poses])[points.view_index]
-    camera = np.einsum("nij,nj->ni", R, points.world) + t
-    if isinstance(known, Intrinsics):
-        return see(known.A, Lens(), camera)
-    return see(known.intrinsics.A, Lens(known.distortion_model, known.distortion), camera)
+    return camera.project(np.einsum("nij,nj->ni", R, points.world) + t)
 
 
 def _measure(

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.job import Strategy
-from neurocal_cli.bundle_adjustment.problem import Known, KnownCamera, known_for
-from neurocal_cli.calibrating.assembly import assemble
-from neurocal_cli.calibrating.fitting import Fitter
-from neurocal_cli.calibrating.outlier_rejection import fit_robustly
-from neurocal_cli.calibration import Calibration, Rejected
-from neurocal_cli.camera.distortion_models import MODELS, Lens, coefficient_names
+from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.calibration import Calibration, Rejected, camera_of
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.options import Progress, options_for
+from neurocal_cli.pipeline.fit import fit
+from neurocal_cli.pipeline.outlier_rejection import fit_robustly
+from neurocal_cli.pipeline.result import calibration_of
 from neurocal_cli.points import Correspondences
-from neurocal_cli.training import Task, Trained
-from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
-from neurocal_cli.training.starts import Agreement
+from neurocal_cli.verdict.assessment import assess
 
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions
@@ -34,16 +33,15 @@ DISTORTIONS = ("auto", *MODELS, "plumb-line")
 OUTLIERS = ("reject", "keep")
 
 _STARTS = 20
+_FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
 _MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor a lens
-
-Progress = Callable[[str, float], None]
 
 
 def calibrate(
     points: Correspondences,
     type: int = 1,
     image_center: tuple[float, float] | None = None,
-    intrinsics: Intrinsics | KnownCamera | Array | None = None,
+    intrinsics: Camera | Calibration | Intrinsics | Array | None = None,
     extrinsics: Mapping[str, Pose] | None = None,
     method: str = "neuro",
     trainer: str = "lm",
@@ -68,8 +66,8 @@ def calibrate(
         4 the extrinsics.
     image_center : (u0, v0), optional [px]
         Type 2; else the one with the points, else the centre of their image size.
-    intrinsics : Intrinsics, (3, 3) array or a camera with a lens, optional
-        Type 3. A camera with a lens is a `Calibration` or what `read_intrinsics` returns.
+    intrinsics : Camera, Calibration, Intrinsics or (3, 3) array, optional
+        Type 3. The first two bring their distortion with them.
     extrinsics : dict of Pose by view name, optional
         Type 4.
     method : {"neuro"}
@@ -81,7 +79,7 @@ def calibrate(
     skew : bool
         False: theta is pi/2.
     outliers : {"reject", "keep"}
-        Whether points, and whole views, that contradict the others are set aside (`rejection`).
+        Whether points, and whole views, that contradict the others are set aside (`outlier_rejection`).
     seed : int
         Of the random weights; the same seed gives the same result.
     starts : int
@@ -105,21 +103,32 @@ def calibrate(
         Points that cannot give an answer, with the reason.
     """
     _check_options(method, trainer, distortion, outliers, starts, seed)
-    camera, lens = _given_camera(intrinsics)
-    known = known_for(points, type, image_center, camera, extrinsics, skew)
-    known, choice = _with_lens(known, distortion, lens)
-    report = progress or (lambda stage, share: None)
+    given = None if intrinsics is None else camera_of(intrinsics)
+    lens = Distortion() if given is None else given.distortion
+    type_3 = isinstance(type, (int, np.integer)) and type == 3
+    if not type_3:
+        lens = Distortion() if distortion in _FOUND else Distortion(distortion)
+    elif distortion not in ("auto", "none", lens.model):
+        raise UsageError(
+            f"type 3 uses the distortion of the given camera ({lens.model}), not {distortion}; leave it out"
+        )
+    way = distortion if distortion in _FOUND and not type_3 else ""
+    options = options_for(trainer, starts, seed, distortion=way, backprop=backprop, progress=progress)
     try:
-        fitter = Fitter(known, choice, _strategy(trainer, starts, backprop, report), seed, report)
+        problem = problem_for(
+            points, type, image_center, given.intrinsics if given else None, extrinsics, skew, lens
+        )
         if outliers == "reject":
-            fit, rejected = fit_robustly(points, fitter)
+            solution, rejected = fit_robustly(problem, options)
         else:
-            fit, rejected = fitter.fit(points), Rejected()
-        if fit.refusal:
-            raise DegenerateGeometryError(fit.refusal)
-        found = assemble(fit, rejected, trainer=trainer, method=method, seed=seed, name=camera_name)
+            solution, rejected = fit(problem, options), Rejected()
+        if solution.refusal:
+            raise DegenerateGeometryError(solution.refusal)
+        found = calibration_of(
+            solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
+        )
         _refuse_misfit(found)
-        return found
+        return replace(found, judgement=assess)
     except DegenerateGeometryError as error:
         # Views and normal matrices do not know the file that the user should look at.
         if points.lines is None or str(error).startswith(points.source):
@@ -127,7 +136,7 @@ def calibrate(
         raise DegenerateGeometryError(f"{points.source}: {error}") from error
 
 
-def fit_poses(points: Correspondences, camera: Intrinsics | KnownCamera, seed: int) -> Calibration:
+def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:
     """Poses of the views of a given camera from all their points, however badly they fit (type 3).
 
     Raises
@@ -135,11 +144,10 @@ def fit_poses(points: Correspondences, camera: Intrinsics | KnownCamera, seed: i
     InputError, DegenerateGeometryError
         Points that do not determine the poses.
     """
-    intrinsics, lens = _given_camera(camera)
-    known, _ = _with_lens(known_for(points, 3, None, intrinsics, None, True), "none", lens)
-    quiet: Progress = lambda stage, share: None  # noqa: E731
-    fit = Fitter(known, "", _strategy("lm", _STARTS, None, quiet), seed, quiet).fit(points)
-    return assemble(fit, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
+    given = camera_of(camera)
+    problem = problem_for(points, 3, intrinsics=given.intrinsics, lens=given.distortion)
+    solution = fit(problem, options_for("lm", _STARTS, seed))
+    return calibration_of(solution, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
 
 
 def _refuse_misfit(calibration: Calibration) -> None:
@@ -149,32 +157,9 @@ def _refuse_misfit(calibration: Calibration) -> None:
         return
     given = {3: ", and the intrinsics", 4: ", and the poses"}.get(calibration.type, "")
     raise DegenerateGeometryError(
-        f"no camera sees the points where they were seen: the best one errs by {calibration.rmse_px:.3g} px; "
+        f"no camera fits these points: the error of the best one is {calibration.rmse_px:.3g} px rms; "
         f"check that each pixel belongs to its point, the order and the signs of X,Y,Z and u,v{given}"
     )
-
-
-def _given_camera(given: Intrinsics | KnownCamera | Array | None) -> tuple[Intrinsics | None, Lens]:
-    if given is None or isinstance(given, Intrinsics):
-        return given, Lens()
-    if isinstance(given, (np.ndarray, list, tuple)):
-        return Intrinsics.from_matrix(np.asarray(given)), Lens()
-    if not isinstance(getattr(given, "intrinsics", None), Intrinsics):
-        raise UsageError("intrinsics must be an Intrinsics, a 3 x 3 matrix, a Calibration or a camera file")
-    return given.intrinsics, Lens(given.distortion_model, given.distortion)
-
-
-def _with_lens(known: Known, distortion: str, given: Lens) -> tuple[Known, str]:
-    """What is known of the lens, and how it is found otherwise: "auto", "plumb-line" or neither."""
-    if known.type != 3:
-        if distortion in ("auto", "plumb-line"):
-            return known, distortion
-        return replace(known, lens=Lens(distortion), free_lens=distortion != "none"), ""
-    if distortion not in ("auto", "none", given.model):
-        raise UsageError(
-            f"type 3 takes the lens of the given camera ({given.model}), not distortion {distortion}"
-        )
-    return replace(known, lens=given, fixed=known.fixed | set(coefficient_names(given.model))), ""
 
 
 def _check_options(method: str, trainer: str, distortion: str, outliers: str, starts: int, seed: int) -> None:
@@ -187,34 +172,6 @@ def _check_options(method: str, trainer: str, distortion: str, outliers: str, st
         if value not in choices:
             raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
     if not isinstance(starts, (int, np.integer)) or starts < 2:
-        raise UsageError("starts must be at least 2, a whole number: one start has nothing to agree with")
+        raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
     if not isinstance(seed, (int, np.integer)) or seed < 0:
-        raise UsageError("seed must be a whole number from 0 on")
-
-
-def _strategy(trainer: str, starts: int, backprop: BackpropOptions | None, report: Progress) -> Strategy:
-    if trainer == "lm":
-        # Starts see a few points of each view; the best one goes on to (nearly) all of them.
-        begin = LMOptions(tolerance=1e-4)
-        finish = LMOptions(stiffness=(0.0,), tolerance=1e-2, damping=1e-8)
-        return Strategy(
-            trainer=lambda task: train_lm(task, begin),
-            agreement=Agreement(),
-            start_points=(16, 40),
-            finish=lambda task: train_lm(task, finish),
-            finish_points=1024,
-            limit=starts,
-        )
-    from neurocal_cli.training.backprop import BackpropOptions, train_backprop
-
-    options = backprop or BackpropOptions()
-
-    def train(task: Task) -> Trained:
-        return train_backprop(task, options, lambda share: report("training the networks", share))
-
-    def constrained(task: Task, a: float) -> Trained:
-        # Lower rates than from random weights, and every gamma where it belongs: it starts trained.
-        gentle = replace(options, rate_weights=0.4 * options.rate_weights, beta=10.0, a=a, resting_gamma=True)
-        return train_backprop(task, gentle, lambda share: report("training with E_orth", share))
-
-    return Strategy(train, Agreement(0.02, 1e-4), (1024, 1024), None, 1024, starts, constrained)
+        raise UsageError("seed must be a whole number of at least 0")

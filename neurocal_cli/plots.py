@@ -210,13 +210,13 @@ def _draw_curve(axes: Axes, calibration: Calibration) -> None:
     curve = np.maximum(np.array(network.curve), _ZERO)
     marker = "o" if len(curve) <= 60 else ""
     axes.semilogy(
-        np.arange(len(curve)), curve, marker=marker, markersize=3.5, color=_INK, label="network's error"
+        np.arange(len(curve)), curve, marker=marker, markersize=3.5, color=_INK, label="error of the network"
     )
     axes.axhline(
         max(network.rmse_after, _ZERO),
         color=_ACCENT,
         linewidth=1.2,
-        label=f"pixel error after the last steps, {network.rmse_after:.4g} px",
+        label=f"error after bundle adjustment, {network.rmse_after:.4g} px",
     )
     axes.set(xlabel="iteration" if calibration.trainer == "lm" else "checkpoint", ylabel="rms [px]")
     axes.legend(loc="upper right", frameon=False)

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, Verdict, ViewResult
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.evaluation import CameraEvaluation
 from neurocal_cli.verdict.report import verdict_json, verdict_lines
@@ -202,16 +202,16 @@ def _view_lines(views: Any) -> list[str]:
     rows += [[_name(name), str(view.n_points), _pixels(view.rmse_px)] for name, view in shown]
     lines = align(rows)
     if len(views) > _MOST_VIEWS:
-        lines.append(
-            f"the worst {_MOST_VIEWS} of {len(views)} views; {len(views) - _MOST_VIEWS} more are better"
-        )
+        lines.append(f"the {_MOST_VIEWS} views with the largest error, of {len(views)} views")
     return lines
 
 
 def _training_lines(calibration: Calibration) -> list[str]:
-    fit = f"error: rms {_pixels(calibration.rmse_px)} px, maximum {_pixels(calibration.max_px)} px"
+    fit = (
+        f"reprojection error: rms {_pixels(calibration.rmse_px)} px, maximum {_pixels(calibration.max_px)} px"
+    )
     if calibration.n_rejected:
-        fit += f", {_plural(calibration.n_rejected, 'point')} rejected"
+        fit += f", {_plural(calibration.n_rejected, 'outlier')} rejected"
     training = [] if calibration.network is None else _network_lines(calibration.network)
     if calibration.straight_lines is not None:
         training.insert(0, _lens_line(calibration.straight_lines))
@@ -226,7 +226,7 @@ def _lens_lines(calibration: Calibration) -> list[str]:
     errors = [f"{name} {_pixels(choice[name])}" for name in sorted(choice, key=lambda name: choice[name])]
     chosen = calibration.distortion_model
     return [
-        f"lens: {chosen}, the simplest that predicts data left out as well as any:",
+        f"distortion model: {chosen}, the simplest whose cross-validation error is as low as any:",
         f"  {', '.join(errors)} px",
     ]
 
@@ -234,9 +234,10 @@ def _lens_lines(calibration: Calibration) -> list[str]:
 def _lens_line(found: StraightLines) -> str:
     u, v = found.centre
     return (
-        f"lens: {_plural(found.n_points, 'point')} on {_plural(found.n_lines, 'straight line')}, "
-        f"{_pixels(found.rms_before)} px beside them as seen, {_pixels(found.rms_after)} px through the "
-        f"lens; centre of distortion ({u:.1f}, {v:.1f})"
+        f"straight lines: {_plural(found.n_points, 'point')} on {_plural(found.n_lines, 'line')}, rms "
+        "distance "
+        f"{_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px after; centre of "
+        f"distortion ({u:.1f}, {v:.1f})"
     )
 
 
@@ -244,9 +245,11 @@ def _network_lines(network: NetworkRecord) -> list[str]:
     agreed = f"network: {network.agreed} of {_plural(network.starts, 'random start')} agreed"
     if len(network.V) > 1:
         starts = _plural(network.starts, "random start")
-        agreed = f"networks: {starts} for {len(network.V)} views, at least {network.agreed} agreed in each"
+        agreed = (
+            f"networks: {starts} for {len(network.V)} views, at least {network.agreed} agreed in each view"
+        )
     return [
         f"{agreed}, {_plural(network.iterations, 'iteration')}, loss {_pixels(network.loss)} px",
-        f"pixel error: {_pixels(network.rmse_before)} px after training, {_pixels(network.rmse_after)} px "
-        f"after {_plural(network.refine_iterations, 'more step')}",
+        f"bundle adjustment: rms {_pixels(network.rmse_before)} px before, {_pixels(network.rmse_after)} px "
+        f"after {_plural(network.refine_iterations, 'iteration')}",
     ]

@@ -1,4 +1,4 @@
-"""For all tests: threads, and examples that are the same in every run."""
+"""For all tests: threads, examples that are the same in every run, and real data."""
 
 import os
 
@@ -8,6 +8,9 @@ from hypothesis import settings
 # Before NumPy loads it.
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
+
+# Only now, for it loads NumPy.
+from support.real_data import real_files, zhang  # noqa: E402, F401
 
 # What fails once has to fail again.
 settings.register_profile("repeatable", derandomize=True)

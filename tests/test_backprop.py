@@ -11,8 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from support.plain_projection import project
 
-from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose, project
+from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, euler_to_rotation, similarity
 from neurocal_cli.network import (
@@ -502,8 +503,8 @@ def run(code: str) -> str:
 
 
 def test_numba_is_imported_only_by_the_compiled_kernel() -> None:
-    code = "import sys; from neurocal_cli.training import backprop, rule_in_blocks; print('numba' in sys.modules)"
-    assert run(code) == "False\n"
+    load = "import sys; from neurocal_cli.training import backprop, rule_in_blocks;"
+    assert run(f"{load} print('numba' in sys.modules)") == "False\n"
 
 
 def test_without_numba_training_goes_in_blocks() -> None:

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_calibration import made_calibration
+from support.made_calibration import made_calibration
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, ViewResult
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
@@ -155,7 +155,7 @@ def calibrations(draw):
         trainer="lm",
         seed=draw(st.integers(0, 2**40)),
         converged=draw(st.booleans()),
-        stop_reason="converged: the pixel error cannot be lowered further",
+        stop_reason="converged: the reprojection error is at a minimum",
         rmse_px=draw(UNKNOWN),
         max_px=0.3,
         rejected=draw(rejections(points)),

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.plain_projection import project
 
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
-from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose, project, projection_jacobian
-from neurocal_cli.errors import DegenerateGeometryError, InputError
-from neurocal_cli.geometry import Array, euler_to_rotation, rotation_step
+from neurocal_cli.calibration import camera_of
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS, Distortion, distort
+from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose
+from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
+from neurocal_cli.geometry import Array, euler_to_rotation
 
 quick = settings(max_examples=60, deadline=None)
 focal = st.floats(10, 1e5)
@@ -154,39 +160,181 @@ def test_a_mirrored_camera_points_on_both_sides_and_a_camera_at_infinity_are_ref
         decompose(np.array([[500.0, 0, 0, 0], [0, 500, 0, 0], [0, 0, 0, 3]]), world)
 
 
-def test_projecting_is_multiplying_by_p_and_dividing() -> None:
-    camera, pose = (
-        Intrinsics(500.0, 510.0, 320.0, 240.0, 1.5),
-        Pose.from_euler(0.1, 0.2, 0.3, [1.0, 2.0, 9.0]),
-    )
+# Projection, beside the same written plainly
+
+
+DISTORTIONS = {
+    "none": [],
+    "k1": [-0.28],
+    "k1k2": [-0.2286, 0.1904],
+    "k1k2p1p2": [-0.26, 0.06, 2e-3, -1e-3],
+    "plumb_bob": [-0.26, 0.06, 2e-3, -1e-3, 0.03],
+    "rational": [0.4, -0.2, 1e-3, 2e-3, 0.05, 0.7, -0.1, 0.02],
+    "fisheye": [0.08, -0.03, 0.02, -0.005],
+}
+SIZE = (640, 480)
+every_model = pytest.mark.parametrize("model", list(MODELS))
+with_and_without_skew = pytest.mark.parametrize("theta", [np.pi / 2, 1.5])
+
+
+def camera_with(model: str, theta: float = np.pi / 2) -> Camera:
+    return Camera(Intrinsics(500.0, 510.0, 320.0, 240.0, theta), Distortion(model, DISTORTIONS[model]), SIZE)
+
+
+def some_points(n: int = 40) -> Array:
+    rng = np.random.default_rng(1)
+    depth = rng.uniform(0.5, 3, n)
+    return np.column_stack([rng.uniform(-0.6, 0.6, (n, 2)) * depth[:, None], depth])
+
+
+def some_pixels(n: int = 40) -> Array:
+    return np.random.default_rng(2).uniform([0, 0], [639, 479], (n, 2))
+
+
+def slopes(f: Callable[[Array], Array], x: Array, steps: Array) -> Array:
+    """Central differences of f (N, d) by each of the entries of x, which is a row or N of them."""
+    columns = []
+    for n, h in enumerate(steps):
+        e = np.zeros(x.shape[-1])
+        e[n] = h
+        columns.append((f(x + e) - f(x - e)) / (2 * h))
+    return np.stack(columns, axis=-1)
+
+
+def with_parameters(camera: Camera, values: Array) -> Camera:
+    """The camera of A11, A12, A22, A13, A23 and coefficients."""
+    A = np.eye(3)
+    A[ENTRIES] = values[:5]
+    distortion = Distortion(camera.distortion.model, values[5:])
+    return Camera(Intrinsics.from_matrix(A), distortion, camera.image_size)
+
+
+@with_and_without_skew
+def test_projecting_is_multiplying_by_p_and_dividing(theta: float) -> None:
+    camera = camera_with("none", theta)
+    pose = Pose.from_euler(0.1, 0.2, 0.3, np.array([1.0, 2.0, 9.0]))
     world = np.random.default_rng(0).normal(size=(7, 3))
     S = np.column_stack([world, np.ones(7)]) @ (camera.A @ pose.D).T
-    pixels, depth = project(camera.A, pose, world)
+    pixels, in_front = camera.project(pose.to_camera(world))
     np.testing.assert_allclose(pixels, S[:, :2] / S[:, 2:], rtol=1e-13)
-    np.testing.assert_allclose(depth, S[:, 2], rtol=1e-13)
+    np.testing.assert_allclose(pixels, project(camera.A, pose, world)[0], rtol=1e-13)
+    assert in_front.all()
 
 
-@quick
-@given(cameras, st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(0.5, 5)))
-def test_projection_jacobian_by_central_differences(camera: Intrinsics, point: tuple[float, ...]) -> None:
-    Xc = np.array(point)
-    by_A, by_pose = projection_jacobian(camera.A, Xc)
+@every_model
+def test_skew_acts_after_distortion(model: str) -> None:
+    camera, points = camera_with(model, 1.4), some_points()
+    x, y = (points[:, :2] / points[:, 2:]).T
+    distorted = np.column_stack([*distort(model, DISTORTIONS[model], x, y), np.ones(len(x))])
+    np.testing.assert_allclose(camera.project(points)[0], (distorted @ camera.A.T)[:, :2], rtol=1e-12)
 
-    def pixel(A: Array, M: Array) -> Array:
-        S = A @ M
-        return np.asarray(S[:2] / S[2])
 
-    numeric_A, numeric = np.empty((2, 5)), np.empty((2, 6))
-    for n, (i, j) in enumerate(zip(*ENTRIES, strict=True)):
-        dA = np.zeros((3, 3))
-        dA[i, j] = 1e-3 * camera.alpha_u
-        numeric_A[:, n] = (pixel(camera.A + dA, Xc) - pixel(camera.A - dA, Xc)) / (2 * dA[i, j])
-    h = 1e-5
-    for n in range(3):
-        e = h * np.eye(3)[n]
-        turned, back = rotation_step(e) @ Xc, rotation_step(-e) @ Xc
-        numeric[:, n] = (pixel(camera.A, turned) - pixel(camera.A, back)) / (2 * h)
-        numeric[:, n + 3] = (pixel(camera.A, Xc + e) - pixel(camera.A, Xc - e)) / (2 * h)
-    rounding = 1e-15 * np.abs(camera.A).max() / h
-    assert np.abs(by_A - numeric_A).max() <= 1e-6 + rounding
-    assert np.abs(by_pose - numeric).max() <= 1e-6 * np.abs(by_pose).max() + 20 * rounding
+def test_points_behind_and_beyond_are_told() -> None:
+    camera = camera_with("k1")
+    points = np.array([[0.1, 0.1, 1.0], [0.1, 0.1, -1.0], [0.1, 0.1, 0.0], [9.0, 0.0, 1.0]])
+    pixels, in_front = camera.project(points)
+    assert in_front.tolist() == [True, False, False, True]
+    assert np.isfinite(pixels).all(axis=1).tolist() == [True, False, False, True]
+    assert camera.sees(points).tolist() == [True, False, False, False]
+
+
+@every_model
+@with_and_without_skew
+def test_project_jacobian_by_central_differences(model: str, theta: float) -> None:
+    camera, points = camera_with(model, theta), some_points()
+    by_camera, by_point = camera.project_jacobian(points)
+    numeric = slopes(lambda p: camera.project(p)[0], points, np.full(3, 1e-5))
+    np.testing.assert_allclose(by_point, numeric, rtol=1e-6, atol=1e-4)
+    values = np.array([*camera.entries, *camera.distortion.coefficients])
+    steps = np.array([1e-2] * 5 + [1e-5] * (len(values) - 5))
+    numeric = slopes(lambda v: with_parameters(camera, v).project(points)[0], values, steps)
+    np.testing.assert_allclose(by_camera, numeric, rtol=1e-6, atol=1e-5)
+
+
+@every_model
+@with_and_without_skew
+def test_unproject_jacobian_by_central_differences(model: str, theta: float) -> None:
+    camera, pixels = camera_with(model, theta), some_pixels()
+    by_camera, by_pixel = camera.unproject_jacobian(pixels)
+    numeric = slopes(camera.unproject, pixels, np.full(2, 1e-3))
+    np.testing.assert_allclose(by_pixel, numeric, rtol=1e-6, atol=1e-9)
+    values = np.array([*camera.entries, *camera.distortion.coefficients])
+    steps = np.array([1e-2] * 5 + [1e-5] * (len(values) - 5))
+    numeric = slopes(lambda v: with_parameters(camera, v).unproject(pixels), values, steps)
+    np.testing.assert_allclose(by_camera, numeric, rtol=1e-5, atol=1e-8)
+
+
+@every_model
+@with_and_without_skew
+def test_unproject_inverts_project(model: str, theta: float) -> None:
+    camera, points, pixels = camera_with(model, theta), some_points(), some_pixels()
+    rays = camera.unproject(camera.project(points)[0])
+    np.testing.assert_allclose(rays, points / np.linalg.norm(points, axis=1)[:, None], atol=1e-11)
+    np.testing.assert_allclose(camera.project(camera.unproject(pixels))[0], pixels, atol=1e-9)
+    assert camera.unproject(pixels.reshape(4, 10, 2)).shape == (4, 10, 3)
+
+
+def test_a_pixel_that_the_camera_cannot_see_has_no_ray() -> None:
+    camera = Camera(Intrinsics(100.0, 100.0, 0.0, 0.0), Distortion("k1", [-1.0]))
+    rays = camera.unproject(np.array([[30.0, 0.0], [50.0, 0.0]]))  # the image ends at 38.5
+    assert np.isfinite(rays).all(axis=1).tolist() == [True, False]
+    assert np.isfinite(camera.unproject_jacobian(np.array([[30.0, 0], [50, 0]]))[1][:, 0, 0]).tolist() == [
+        True,
+        False,
+    ]
+
+
+# Other images of the same camera
+
+
+@every_model
+@with_and_without_skew
+@pytest.mark.parametrize("scale", [0.5, 2.0, (0.25, 0.5)])
+def test_a_rescaled_camera_sees_every_point_at_its_place_in_the_resized_image(
+    model: str, theta: float, scale: float | tuple[float, float]
+) -> None:
+    camera, points = camera_with(model, theta), some_points()
+    rescaled = camera.rescaled(scale)
+    expected = (camera.project(points)[0] + 0.5) * scale - 0.5
+    np.testing.assert_allclose(rescaled.project(points)[0], expected, rtol=1e-12, atol=1e-9)
+    assert rescaled.image_size == tuple(np.round(np.array(SIZE) * scale).astype(int).tolist())
+
+
+def test_resizing_an_image_moves_its_content_as_rescaled_says() -> None:
+    cv2 = pytest.importorskip("cv2")
+    u, v = np.meshgrid(np.arange(640), np.arange(480))
+    at = np.array([200.0, 150.0])
+    dot = np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * 6.0**2))
+    small = cv2.resize(dot, (160, 120), interpolation=cv2.INTER_AREA)
+    u, v = np.meshgrid(np.arange(160), np.arange(120))
+    found = np.array([(small * u).sum(), (small * v).sum()]) / small.sum()
+    camera = Camera(Intrinsics(500.0, 500.0, *at), image_size=SIZE).rescaled(0.25)
+    assert [camera.intrinsics.u0, camera.intrinsics.v0] == pytest.approx(found, abs=1e-6)
+
+
+@every_model
+@with_and_without_skew
+def test_a_cropped_camera_sees_every_point_moved(model: str, theta: float) -> None:
+    camera, points = camera_with(model, theta), some_points()
+    cropped = camera.cropped(40, 25, 320, 200)
+    np.testing.assert_allclose(cropped.project(points)[0], camera.project(points)[0] - [40, 25], atol=1e-9)
+    assert cropped.image_size == (320, 200)
+
+
+def test_wrong_sizes_and_scales_are_refused() -> None:
+    with pytest.raises(InputError, match="image_size must be two positive whole numbers"):
+        Camera(Intrinsics(500, 500, 0, 0), image_size=(0, 5))
+    for scale in (0.0, -1.0, float("nan")):
+        with pytest.raises(InputError, match="scale of an image must be positive"):
+            camera_with("k1").rescaled(scale)
+
+
+def test_a_camera_is_taken_in_any_form() -> None:
+    intrinsics = Intrinsics(500.0, 510.0, 320.0, 240.0)
+    camera = Camera(intrinsics, Distortion("k1", [-0.2]))
+    assert camera_of(camera) is camera
+    for given_as in (intrinsics, intrinsics.A, intrinsics.A.tolist()):
+        assert camera_of(given_as).intrinsics == intrinsics
+        assert camera_of(given_as).distortion.is_identity
+    with pytest.raises(UsageError, match="must be a Camera, a Calibration"):
+        camera_of("camera.yaml")  # type: ignore[arg-type]

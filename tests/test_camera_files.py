@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_calibration import made_calibration
+from support.made_calibration import made_calibration
+from support.real_data import RealFiles
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.calibration_yaml import write_calibration
 from neurocal_cli.io.camera_files import read_extrinsics, read_intrinsics
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 K = [[600.0, 0.5, 320.0], [0.0, 610.0, 240.0], [0.0, 0.0, 1.0]]
 FLAT = [x for row in K for x in row]
 
@@ -94,14 +93,17 @@ def refused(read, text):
 def test_an_opencv_yaml_file_is_read_by_any_of_its_usual_names(read, key, lens):
     camera = read(OPENCV_YAML.replace("KEY", key).replace("DIST", lens))
     assert np.allclose(camera.intrinsics.A, K, rtol=0, atol=1e-12)
-    assert (camera.distortion_model, camera.distortion.tolist()) == ("plumb_bob", [-0.1, 0.02, 0, 0, 0.003])
+    assert (camera.distortion.model, camera.distortion.coefficients.tolist()) == (
+        "plumb_bob",
+        [-0.1, 0.02, 0, 0, 0.003],
+    )
     assert camera.image_size == (640, 480)
 
 
 def test_an_opencv_xml_file_is_read(read):
     camera = read(OPENCV_XML)
     assert np.allclose(camera.intrinsics.A, K, rtol=0, atol=1e-12)
-    assert camera.distortion.tolist() == [-0.1, 0.02, 0, 0, 0]
+    assert camera.distortion.coefficients.tolist() == [-0.1, 0.02, 0, 0, 0]
     assert camera.image_size == (640, 480)
 
 
@@ -109,7 +111,11 @@ def test_an_opencv_json_file_is_read(read):
     tree = {"K": {"type_id": "opencv-matrix", "rows": 3, "cols": 3, "dt": "d", "data": FLAT}}
     camera = read(json.dumps(tree))
     assert np.allclose(camera.intrinsics.A, K, rtol=0, atol=1e-12)
-    assert (camera.distortion_model, len(camera.distortion), camera.image_size) == ("none", 0, None)
+    assert (camera.distortion.model, len(camera.distortion.coefficients), camera.image_size) == (
+        "none",
+        0,
+        None,
+    )
 
 
 def test_files_written_by_opencv_are_read(tmp_path):
@@ -124,21 +130,21 @@ def test_files_written_by_opencv_are_read(tmp_path):
         storage.release()
         camera = read_intrinsics(path)
         assert np.allclose(camera.intrinsics.A, K, rtol=0, atol=1e-12)
-        assert camera.distortion.tolist() == [-0.1, 0.02, 1e-5, 0.0, 1 / 3]
+        assert camera.distortion.coefficients.tolist() == [-0.1, 0.02, 1e-5, 0.0, 1 / 3]
         assert camera.image_size == (640, 480)
 
 
 def test_a_ros_file_is_read(read):
     camera = read(ROS)
     assert np.allclose(camera.intrinsics.A, K, rtol=0, atol=1e-12)
-    assert camera.camera_name == "narrow_stereo/left"
-    assert camera.distortion_model == "plumb_bob"
+    assert camera.name == "narrow_stereo/left"
+    assert camera.distortion.model == "plumb_bob"
 
 
 def test_matrices_may_be_nested_lists_and_numbers_may_lack_a_point(read):
     camera = read(f"K: {K}\nD: [-1e-01, 2e-02, 0, 0]\n")
     assert np.allclose(camera.intrinsics.A, K, rtol=0, atol=1e-12)
-    assert camera.distortion.tolist() == [-0.1, 0.02, 0, 0, 0]
+    assert camera.distortion.coefficients.tolist() == [-0.1, 0.02, 0, 0, 0]
 
 
 @pytest.mark.parametrize(
@@ -151,8 +157,8 @@ def test_matrices_may_be_nested_lists_and_numbers_may_lack_a_point(read):
 )
 def test_the_distortion_models_of_ros_get_our_names(read, model, data, ours):
     camera = read(f"K: {FLAT}\ndistortion_model: {model}\nD: {data}\n")
-    assert camera.distortion_model == ours
-    assert camera.distortion.tolist() == (data if ours != "none" else [])
+    assert camera.distortion.model == ours
+    assert camera.distortion.coefficients.tolist() == (data if ours != "none" else [])
 
 
 def test_a_neurocal_file_gives_its_camera_and_its_poses(tmp_path):
@@ -228,13 +234,20 @@ def test_a_damaged_file_is_read_or_refused_in_one_line(tmp_path_factory, text, s
     assert message.isprintable()
 
 
-@pytest.mark.skipif(not DATA.exists(), reason="the real data is not beside the project")
-def test_real_camera_files_are_read():
-    opencv = read_intrinsics(DATA / "opencv_stereo" / "left_intrinsics.yml")
+def test_real_camera_files_are_read(real_files: RealFiles) -> None:
+    (path,) = real_files("opencv_stereo/left_intrinsics.yml")
+    opencv = read_intrinsics(path)
     assert opencv.intrinsics.alpha_u == 535.91573396163199
-    assert opencv.distortion[4] == 0.23839153080878486
+    assert opencv.distortion.coefficients[4] == 0.23839153080878486
     assert opencv.image_size == (640, 480)
-    boofcv = read_intrinsics(DATA / "sony_chess" / "intrinsic.yaml")
+    (path,) = real_files("sony_chess/intrinsic.yaml")
+    boofcv = read_intrinsics(path)
     assert (boofcv.intrinsics.alpha_v, boofcv.intrinsics.u0) == (698.6537946928421, 308.4551818095542)
-    assert boofcv.distortion.tolist() == [-0.25559248570886445, 0.09997127476560613, 0.0, 0.0, 0.0]
+    assert boofcv.distortion.coefficients.tolist() == [
+        -0.25559248570886445,
+        0.09997127476560613,
+        0.0,
+        0.0,
+        0.0,
+    ]
     assert boofcv.image_size == (640, 480)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import run
+from support.command_line import run
 
 from neurocal_cli import Board, read_image, read_points
 from neurocal_cli.board import Plane
@@ -64,7 +64,7 @@ def write(path: Path, picture: np.ndarray) -> None:
 def test_points_of_all_images_go_to_a_file(folder: Path, tmp_path: Path) -> None:
     result = detect(folder, *BOARD, "-o", tmp_path / "p.csv")
     assert (result.exit_code, result.stdout) == (0, "")
-    assert result.stderr == "found the board in 3 of 3 images: 279 points, 0 rejected\n"
+    assert result.stderr == "board detected in 3 of 3 images: 279 points, 0 rejected\n"
     text = (tmp_path / "p.csv").read_text()
     head = "# image_size: 400 300\n# unit: mm\nview,point,X,Y,Z,u,v,suu,suv,svv,nu,nv\n"
     assert text.startswith(head + "board01,h:0:0,12.5,0.0,0.0,")
@@ -125,16 +125,16 @@ def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> N
         "d_empty.png": "is empty",
         "e_text.png": "is no image",
         "f_bomb.png": "60000 x 60000 px",
-        "g_tiny.png": "no board found",
-        "h_black.pgm": "no board found",
-        "i_white.bmp": "no board found",
+        "g_tiny.png": "no board detected",
+        "h_black.pgm": "no board detected",
+        "i_white.bmp": "no board detected",
         "absent.png": "no such file",
     }
     assert len(lines) == len(expected)
     for line, (name, words) in zip(lines, expected.items(), strict=True):
         assert line.startswith(f"{folder / name}: ")
         assert words in line
-    assert summary == "found the board in 3 of 11 images: 279 points, 0 rejected"
+    assert summary == "board detected in 3 of 11 images: 279 points, 0 rejected"
     assert {row.split(",")[0] for row in result.stdout.splitlines()[3:]} == {"board01", "board02", "board03"}
 
 
@@ -149,7 +149,7 @@ def test_the_decoders_are_not_heard(folder: Path) -> None:
     done = subprocess.run(words, capture_output=True, text=True, check=True)
     first, last = done.stderr.splitlines()
     assert first.startswith(f"{folder / 'a.jpg'}: is damaged")
-    assert last.startswith("found the board in 3 of 4 images")
+    assert last.startswith("board detected in 3 of 4 images")
 
 
 def test_no_board_in_any_image_is_exit_1_without_a_file(folder: Path, tmp_path: Path) -> None:
@@ -169,8 +169,8 @@ def test_no_board_in_any_image_is_exit_1_without_a_file(folder: Path, tmp_path: 
     assert (result.exit_code, result.stdout) == (1, "")
     *lines, last = result.stderr.splitlines()
     assert len(lines) == 3
-    assert all("found 9 x 6 inner vertices, the board has 6 x 4" in line for line in lines)
-    assert last == "Error: none of the 3 images shows the board; the reason stands above"
+    assert all("detected 9 x 6 inner vertices, but the board has 6 x 4" in line for line in lines)
+    assert last == "Error: none of the 3 images shows the board; see the reason above"
     assert not (tmp_path / "p.csv").exists()
     assert not (tmp_path / "o").exists()
 
@@ -194,7 +194,7 @@ def test_overlays_never_replace_the_images(folder: Path, tmp_path: Path) -> None
     before = (folder / "board01.png").read_bytes()
     result = detect(folder, *BOARD, "--overlay", folder)
     assert result.exit_code == 2
-    assert "holds the images themselves" in result.stderr
+    assert "is the folder of the images" in result.stderr
     assert (folder / "board01.png").read_bytes() == before
     (tmp_path / "file").write_text("x")
     assert detect(folder, *BOARD, "--overlay", tmp_path / "file").exit_code == 2
@@ -227,16 +227,14 @@ def test_planes_that_are_missing_and_rejected_points_are_noted(
     board = Board((Plane("a", 9, 6, 25.0), Plane("b", 4, 4, 25.0)))
     found = detect_points(read_image(folder / "board01.png").grey, Board.single(9, 6, 25.0))
     named = replace(found, located=(replace(found.located[0], plane=board.planes[0]),))
-    assert list(batch._remarks(named, board)) == [
-        "without b: not found, or not to be told from something else"
-    ]
+    assert list(batch._remarks(named, board)) == ["no points of b: not detected, or ambiguous"]
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ((), "the board is not described"),
-        (("--cols", 9, "--rows", 6), "the board is not described"),
+        ((), "the size of the board is missing"),
+        (("--cols", 9, "--rows", 6), "the size of the board is missing"),
         (("--board", "b.yaml", "--cols", 9), "leave out --cols"),
         (("--cols", 9, "--rows", 1, "--square", 25), "--rows"),
         (("--cols", 9, "--rows", 6, "--square", -1), "--square"),

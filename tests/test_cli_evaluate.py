@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import run
-from made_calibration import made_calibration, made_points, pose_of
+from support.command_line import run
+from support.made_calibration import made_calibration, made_points, pose_of
 
 from neurocal_cli import Correspondences, evaluate_camera, read_calibration, write_calibration, write_points
 
@@ -149,7 +149,7 @@ def test_a_camera_file_of_ros_is_judged_by_points_with_fitted_poses(tmp_path: Pa
     values = json.loads(result.stdout)
     assert values["fitted_views"] == ["view00", "view01"]
     assert values["rmse_px"] < 0.5
-    assert "note: only the intrinsic parameters and the lens are used" in result.stderr
+    assert "note: only the intrinsic parameters and the distortion are used" in result.stderr
     assert evaluate(ros).exit_code == 1
 
 

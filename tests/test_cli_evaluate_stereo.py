@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import run
-from rigs import RigScene, corner, random_rig
+from support.command_line import run
+from support.rigs import RigScene, corner, random_rig
 
 from neurocal_cli import Calibration, calibrate, read_calibration, write_calibration, write_points
 from neurocal_cli.io.rig_yaml import write_rig
@@ -130,7 +130,7 @@ def one_line_error(result: Result, *parts: str) -> None:
 
 
 def test_the_same_camera_twice_is_refused(cameras: tuple[Path, Path]) -> None:
-    one_line_error(evaluate(cameras[0], cameras[0]), "both cameras stand at one place")
+    one_line_error(evaluate(cameras[0], cameras[0]), "both cameras are at the same place")
 
 
 def test_swapped_files_are_refused_by_their_views_names(cameras: tuple[Path, Path]) -> None:
@@ -185,7 +185,7 @@ def test_opencvs_cameras_are_judged_by_points_with_fitted_poses(tmp_path: Path) 
         words.append(tmp_path / f"{side}.yaml")
     result = evaluate(*words, "--points", tmp_path / "0.csv", tmp_path / "1.csv", "--json")
     assert result.exit_code == 0, result.stderr
-    assert result.stderr.count("note: only the intrinsic parameters and the lens are used") == 2
+    assert result.stderr.count("note: only the intrinsic parameters and the distortion are used") == 2
     values = json.loads(result.stdout)
     assert values["rig"]["epipolar_px"] == pytest.approx(0.2, rel=0.2)
     assert values["baseline"] == pytest.approx(np.linalg.norm(made.rig.t), rel=0.01)

@@ -3,36 +3,21 @@
 from __future__ import annotations
 
 import inspect
+import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import click
 import pytest
-from command_line import run
+from support.command_line import commands, run
 
 import neurocal_cli
 from neurocal_cli.commands import neurocal
 from neurocal_cli.commands.man import man_pages
 
 MAN = Path(neurocal_cli.__file__).parents[1] / "man"
-
-
-def commands() -> Iterator[tuple[list[str], click.Command]]:
-    """Every command that a user sees, with the words that call it."""
-
-    def walk(words: list[str], command: click.Command) -> Iterator[tuple[list[str], click.Command]]:
-        yield words, command
-        if isinstance(command, click.Group):
-            context = click.Context(command)
-            for name in command.list_commands(context):
-                child = command.get_command(context, name)
-                if child is not None and not child.hidden:
-                    yield from walk([*words, name], child)
-
-    return walk([], neurocal)
 
 
 COMMANDS = [pytest.param(words, command, id=" ".join(["neurocal", *words])) for words, command in commands()]
@@ -55,7 +40,56 @@ def test_each_option_has_one_sentence_of_help(words: list[str], command: click.C
         if isinstance(option, click.Option):
             assert option.help, option.name
             assert option.help.endswith("."), option.name
-            assert option.is_flag or option.show_default or option.default is not None, option.name
+            assert option.show_default or option.default is not None, option.name
+
+
+def examples(command: click.Command) -> str:
+    """The examples of a command, as they are pasted into a shell."""
+    text = inspect.cleandoc(command.help or "").partition("\b\nExamples:\n")[2]
+    return "".join(f"{line.removeprefix('  ')}\n" for line in text.splitlines())
+
+
+@pytest.mark.parametrize(("words", "command"), COMMANDS)
+def test_each_option_is_in_an_example(words: list[str], command: click.Command) -> None:
+    shown = set(examples(command).split())
+    for option in command.params:
+        if isinstance(option, click.Option) and "--version" not in option.opts:
+            assert shown & set(option.opts), option.name
+
+
+def _slow(words: list[str]) -> bool:
+    """Whether the examples take minutes: those that fit a zoom lens, and both of the longest lists."""
+    return words[:1] in ([], ["lens"], ["stereo"])
+
+
+@pytest.mark.parametrize(
+    ("words", "command"),
+    [
+        pytest.param(*param.values, id=param.id, marks=[pytest.mark.slow] * _slow(param.values[0]))  # type: ignore[arg-type]
+        for param in COMMANDS
+    ],
+)
+def test_the_examples_work_on_the_sample_data(
+    words: list[str], command: click.Command, tmp_path: Path
+) -> None:
+    (tmp_path / "sample_data").symlink_to(MAN.parent / "sample_data")
+    tools = tmp_path / "bin"
+    tools.mkdir()
+    program = tools / "neurocal"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m neurocal_cli "$@"\n')
+    program.chmod(0o755)
+    path = f"{tools}{os.pathsep}{os.environ['PATH']}"
+    result = subprocess.run(
+        ["sh", "-e"],
+        input=examples(command),
+        cwd=tmp_path,
+        env=os.environ | {"PATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert "Error" not in result.stderr  # of a command that is not the last of its pipeline
 
 
 def test_summaries_of_the_group_are_those_of_the_commands() -> None:

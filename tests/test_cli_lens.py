@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import run
-from zoom_laws import FLOOR, between, grid, seen
+from support.command_line import run
+from support.zoom_laws import FLOOR, between, grid, seen
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration
@@ -195,7 +195,7 @@ def test_calibration_files_that_a_table_names_go_the_simple_path(folder: Path) -
         ("zoom,camera\n20,none.yml\n30,none.yml\n40,none.yml\n", "none.yml: there is no such file"),
         ("camera\nplain.yml\n", "no column zoom or focus"),
         ("zoom,camera\n20,plain.yml\n30,fisheye.yml\n40,plain.yml\n", "some cameras are fisheyes"),
-        ("zoom,camera\n20,plain.yml\n30,small.yml\n40,plain.yml\n", "image_size differs"),
+        ("zoom,camera\n20,plain.yml\n30,small.yml\n40,plain.yml\n", "differ in image_size"),
     ],
 )
 def test_lists_of_cameras_that_cannot_be_used_are_refused(tmp_path: Path, lines: str, message: str) -> None:

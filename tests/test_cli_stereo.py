@@ -10,15 +10,14 @@ import numpy as np
 import pytest
 import yaml
 from click.testing import Result
-from command_line import run
-from rigs import RigScene, random_rig
+from support.command_line import run
+from support.real_data import RealFiles
+from support.rigs import RigScene, random_rig
 
 from neurocal_cli import Board, Correspondences, calibrate, read_rig, write_calibration, write_points
 from neurocal_cli.board import Plane
 from neurocal_cli.io.board_yaml import write_board
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def scene(n_views: int = 5) -> RigScene:
@@ -56,8 +55,8 @@ def test_the_summary_says_what_was_found(files: tuple[Path, Path]) -> None:
     result = run("stereo", *files, "--no-skew")
     assert result.stdout.startswith("left:\n  camera_name: left\n")
     text = result.stderr
-    assert "rig: 4 views of both cameras, left 270 points in 5 views, right 216 points in 4 views" in text
-    assert "note: the left camera alone saw left02" in text
+    assert "rig: 4 pairs of views, left 270 points in 5 views, right 216 points in 4 views" in text
+    assert "note: only the left camera saw left02" in text
     for label in ("alpha_u [px]", "X_right = R X_left + t", "t_z [mm]", "baseline [mm]", "left03 / right03"):
         assert any(line.startswith(label) for line in text.splitlines()), label
     assert "converged" in text.splitlines()[-1]
@@ -116,11 +115,11 @@ def test_ros_files_come_beside_the_rig(files: tuple[Path, Path], tmp_path: Path)
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--type", "4"], "no rig to find"),
+        (["--type", "4"], "no rig to estimate"),
         (["--type", "3"], "--left-intrinsics and --right-intrinsics"),
-        (["--image-center", "1", "2"], "--image-center belongs to --type 2"),
+        (["--image-center", "1", "2"], "--image-center needs --type 2"),
         (["--alpha", "2"], "--alpha"),
-        (["--epochs", "5"], "--epochs belongs to --trainer backprop"),
+        (["--epochs", "5"], "--epochs needs --trainer backprop"),
         (["-o", "a", "--ros", "a", "b"], "same file"),
     ],
 )
@@ -151,14 +150,14 @@ def error(result: Result, *parts: str) -> None:
 
 def test_files_that_do_not_go_together_are_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
     error(run("stereo", *files[::-1]), "swapped", "give the left camera first")
-    error(run("stereo", files[0], files[0], "--no-skew"), "both cameras stand at one place")
+    error(run("stereo", files[0], files[0], "--no-skew"), "both cameras are at the same place")
     right = points()[1]
     write_points(replace(right, unit="cm"), tmp_path / "r.csv")
     error(run("stereo", files[0], tmp_path / "r.csv"), "is in mm", "in cm")
     write_points(replace(right, world=right.world / 10), tmp_path / "r.csv")
     error(run("stereo", files[0], tmp_path / "r.csv"), "in the same coordinates and unit")
     write_points(replace(right, view=[f"b{v}" for v in right.view]), tmp_path / "r.csv")
-    error(run("stereo", files[0], tmp_path / "r.csv"), "no view of the left camera has its pair")
+    error(run("stereo", files[0], tmp_path / "r.csv"), "no view of the left camera has a partner")
     (tmp_path / "r.csv").write_text("")
     error(run("stereo", files[0], tmp_path / "r.csv"), "is empty")
     error(run("stereo", files[0], tmp_path / "none.csv"), "there is no such file")
@@ -177,9 +176,10 @@ def test_a_flipped_pair_is_named_and_left_out_or_refused(files: tuple[Path, Path
     assert not (tmp_path / "rig").exists()
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the data is not beside the project")
 @pytest.mark.parametrize(("kind", "least"), [("vertices", 120), ("midpoints", 190)])
-def test_the_corner_rig_from_its_photographs(kind: str, least: int, tmp_path: Path) -> None:
+def test_the_corner_rig_from_its_photographs(
+    kind: str, least: int, tmp_path: Path, real_files: RealFiles
+) -> None:
     """The paper's section 5.2, from detection to reconstruction."""
     X, Y, Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
     planes = (
@@ -189,7 +189,7 @@ def test_the_corner_rig_from_its_photographs(kind: str, least: int, tmp_path: Pa
     )
     write_board(Board(planes), tmp_path / "board.yaml")
     for side in ("left", "right"):
-        image = DATA / "ortho3" / f"{side}_calib.jpg"
+        (image,) = real_files(f"ortho3/{side}_calib.jpg")
         words = ["--board", tmp_path / "board.yaml", "--points", kind, "-o", tmp_path / f"{side}.csv"]
         found = run("detect", image, *words)
         assert found.exit_code == 0, found.stderr
@@ -208,10 +208,11 @@ def test_the_corner_rig_from_its_photographs(kind: str, least: int, tmp_path: Pa
     assert values["nsce"] == pytest.approx(3.95, abs=0.2)
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="the data is not beside the project")
-def test_thirteen_real_pairs_are_fitted_better_than_opencv_fits_its_corners(tmp_path: Path) -> None:
+def test_thirteen_real_pairs_are_fitted_better_than_opencv_fits_its_corners(
+    tmp_path: Path, real_files: RealFiles
+) -> None:
     for side in ("left", "right"):
-        images = sorted((DATA / "opencv_stereo").glob(f"{side}??.jpg"))
+        images = real_files(f"opencv_stereo/{side}??.jpg")
         words = ["--cols", "9", "--rows", "6", "--square", "25", "-o", tmp_path / f"{side}.csv"]
         assert run("detect", *images, *words).exit_code == 0
     words = ["--no-skew", "--distortion", "plumb_bob", "--outliers", "keep", "-o", tmp_path / "rig.yaml"]

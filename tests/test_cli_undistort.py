@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from click.testing import Result
-from command_line import run
+from support.command_line import run
 
 from neurocal_cli import Correspondences, read_calibration, read_points, undistort_image, undistort_points
 from neurocal_cli.io.camera_files import read_intrinsics
@@ -132,7 +132,7 @@ def test_sixteen_bits_do_not_become_eight(camera: Path, tmp_path: Path) -> None:
     write(tmp_path / "in.png", np.zeros((300, 400), np.uint16))
     result = undistort(camera, tmp_path / "in.png", "-o", tmp_path / "out.jpg")
     assert result.exit_code == 1
-    assert "16 bits a pixel do not go into .jpg files; write .png" in result.stderr
+    assert "an image of 16 bits cannot be written to a .jpg file; use .png" in result.stderr
     assert not (tmp_path / "out.jpg").exists()
 
 
@@ -142,7 +142,7 @@ def test_images_that_cannot_be_corrected_are_a_line_each(camera: Path, images: P
     result = undistort(camera, images, "-o", tmp_path / "straight")
     assert result.exit_code == 0
     assert result.stderr.splitlines() == [
-        f"{images}/broken.png: is no image that can be read; give PNG, JPEG, TIFF, BMP, PGM or PPM",
+        f"{images}/broken.png: is not a readable image; give PNG, JPEG, TIFF, BMP, PGM or PPM",
         f"{images}/small.png: has 100 x 50 px, the camera's images have 400 x 300; give images as the camera "
         "took them",
         "undistorted 3 of 5 files",
@@ -156,7 +156,7 @@ def test_if_nothing_can_be_corrected_nothing_is_written(camera: Path, images: Pa
     result = undistort(camera, images, "-o", tmp_path / "straight", "--camera", tmp_path / "new.yaml")
     assert result.exit_code == 1
     assert result.stderr.splitlines()[-1] == (
-        "Error: none of the 3 files could be corrected; the reasons stand above"
+        "Error: none of the 3 files could be undistorted; see the reasons above"
     )
     assert not (tmp_path / "straight").exists()
     assert not (tmp_path / "new.yaml").exists()
@@ -166,7 +166,7 @@ def test_one_image_of_another_size_is_an_error(camera: Path, tmp_path: Path) -> 
     write(tmp_path / "small.png", np.zeros((50, 100), np.uint8))
     result = undistort(camera, tmp_path / "small.png", "-o", tmp_path / "out.png")
     assert result.exit_code == 1
-    assert result.stderr.startswith(f"Error: {tmp_path}/small.png: has 100 x 50 px, the camera's images")
+    assert result.stderr.startswith(f"Error: {tmp_path}/small.png: has 100 x 50 px, but the camera is for")
 
 
 def test_a_camera_without_a_size_takes_that_of_the_first_image(images: Path, tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_the_new_camera_is_that_of_the_corrected_images(camera: Path, images: Pa
     )
     assert result.exit_code == 0
     new = read_intrinsics(tmp_path / "n.yaml")
-    assert (new.distortion_model, new.image_size, new.camera_name) == ("none", SIZE, "left")
+    assert (new.distortion.model, new.image_size, new.name) == ("none", SIZE, "left")
     assert new.intrinsics.alpha_u < 480
     again = undistort(tmp_path / "n.yaml", tmp_path / "a.png", "-o", tmp_path / "b.png")
     assert again.exit_code == 0
@@ -254,7 +254,7 @@ def test_a_pixel_that_cannot_have_been_seen_is_named_by_its_line(points: Path, t
     camera = camera_file(tmp_path / "c.yaml", "plumb_bob", [-5.0, 0, 0, 0, 0])
     result = undistort(camera, points, "-o", tmp_path / "out.csv")
     assert result.exit_code == 1
-    assert result.stderr.startswith(f"Error: {points}:5: the lens cannot have seen anything at the pixel (")
+    assert result.stderr.startswith(f"Error: {points}:5: the distortion maps nothing to the pixel (")
     assert not (tmp_path / "out.csv").exists()
 
 
@@ -262,7 +262,7 @@ def test_points_of_another_size_are_refused(camera: Path, points: Path) -> None:
     points.write_text(points.read_text().replace("400 300", "640 480"))
     result = undistort(camera, points)
     assert result.exit_code == 1
-    assert "its image_size is 640 x 480 px, the camera's 400 x 300 px" in result.stderr
+    assert "the image_size is 640 x 480 px, but the camera is for 400 x 300 px" in result.stderr
 
 
 def test_columns_that_are_not_known_are_noted(camera: Path, tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_all_kinds_of_lenses_do(
 @pytest.mark.parametrize(
     ("words", "exit_code", "message"),
     [
-        (["CAMERA", "IMAGES"], 2, "several files need a folder to go to; give -o DIR"),
+        (["CAMERA", "IMAGES"], 2, "several files cannot go to standard output; give a folder, -o DIR"),
         (["CAMERA", "IMAGE", "-o", "IMAGE"], 2, "is an input and would be overwritten"),
         (["CAMERA", "IMAGES", "-o", "IMAGES"], 2, "is an input and would be overwritten"),
         (["CAMERA", "POINTS", "-o", "POINTS"], 2, "is an input and would be overwritten"),
@@ -315,7 +315,7 @@ def test_all_kinds_of_lenses_do(
         ),
         (["CAMERA", "POINTS", "-o", "x.csv", "--camera", "x.csv"], 2, "would both be written to x.csv"),
         (["CAMERA", "IMAGES", "-o", "POINTS"], 2, "is a file; give a folder"),
-        (["CAMERA", "IMAGE", "--alpha", "2", "-o", "x.png"], 2, "--alpha 2: must lie between 0 and 1"),
+        (["CAMERA", "IMAGE", "--alpha", "2", "-o", "x.png"], 2, "--alpha is 2; give a number from 0 to 1"),
         (["CAMERA", "IMAGE", "--alpha", "nan", "-o", "x.png"], 2, "alpha"),
         (["-", "-"], 2, "standard input (-) can be read only once"),
         (["CAMERA"], 2, "Missing argument"),

@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from scenes import Scene, pinhole, random_flat_set, random_solid, reference
+from support.scenes import Scene, pinhole, random_flat_set, random_solid, reference
 
 SIGMA = 0.3  # px
 # Scenes whose Cramer-Rao bound leaves the focal length open by more than this are drawn again:

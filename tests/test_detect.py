@@ -8,8 +8,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from rendered import Recipe, board_pose, condition, picture, single
-from seen_grids import labelled_vertices, seen_grid
+from support.rendered import Recipe, board_pose, condition, picture, single
+from support.seen_grids import labelled_vertices, seen_grid
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect
@@ -110,14 +110,14 @@ def test_edges_turn_with_their_grid(matrix: tuple, offset: tuple) -> None:
 
 def test_an_image_without_a_board_says_so() -> None:
     for value in (0, 255):
-        with pytest.raises(NoBoardError, match="no board found"):
+        with pytest.raises(NoBoardError, match="no board detected"):
             detect_points(np.full((100, 120), value, dtype=np.uint8), BOARD)
-    with pytest.raises(NoBoardError, match="no board found"):
+    with pytest.raises(NoBoardError, match="no board detected"):
         detect_points(np.zeros((8, 8), dtype=np.uint8), BOARD)
 
 
 def test_a_board_of_another_size_is_not_taken() -> None:
-    with pytest.raises(NoBoardError, match="found 9 x 6 inner vertices, the board has 6 x 4"):
+    with pytest.raises(NoBoardError, match="detected 9 x 6 inner vertices, but the board has 6 x 4"):
         detect_points(picture("base", 0).image, Board.single(6, 4, 28.0))
 
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_calibration import CAMERA, made_calibration, made_points, pose_of, two_planes
+from support.made_calibration import CAMERA, made_calibration, made_points, pose_of, two_planes
+from support.plain_projection import project
 
 from neurocal_cli import Correspondences, NeurocalError, evaluate_camera
-from neurocal_cli.camera.pinhole import project
 
 
 def test_error_is_that_of_projecting_each_point_alone() -> None:

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rendered import condition, picture
+from support.real_data import RealFiles
+from support.rendered import condition, picture
 
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.finding import levels as find_levels
@@ -22,7 +23,6 @@ from neurocal_cli.simulation.rendering import PlaneTruth, Rectangle, render, sce
 
 cv2 = pytest.importorskip("cv2")
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 FIRST = 500  # seeds that nothing was developed on
 
 WHOLE = (
@@ -271,40 +271,31 @@ def test_finding_is_deterministic() -> None:
     assert all(np.array_equal(a.pixels, b.pixels, equal_nan=True) for a, b in zip(first, second, strict=True))
 
 
-def real(pattern: str) -> list[Path]:
-    return sorted(DATA.glob(pattern))
-
-
 def shapes(path: Path) -> list[tuple[int, ...]]:
     """Shapes of the whole grids in a picture, the smaller number first."""
     grids = find_grids(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE))
     return [tuple(sorted(grid.shape)) for grid in grids if grid.seen.all()]
 
 
-@pytest.mark.skipif(not real("opencv_stereo/*.jpg"), reason="pictures not there")
-def test_all_boards_of_a_stereo_rig_are_found() -> None:
-    assert [path.name for path in real("opencv_stereo/*.jpg") if shapes(path)[:1] != [(6, 9)]] == []
+def test_all_boards_of_a_stereo_rig_are_found(real_files: RealFiles) -> None:
+    assert [path.name for path in real_files("opencv_stereo/*.jpg") if shapes(path)[:1] != [(6, 9)]] == []
 
 
-@pytest.mark.skipif(not real("sony_chess/*.jpg"), reason="pictures not there")
-def test_all_boards_on_a_table_are_found() -> None:
-    assert [path.name for path in real("sony_chess/*.jpg") if shapes(path) != [(4, 6)]] == []
+def test_all_boards_on_a_table_are_found(real_files: RealFiles) -> None:
+    assert [path.name for path in real_files("sony_chess/*.jpg") if shapes(path) != [(4, 6)]] == []
 
 
-@pytest.mark.skipif(not real("line_pattern/chessboard.jpg"), reason="picture not there")
-def test_a_board_of_900_vertices_is_found() -> None:
-    assert shapes(DATA / "line_pattern" / "chessboard.jpg") == [(25, 36)]
+def test_a_board_of_900_vertices_is_found(real_files: RealFiles) -> None:
+    assert shapes(real_files("line_pattern/chessboard.jpg")[0]) == [(25, 36)]
 
 
-@pytest.mark.skipif(not real("ortho3/*_calib.jpg"), reason="pictures not there")
-def test_three_walls_are_found_at_once() -> None:
-    for path in real("ortho3/*.jpg"):
+def test_three_walls_are_found_at_once(real_files: RealFiles) -> None:
+    for path in real_files("ortho3/*.jpg"):
         assert sorted(shapes(path)) == [(6, 7), (6, 8), (6, 8)]
 
 
-@pytest.mark.skipif(not real("zhang_planar/*.png"), reason="pictures not there")
-def test_separate_squares_are_no_board() -> None:
-    assert [path.name for path in real("zhang_planar/*.png") if shapes(path)] == []
+def test_separate_squares_are_no_board(real_files: RealFiles) -> None:
+    assert [path.name for path in real_files("zhang_planar/*.png") if shapes(path)] == []
 
 
 @pytest.mark.parametrize("seed", [FIRST, FIRST + 1])

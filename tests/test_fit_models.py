@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.maps import some_map
 
 from neurocal_cli.detection.fitting import edges as fit_edges
 from neurocal_cli.detection.fitting import vertices as fit_vertices
@@ -23,7 +24,7 @@ from neurocal_cli.detection.fitting.profile import (
     response_terms,
     tail_terms,
 )
-from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fitting.smooth_map import homography_start
 from neurocal_cli.detection.fitting.vertices import VertexData
 from neurocal_cli.geometry import Array
 
@@ -192,18 +193,6 @@ def test_blurred_oblique_cross_is_as_modelled(angle: float) -> None:
     shape = Shape(np.zeros((1, 2)), np.zeros(RESPONSE_TERMS))
     linear = fit_vertices.linearised(data, (zero, zero), values, shape)  # type: ignore[arg-type]
     np.testing.assert_allclose(linear.x[0], exact, atol=0.006)
-
-
-def some_map(degree: int = 4) -> SmoothMap:
-    rng = np.random.default_rng(4)
-    grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
-    frame = Frame.of(grid, (640, 480))
-    homography = np.array([0.4, 0.05, 0.02, -0.04, 0.3, -0.01, 0.1, -0.05])
-    now = SmoothMap(frame, np.concatenate([homography, np.zeros(6)])).shaped(3, degree)
-    values = now.parameters.copy()
-    values[8:14] = [0.02, -0.03, -0.2, 0.05, 0.02, -0.01]
-    values[14:] = rng.normal(0, 0.0005, len(values) - 14)
-    return replace(now, parameters=values)
 
 
 def test_map_has_the_derivatives_it_says() -> None:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_fit_models import some_map
+from support.maps import some_map
 
 from neurocal_cli.detection.fitting.forms import choose_map
 from neurocal_cli.detection.fitting.newton import BLUR, Fit, Linear, Part, Prior, gauss_newton, rows_for

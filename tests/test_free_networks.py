@@ -8,7 +8,7 @@ import pytest
 from neurocal_cli import calibrate, read_points
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
 from neurocal_cli.verdict.assessment import _AtMinimum
 
 FLAT = Path(__file__).resolve().parents[1] / "sample_data" / "flat.csv"
@@ -16,8 +16,8 @@ FLAT = Path(__file__).resolve().parents[1] / "sample_data" / "flat.csv"
 
 @pytest.mark.parametrize(("distortion", "within"), [("none", 1e-5), ("plumb_bob", 0.006)])
 def test_free_networks_are_at_the_minimum(distortion: str, within: float) -> None:
-    court = _AtMinimum(calibrate(read_points(FLAT), skew=False, distortion=distortion, outliers="keep"))
-    state, views = court.state, court.views
+    found = _AtMinimum(calibrate(read_points(FLAT), skew=False, distortion=distortion, outliers="keep"))
+    state, views = found.state, found.views
     own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.lens, state.k)
     free = np.arange(5 + len(state.k)) < 5
     minimum = adjust(views.batches, own, free, True, 1000).cost.sum()
@@ -26,10 +26,10 @@ def test_free_networks_are_at_the_minimum(distortion: str, within: float) -> Non
 
 def test_views_that_the_camera_fits_exactly_leave_nothing() -> None:
     points = read_points(FLAT)
-    court = _AtMinimum(calibrate(points, skew=False, distortion="none", outliers="keep"))
-    predicted, _ = court.seen.predict(points.world, points.view_index)
+    found = _AtMinimum(calibrate(points, skew=False, distortion="none", outliers="keep"))
+    predicted, _ = predicted_pixels(found.given, points.world, points.view_index)
     exact = type(points)(points.world, predicted, view=points.view, image_size=points.image_size)
-    court = _AtMinimum(calibrate(exact, skew=False, distortion="none", outliers="keep"))
-    left = free_networks(court.views, court.state)
+    found = _AtMinimum(calibrate(exact, skew=False, distortion="none", outliers="keep"))
+    left = free_networks(found.views, found.state)
     assert (left >= 0).all()
     assert left.sum() < 1e-20

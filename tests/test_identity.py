@@ -9,9 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from rendered import Recipe, board_pose, condition, folded, single
-from rendered import picture as rendered_picture
-from seen_grids import labelled_vertices, seen_grid, seen_grids, true_vertices, turned_by
+from support.rendered import Recipe, board_pose, condition, folded, single
+from support.rendered import picture as rendered_picture
+from support.seen_grids import labelled_vertices, seen_grid, seen_grids, true_vertices, turned_by
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import Grid
@@ -74,7 +74,7 @@ def test_a_part_of_the_board_is_placed_by_the_ends_that_are_seen_or_refused(name
         try:
             found = labelled_vertices(identify(scene.board, seen_grids(scene, seen), seen.image))
         except NoBoardError as error:
-            assert "nothing tells which" in str(error)  # noqa: PT017 - both are right, wrong points are not
+            assert "it is ambiguous which" in str(error)  # noqa: PT017 - both are right, wrong points are not
             continue
         placed += 1
         found = found if scene.targets[0].first_black else turned_by(found, 9, 6)
@@ -83,17 +83,19 @@ def test_a_part_of_the_board_is_placed_by_the_ends_that_are_seen_or_refused(name
 
 
 def test_a_part_that_could_be_anywhere_is_refused() -> None:
-    with pytest.raises(NoBoardError, match="found 5 x 4 of 9 x 6 inner vertices, and nothing tells which"):
+    with pytest.raises(
+        NoBoardError, match="detected 5 x 4 of 9 x 6 inner vertices, but it is ambiguous which"
+    ):
         identify(Board.single(9, 6, 25), [flat_grid(5, 4)], EMPTY)
 
 
 @pytest.mark.parametrize(
     ("cols", "rows", "words"),
     [
-        (6, 4, "found 9 x 6 inner vertices, the board has 6 x 4"),
-        (4, 6, "found 6 x 9 inner vertices, the board has 4 x 6"),
-        (9, 5, "found 9 x 6 inner vertices, the board has 9 x 5"),
-        (10, 6, "found 9 x 6 inner vertices, the board has 10 x 6"),
+        (6, 4, "detected 9 x 6 inner vertices, but the board has 6 x 4"),
+        (4, 6, "detected 6 x 9 inner vertices, but the board has 4 x 6"),
+        (9, 5, "detected 9 x 6 inner vertices, but the board has 9 x 5"),
+        (10, 6, "detected 9 x 6 inner vertices, but the board has 10 x 6"),
     ],
 )
 def test_a_board_of_another_size_is_named(cols: int, rows: int, words: str) -> None:
@@ -167,21 +169,21 @@ def test_small_pieces_of_large_boards_are_refused_at_once() -> None:
     pieces = [flat_grid(3, 3), Grid(flat_grid(4, 3).pixels + 200.0, 0)]
     for board in (Board.single(40, 30, 5.0), Board(sheets)):
         start = time.monotonic()
-        with pytest.raises(NoBoardError, match="nothing tells which"):
+        with pytest.raises(NoBoardError, match="it is ambiguous which"):
             identify(board, pieces, EMPTY)
         assert time.monotonic() - start < 5
 
 
 def test_a_piece_beside_a_bigger_board_is_not_taken_but_a_board_before_it_is() -> None:
     board, bigger = Board.single(9, 6, 25), flat_grid(12, 8)
-    with pytest.raises(NoBoardError, match="found 12 x 8 inner vertices, the board has 9 x 6"):
+    with pytest.raises(NoBoardError, match="detected 12 x 8 inner vertices, but the board has 9 x 6"):
         identify(board, [bigger, flat_grid(9, 6)], EMPTY)
     far = Grid(bigger.pixels * 0.5, 0)
     assert identify(board, [far, flat_grid(9, 6)], EMPTY).located[0].grid.shape == (9, 6)
 
 
 def test_no_grid_is_no_board() -> None:
-    with pytest.raises(NoBoardError, match="no board found"):
+    with pytest.raises(NoBoardError, match="no board detected"):
         identify(Board.single(9, 6, 25), [], EMPTY)
 
 
@@ -212,7 +214,7 @@ def test_planes_of_one_size_are_told_apart_by_their_places() -> None:
 
 def test_one_plane_of_several_does_not_tell_how_it_lies() -> None:
     scene, seen = condition("two planes", 0), picture("two planes", 0)
-    with pytest.raises(NoBoardError, match="only 1 of the 2 planes found"):
+    with pytest.raises(NoBoardError, match="only 1 of the 2 planes detected"):
         identify(scene.board, seen_grids(scene, seen)[:1], seen.image)
 
 

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
-from measured import errors, found, places, take
+from support.measured import errors, found, places, take
+from support.real_data import RealFiles
 
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Grid
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.simulation.rendering import edge_bound
-
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-PHOTOS = DATA / "opencv_stereo"
-LARGE = DATA / "line_pattern" / "chessboard.jpg"
 
 # Conditions in which the bound is to be met within a fifth, and those where a factor of two is allowed:
 # edges along the pixels, blur as wide as the squares, unknown responses, clipped light, hardly any pixels.
@@ -64,7 +60,7 @@ GOOD = (
 )
 
 
-@pytest.mark.parametrize("name", ["base", "tilt 65", "k1 -0.3"])
+@pytest.mark.parametrize("name", ["base", "tilt 65", pytest.param("k1 -0.3", marks=pytest.mark.slow)])
 def test_midpoints_reach_the_bound(name: str) -> None:
     found_errors = errors(name, range(2))
     assert found_errors.ratio < 1.2
@@ -225,23 +221,21 @@ def test_occluders_in_many_pictures() -> None:
     assert found_errors.hidden_kept <= 8
 
 
-@pytest.mark.skipif(not LARGE.is_file(), reason="needs the photograph")
-def test_edges_of_a_sharp_photograph_settle() -> None:
+def test_edges_of_a_sharp_photograph_settle(real_files: RealFiles) -> None:
     cv2 = pytest.importorskip("cv2")
     finding = pytest.importorskip("neurocal_cli.detection.finding.grids")
-    image = cv2.imread(str(LARGE), 0)
+    image = cv2.imread(str(real_files("line_pattern/chessboard.jpg")[0]), 0)
     measured = measure(image, finding.find_grids(image)[0])
     assert len(measured.kind) + measured.rejected == 1739  # of 36 x 25 vertices
     assert measured.rejected < 0.06 * 1739
 
 
-@pytest.mark.skipif(not PHOTOS.is_dir(), reason="needs the photographs")
 @pytest.mark.parametrize("points", ["midpoints", "vertices"])
-def test_photographs_calibrate_better_than_with_opencv_corners(points: str) -> None:
+def test_photographs_calibrate_better_than_with_opencv_corners(real_files: RealFiles, points: str) -> None:
     cv2 = pytest.importorskip("cv2")
     finding = pytest.importorskip("neurocal_cli.detection.finding.grids")
     places_3d, pixels = [], []
-    for path in sorted(PHOTOS.glob("left*.jpg")):
+    for path in real_files("opencv_stereo/left*.jpg"):
         image = cv2.imread(str(path), 0)
         grid = finding.find_grids(image)[0]
         measured = measure(image, grid, points)  # type: ignore[arg-type]

@@ -7,16 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid, table_1
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from test_uncertainty import noisy, whitener
+from support.noise import noisy, whitener
+from support.plain_projection import project
+from support.scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid, table_1
 
 from neurocal_cli import Correspondences, Intrinsics, Pose
 from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, project
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.geometry import Array
 
 CAMERA = Intrinsics(800.0, 820.0, 330.0, 250.0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes import Scene, pinhole, table_1
+from support.scenes import Scene, pinhole, table_1
 
 from neurocal_cli import Calibration
 from neurocal_cli.bundle_adjustment.covariance import covariance
@@ -63,7 +63,7 @@ def check(type: int, sigma: float, trials: int) -> None:
 
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
 def test_errors_are_at_the_cramer_rao_bound(type: int) -> None:
-    check(type, 1.0, 150)
+    check(type, 1.0, 60)
 
 
 @pytest.mark.slow
@@ -77,11 +77,11 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     scene = table_1()
     points = scene.points()
     views = arrange(points)
-    known = scene.known(points, 1)
+    problem = scene.problem(points, 1)
     normal, _ = normal_blocks(views.batches, scene.true_state(views))
     unknowns, n = UNKNOWNS[1], 2 * len(points)
     normal[0, -1, -1] = (1.0 / views.pixel_scale) ** 2 * (n - unknowns)
-    entries = covariance(normal, known.free, True, n).entries
+    entries = covariance(normal, problem.free, True, n).entries
     J = scene.intrinsics.entry_jacobian() * views.pixel_scale
     fisher = np.sqrt(np.diag(J @ entries @ J.T))
     assert bound(scene, 1)[:5] == pytest.approx(fisher, rel=1e-4)

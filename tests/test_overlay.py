@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from rendered import condition, picture
+from support.rendered import condition, picture
 
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured
 from neurocal_cli.detection.detect import Detection, detect_points

@@ -5,9 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
-from made_calibration import made_calibration
+from support.made_calibration import made_calibration
 
 from neurocal_cli import NeurocalError
 from neurocal_cli.calibration import Calibration
@@ -45,8 +46,8 @@ def test_missing_matplotlib_is_said_with_what_to_install(monkeypatch: pytest.Mon
 
 def test_drawing_leaves_the_state_of_pyplot_alone() -> None:
     code = (
-        "import sys; sys.path.insert(0, 'tests'); from made_calibration import made_calibration;"
+        "import sys; from support.made_calibration import made_calibration;"
         "from neurocal_cli.plots import draw_calibration; draw_calibration(made_calibration());"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, check=True)

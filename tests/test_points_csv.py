@@ -160,7 +160,7 @@ def test_a_constant_zoom_is_noted_and_a_varying_one_refused(read):
     assert "zoom is 35 throughout" in notes[0]
     message = complaint(read, "X,Y,Z,u,v,focus\n1,2,3,4,5,1\n2,2,3,4,5,2\n")
     assert message.startswith("a.csv:3: focus changes from 1 to 2")
-    assert "calibrate one setting at a time" in message
+    assert "give one setting" in message
     two_files = ("view,X,Y,Z,u,v,zoom\na,1,2,3,4,5,1\n", "view,X,Y,Z,u,v,zoom\nb,1,2,3,4,5,2\n")
     assert complaint(read, *two_files).startswith("b.csv:2: zoom changes")
 

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes import pinhole, table_1
+from support.scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
-from neurocal_cli.bundle_adjustment.problem import known_for
+from neurocal_cli.bundle_adjustment.problem import problem_for
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
-from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 
 SCENE = table_1()
@@ -20,7 +19,7 @@ NOTHING: dict[str, Any] = {"image_center": None, "intrinsics": None, "extrinsics
 
 
 def known(type: Any, points: Correspondences | None = None, **given: Any) -> Any:
-    return known_for(points or SCENE.points(), type, **(NOTHING | given))
+    return problem_for(points or SCENE.points(), type, **(NOTHING | given))
 
 
 @pytest.mark.parametrize(
@@ -51,9 +50,9 @@ def test_what_each_type_leaves_free(
         (0, {}, "type must be 1, 2, 3 or 4, not 0"),
         (5, {}, "not 5"),
         ("1", {}, "not '1'"),
-        (1, {"image_center": (1.0, 2.0)}, "image_center belongs to type 2.*give type=2"),
-        (1, {"intrinsics": CAMERA}, "intrinsics belongs to type 3"),
-        (2, {"extrinsics": {}}, "extrinsics belongs to type 4"),
+        (1, {"image_center": (1.0, 2.0)}, "image_center needs type 2.*give type=2"),
+        (1, {"intrinsics": CAMERA}, "intrinsics needs type 3"),
+        (2, {"extrinsics": {}}, "extrinsics needs type 4"),
         (3, {}, "type 3 needs the intrinsics"),
         (4, {}, "type 4 needs the extrinsics"),
     ],
@@ -121,12 +120,11 @@ def test_given_parameters_come_back_to_the_last_bit(type: int, skew: bool) -> No
 
 def test_given_entries_are_normalised_as_the_pixels_are() -> None:
     found = known(3, intrinsics=CAMERA)
-    views = arrange(SCENE.points())
-    entries = found.normalised_entries(views)
+    views, entries = found.views, found.normalised_entries
     A = np.eye(3)
     A[ENTRIES] = entries
     np.testing.assert_allclose(views.S1 @ A, CAMERA.A, rtol=1e-14, atol=1e-12)
-    np.testing.assert_array_equal(found.matrix(entries, views), CAMERA.A)
+    np.testing.assert_array_equal(found.matrix(entries), CAMERA.A)
 
 
 def test_a_matrix_will_do_for_intrinsics() -> None:

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import random_rig
-from test_stereo import sides
+from support.rigs import random_rig, sides
 
 from neurocal_cli import Pose, Rig
 from neurocal_cli.errors import InputError, UsageError

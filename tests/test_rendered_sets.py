@@ -6,15 +6,16 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from bent import coefficients
+from support.distorted import coefficients
 
 from neurocal_cli import Calibration, Correspondences, calibrate, detect_points
 from neurocal_cli.board import Board, Plane
-from neurocal_cli.camera.distortion_models import MODELS, Lens
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.detection.detect import Points, gather
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
-from neurocal_cli.simulation.rendering import Background, Camera, Scene, Sensor, Target, render
+from neurocal_cli.simulation.rendering import Background, Scene, Sensor, Target, render
 
 SIZE = (400, 300)
 TRUTH = Intrinsics(505.0, 503.0, 201.0, 148.0)
@@ -27,9 +28,9 @@ def camera(model: str, rng: np.random.Generator) -> Camera:
     """One that bends, but folds nothing back that it sees."""
     anywhere = Correspondences(np.zeros((1, 3)), np.array([[200.0, 150.0]]), image_size=SIZE)
     while True:
-        lens = tuple(coefficients(model, 0.5, rng))
-        if where_not_monotonic(Lens(model, lens), TRUTH.A, anywhere) is None:
-            return Camera(TRUTH, SIZE, lens)
+        distortion = Distortion(model, coefficients(model, 0.5, rng))
+        if where_not_monotonic(distortion, TRUTH.A, anywhere) is None:
+            return Camera(TRUTH, distortion, SIZE)
 
 
 def look(rng: np.random.Generator, view: int) -> Pose:

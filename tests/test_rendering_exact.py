@@ -7,16 +7,17 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from rendered import board_pose, condition
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
+from support.rendered import board_pose, condition
 
 from neurocal_cli.board import Plane
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import (
     Background,
-    Camera,
     Illumination,
     Scene,
     Sensor,
@@ -34,7 +35,7 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(5)
 
 def facing(square: float, roll: float, middle: tuple[float, float], psf: float, **changes: object) -> Scene:
     """A board parallel to the image, its squares with a side in px."""
-    camera = Camera(Intrinsics(500.0, 500.0, 81.3, 58.9), (160, 120))
+    camera = Camera(Intrinsics(500.0, 500.0, 81.3, 58.9), image_size=(160, 120))
     scene = Scene(camera, Pose(np.eye(3), np.ones(3)), (Target(PLANE),), psf=psf, sensor=EXACT)
     scene = replace(scene, **changes)  # type: ignore[arg-type]
     return replace(scene, pose=board_pose(scene, np.array(middle), square, 0.0, 0.0, roll))
@@ -47,7 +48,7 @@ def erf_model(scene: Scene, square: float, roll: float, middle: tuple[float, flo
     integrated by Gauss and Legendre's rule.
     """
     target, s = scene.targets[0], scene.psf / square
-    width, height = scene.camera.size
+    width, height = scene.size
     t = 0.5 * NODES
     u = np.arange(width)[:, None] + t - middle[0]
     v = (np.arange(height)[:, None] + t - middle[1])[:, :, None, None]
@@ -129,7 +130,7 @@ def straight_edge(distance: Array, normal: Array, psf: float) -> Array:
 @pytest.mark.parametrize("tilt", [30.0, 60.0, 72.0])
 def test_edges_of_a_tilted_board_are_straight_edges_between_its_vertices(tilt: float) -> None:
     scene = facing(34.0, 0.0, (80.0, 60.0), 0.8)
-    scene = replace(scene, camera=replace(scene.camera, size=(320, 240)), psf=0.8)
+    scene = replace(scene, camera=replace(scene.camera, image_size=(320, 240)), psf=0.8)
     scene = replace(scene, pose=board_pose(scene, np.array([160.2, 119.6]), 36.0, tilt, 0.7, 0.15))
     picture = noise_free(scene) / 65535
     truth, target = ground_truth(scene).planes[0], scene.targets[0]
@@ -156,7 +157,7 @@ def test_edges_of_a_tilted_board_are_straight_edges_between_its_vertices(tilt: f
 def undistorted(camera: Camera, pixels: Array) -> Array:
     """Normalised coordinates of pixels, by OpenCV's fixed point iteration."""
     ideal = np.linalg.solve(camera.intrinsics.A, np.column_stack([pixels, np.ones(len(pixels))]).T)[:2]
-    k1, k2, p1, p2, k3 = camera.distortion
+    k1, k2, p1, p2, k3 = camera.distortion.coefficients
     x, y = ideal
     for _ in range(14):
         r2 = x * x + y * y
@@ -191,7 +192,7 @@ def brute_force(scene: Scene, left: int, top: int, size: int, fine: int = 40) ->
         black &= (a > low_a) & (a < high_a) & (b > low_b) & (b < high_b)
         light[on] = np.where(black, target.black, target.white)[on]
         depth[on] = own[on]
-    shade, (width, height) = scene.illumination, scene.camera.size
+    shade, (width, height) = scene.illumination, scene.size
     gu, gv = shade.gradient
     slope = gu * (u - (width - 1) / 2) / width + gv * (v - (height - 1) / 2) / height
     samples = light.reshape(u.shape) * shade.level * (1 + slope)
@@ -201,9 +202,8 @@ def brute_force(scene: Scene, left: int, top: int, size: int, fine: int = 40) ->
 
 
 def skewed_and_distorted() -> Scene:
-    camera = Camera(
-        Intrinsics(300.0, 310.0, 158.0, 122.0, np.pi / 2 - 0.06), (320, 240), (-0.3, 0.1, 0.002, -0.003, 0.01)
-    )
+    intrinsics = Intrinsics(300.0, 310.0, 158.0, 122.0, np.pi / 2 - 0.06)
+    camera = Camera(intrinsics, Distortion("plumb_bob", [-0.3, 0.1, 0.002, -0.003, 0.01]), (320, 240))
     light = Illumination(0.8, (0.9, -0.7))
     scene = Scene(camera, Pose(np.eye(3), np.ones(3)), (Target(PLANE),), illumination=light, sensor=EXACT)
     return replace(scene, pose=board_pose(scene, np.array([110.0, 90.0]), 30.0, 45.0, 0.8, 0.3))
@@ -234,7 +234,7 @@ def test_folds_and_planes_before_one_another_agree_with_brute_force(name: str) -
         cv2.Rodrigues(scene.pose.R)[0],
         scene.pose.t,
         scene.camera.intrinsics.A,
-        np.array(scene.camera.distortion),
+        scene.camera.distortion.coefficients,
     )[0].ravel()
     left, top = int(u) - 5, int(v) - 5
     model = brute_force(scene, left, top, 11)

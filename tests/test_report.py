@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_calibration import made_calibration, pose_of
+from support.made_calibration import made_calibration, pose_of
 
 from neurocal_cli import Correspondences, evaluate_camera
 from neurocal_cli.report import align, calibration_report, evaluation_json, evaluation_report, rounded
@@ -68,14 +68,14 @@ def test_only_the_worst_of_many_views_are_listed() -> None:
     shown = [line.split()[0] for line in lines if line.startswith("view") and line.split()[0] != "view"]
     by_error = sorted(calibration.views, key=lambda name: -calibration.views[name].rmse_px)
     assert shown == by_error[:20]
-    assert "the worst 20 of 25 views; 5 more are better" in lines
+    assert "the 20 views with the largest error, of 25 views" in lines
 
 
 def test_the_report_tells_how_the_training_went() -> None:
     text = calibration_report(made_calibration())
     assert "2 of 3 random starts agreed, 33 iterations, loss 0.4300 px" in text
-    assert "0.4400 px after training, 0.4200 px after 4 more steps" in text
-    assert text.endswith("converged: the pixel error cannot be lowered further")
+    assert "0.4400 px before, 0.4200 px after 4 iterations" in text
+    assert text.endswith("converged: the reprojection error is at a minimum")
 
 
 def test_a_calibration_without_a_network_is_reported() -> None:
@@ -116,4 +116,4 @@ def test_names_cannot_break_the_table() -> None:
 
 def test_starts_of_several_views_are_told_apart() -> None:
     text = calibration_report(made_calibration(2))
-    assert "networks: 3 random starts for 2 views, at least 2 agreed in each, 33 iterations" in text
+    assert "networks: 3 random starts for 2 views, at least 2 agreed in each view, 33 iterations" in text

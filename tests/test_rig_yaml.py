@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from rigs import random_rig
+from support.rigs import random_rig
 
 from neurocal_cli import calibrate
 from neurocal_cli.errors import FormatError

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs import KINDS, RigScene, corner, random_rig
-from scenes import random_rotation
+from support.rigs import KINDS, RigScene, all_residuals, corner, random_rig, sides
+from support.scenes import random_rotation
 
-from neurocal_cli import Correspondences, Rig, calibrate
+from neurocal_cli import Rig, calibrate
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
@@ -19,11 +19,6 @@ from neurocal_cli.stereo.adjust import adjust_rig
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.problem import rig_problem
-
-
-def sides(scene: RigScene, sigma: float, seed: int = 1) -> tuple[Correspondences, Correspondences]:
-    rng = np.random.default_rng(seed)
-    return scene.points(0, sigma, rng), scene.points(1, sigma, rng)
 
 
 def flat(kind: str = "verging", n_views: int = 8, seed: int = 5, lens: str = "none") -> RigScene:
@@ -207,8 +202,6 @@ def test_errors_are_at_the_bound_over_two_hundred_rigs() -> None:
 
 def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     """At the truth, from the residuals' own finite differences."""
-    from test_stereo_pixel_error import all_residuals
-
     from neurocal_cli.stereo.reprojection import Columns
 
     scene = flat("wide", 4, 7)
@@ -249,7 +242,7 @@ def test_what_makes_no_sense_is_refused() -> None:
         calibrate_stereo(*points, type=3)
     with pytest.raises(InputError, match="same coordinates and unit"):
         calibrate_stereo(points[0], replace(points[1], world=points[1].world / 25.4))
-    with pytest.raises(DegenerateGeometryError, match="both cameras stand at one place"):
+    with pytest.raises(DegenerateGeometryError, match="both cameras are at the same place"):
         calibrate_stereo(points[0], points[0], skew=False)
 
 

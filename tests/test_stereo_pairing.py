@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import random_rig
+from support.rigs import random_rig
 
 from neurocal_cli import Correspondences
 from neurocal_cli.errors import InputError
@@ -47,7 +47,7 @@ def test_pairs_come_in_the_left_cameras_order() -> None:
 )
 def test_names_that_do_not_pair_are_refused_with_what_to_do(left: list[str], right: list[str]) -> None:
     with pytest.raises(
-        InputError, match=r"no view of the left camera has its pair.*give views taken together"
+        InputError, match=r"no view of the left camera has a partner.*give views taken together"
     ):
         pair_views(left, right)
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scenes import table_1
+from support.scenes import table_1
 
 from neurocal_cli import Calibration, calibrate
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rigs import KINDS, RigScene, random_rig
+from support.rigs import KINDS, RigScene, random_rig
 
 from neurocal_cli import Pose
-from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.triangulation import METHODS, Triangulated, epipolar_limit, triangulate
@@ -77,7 +77,7 @@ def test_the_point_is_the_minimum_of_the_pixel_error(lens: str, whitened: bool) 
     rng = np.random.default_rng(5)
     scene = random_rig(rng, "verging", 3, lens)
     if lens == "fisheye":
-        scene = replace(scene, lenses=(Lens("fisheye", np.array([0.02, -0.01, 0.0, 0.0])),) * 2)
+        scene = replace(scene, lenses=(Distortion("fisheye", np.array([0.02, -0.01, 0.0, 0.0])),) * 2)
     X, left, right = scattered(scene, 30, rng)
     left, right = left + rng.normal(size=left.shape), right + rng.normal(size=right.shape)
     factors = rng.uniform(0.5, 2, (2, 30, 3)) * [1, 0.4, 1]
@@ -153,7 +153,8 @@ def test_a_pixel_that_no_lens_could_have_seen_gives_no_point() -> None:
     from dataclasses import replace
 
     scene = replace(
-        random_rig(np.random.default_rng(3), "parallel", 3), lenses=(Lens("fisheye", np.zeros(4)), Lens())
+        random_rig(np.random.default_rng(3), "parallel", 3),
+        lenses=(Distortion("fisheye", np.zeros(4)), Distortion()),
     )
     found = through(scene, np.array([[5000.0, 0.0], [320, 240]]), np.array([[0.0, 0.0], [250, 240]]))
     assert found.behind[0]

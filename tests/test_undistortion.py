@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scenes import random_flat_set
-from test_lens import LENSES
-from test_lens_calibration import bent
+from support.distorted import LENSES, through
+from support.real_data import RealFiles
+from support.scenes import random_flat_set
 
 from neurocal_cli import Correspondences, calibrate, undistort_image, undistort_points
-from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.distortion.undistortion import new_camera, undistortion
+from neurocal_cli.distortion.undistortion import new_matrix, sources, undistort_pixels, undistorted_camera
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
@@ -25,23 +25,9 @@ SIZE = (640, 480)
 BENDING = [model for model in LENSES if model != "none"]
 
 
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """A camera as a file states it."""
-
-    intrinsics: Intrinsics
-    distortion_model: str = "none"
-    distortion: Array = field(default_factory=lambda: np.zeros(0))
-    image_size: tuple[int, int] | None = SIZE
-
-    @property
-    def K(self) -> Array:
-        return self.intrinsics.A
-
-
 def camera(model: str, skew: bool = False, f: float = 640.0) -> Camera:
     theta = 1.57 if skew else np.pi / 2
-    return Camera(Intrinsics(f, 1.02 * f, 310.0, 250.0, theta), model, np.array(LENSES[model]))
+    return Camera(Intrinsics(f, 1.02 * f, 310.0, 250.0, theta), Distortion(model, LENSES[model]), SIZE)
 
 
 def inside(n: int = 300) -> Array:
@@ -50,13 +36,15 @@ def inside(n: int = 300) -> Array:
 
 def by_opencv(seen: Array, cam: Camera, new: Array) -> Array:
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-15)
-    if cam.distortion_model == "fisheye":
-        out = cv2.fisheye.undistortPoints(seen[:, None], cam.K, cam.distortion, P=new, criteria=criteria)
+    if cam.distortion.model == "fisheye":
+        out = cv2.fisheye.undistortPoints(
+            seen[:, None], cam.A, cam.distortion.coefficients, P=new, criteria=criteria
+        )
     else:
         k = np.zeros(8)
-        k[: len(cam.distortion)] = cam.distortion
+        k[: len(cam.distortion.coefficients)] = cam.distortion.coefficients
         precise = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4, OpenCV 5
-        out = precise(seen[:, None], cam.K, k, R=np.eye(3), P=new, criteria=criteria)
+        out = precise(seen[:, None], cam.A, k, R=np.eye(3), P=new, criteria=criteria)
     return out.reshape(-1, 2)  # (N, 1, 2) of OpenCV 4, (N, 2) of some functions of OpenCV 5
 
 
@@ -68,29 +56,29 @@ def test_points_are_those_of_opencv(model: str) -> None:
     cam = camera(model)
     seen = inside()
     points = Correspondences(np.zeros((len(seen), 3)), seen, image_size=SIZE)
-    assert undistort_points(points, cam).pixels == pytest.approx(by_opencv(seen, cam, cam.K), abs=1e-9)
+    assert undistort_points(points, cam).pixels == pytest.approx(by_opencv(seen, cam, cam.A), abs=1e-9)
 
 
 @pytest.mark.parametrize("model", BENDING)
 @pytest.mark.parametrize("skew", [True, False])
 def test_points_go_there_and_back(model: str, skew: bool) -> None:
-    step = undistortion(camera(model, skew))
-    seen = inside()
-    corrected = step.points(seen)
+    cam = camera(model, skew)
+    new, seen = undistorted_camera(cam), inside()
+    corrected = undistort_pixels(cam, new, seen)
     assert np.abs(corrected - seen).max() > 3
-    assert np.column_stack(step.sources(*corrected.T)) == pytest.approx(seen, abs=1e-9)
+    assert np.column_stack(sources(cam, new, *corrected.T)) == pytest.approx(seen, abs=1e-9)
 
 
 def test_without_a_lens_points_stay() -> None:
-    seen = inside()
-    assert undistortion(camera("none", True)).points(seen) == pytest.approx(seen, abs=1e-12)
+    seen, cam = inside(), camera("none", True)
+    assert undistort_pixels(cam, undistorted_camera(cam), seen) == pytest.approx(seen, abs=1e-12)
 
 
 @pytest.mark.parametrize("skew", [True, False])
 @pytest.mark.parametrize("model", ["k1k2", "plumb_bob", "fisheye"])
 def test_corrected_points_give_the_same_camera_without_distortion(model: str, skew: bool) -> None:
     flat = random_flat_set(np.random.default_rng(7), 12, skew, cols=11, rows=8, f=900, width=1000)
-    points = Correspondences(flat.world, bent(flat, model, LENSES[model]), flat.view, flat.image_size)
+    points = through(flat, model, LENSES[model]).points()
     cam = Camera(flat.intrinsics, model, np.array(LENSES[model]), flat.image_size)
     found = calibrate(undistort_points(points, cam), distortion="none")
     assert found.intrinsics.values() == pytest.approx(flat.intrinsics.values(), rel=1e-6)
@@ -99,35 +87,39 @@ def test_corrected_points_give_the_same_camera_without_distortion(model: str, sk
 
 def test_a_zoomed_camera_is_that_of_the_corrected_points() -> None:
     flat = random_flat_set(np.random.default_rng(7), 8, False, cols=11, rows=8, f=900, width=1000)
-    points = Correspondences(flat.world, bent(flat, "k1k2", LENSES["k1k2"]), flat.view, flat.image_size)
+    points = through(flat, "k1k2", LENSES["k1k2"]).points()
     cam = Camera(flat.intrinsics, "k1k2", np.array(LENSES["k1k2"]), flat.image_size)
     found = calibrate(undistort_points(points, cam, alpha=0.0), distortion="none")
-    assert (
-        pytest.approx(undistortion(cam, 0.0, flat.image_size).new.A, rel=1e-6, abs=1e-8) == found.intrinsics.A
-    )
+    assert pytest.approx(undistorted_camera(cam, 0.0).A, rel=1e-6, abs=1e-8) == found.intrinsics.A
 
 
 @pytest.mark.parametrize("model", BENDING)
 def test_covariances_are_those_of_many_points(model: str) -> None:
-    step = undistortion(camera(model, True), 0.3, SIZE)
+    cam = camera(model, True)
     seen = np.array([[600.0, 30.0]])
     C = np.array([[0.04, 0.01, 0.02]])
     square = C[0, [0, 1, 1, 2]].reshape(2, 2)
-    cloud = step.points(seen + np.random.default_rng(0).multivariate_normal([0, 0], square, 20000))
-    expected = np.cov(cloud.T)[[0, 0, 1], [0, 1, 1]]
-    assert step.covariance(step.points(seen), C)[0] == pytest.approx(expected, abs=0.04 * expected[0])
+    cloud = seen + np.random.default_rng(0).multivariate_normal([0, 0], square, 20000)
+    expected = np.cov(undistort_pixels(cam, undistorted_camera(cam, 0.3), cloud).T)[[0, 0, 1], [0, 1, 1]]
+    points = Correspondences(np.zeros((1, 3)), seen, image_size=SIZE, covariance=C)
+    found = undistort_points(points, cam, 0.3).covariance
+    assert found is not None
+    assert found[0] == pytest.approx(expected, abs=0.04 * expected[0])
 
 
 @pytest.mark.parametrize("model", BENDING)
 def test_a_direction_of_measurement_stays_across_the_edge(model: str) -> None:
-    step = undistortion(camera(model, True), 0.3, SIZE)
-    seen, edge = np.array([[600.0, 30.0]]), np.array([0.6, 0.8])
-    ends = step.points(seen + 0.01 * np.outer([-1, 1], edge))
-    turned = step.across(step.points(seen), 7.0 * np.array([[-0.8, 0.6]]))
+    cam = camera(model, True)
+    seen, edge = np.array([600.0, 30.0]), np.array([0.6, 0.8])
+    ends = undistort_pixels(cam, undistorted_camera(cam, 0.3), seen + 0.01 * np.outer([-1, 1], edge))
+    across = np.array([[-5.6, 4.2], [0.0, 0.0]])
+    points = Correspondences(np.zeros((2, 3)), np.array([seen, seen]), image_size=SIZE, across=across)
+    turned = undistort_points(points, cam, 0.3).across
+    assert turned is not None
     along = ends[1] - ends[0]
     assert np.hypot(*turned[0]) == pytest.approx(1)
     assert turned[0] @ along == pytest.approx(0, abs=1e-5 * np.hypot(*along))
-    assert step.across(step.points(seen), np.zeros((1, 2))).tolist() == [[0, 0]]
+    assert turned[1].tolist() == [0, 0]
 
 
 def test_what_belongs_to_points_is_carried_over() -> None:
@@ -151,7 +143,9 @@ def test_what_belongs_to_points_is_carried_over() -> None:
     assert done.covariance is not None
     assert not np.allclose(done.covariance, points.covariance)
     assert done.across is not None
-    assert done.image_center == pytest.approx(undistortion(cam).points(np.array([[300.0, 260.0]]))[0])
+    assert done.image_center == pytest.approx(
+        undistort_pixels(cam, undistorted_camera(cam), np.array([[300.0, 260.0]]))[0]
+    )
 
 
 def test_a_pixel_that_the_lens_cannot_have_seen_is_named() -> None:
@@ -161,7 +155,7 @@ def test_a_pixel_that_the_lens_cannot_have_seen_is_named() -> None:
     with pytest.raises(
         InputError, match=r"^p.csv:3: the lens cannot have seen anything at the pixel \(630, 470\)"
     ):
-        undistort_points(points, Camera(Intrinsics(300, 300, 320, 240), "k1", np.array([-0.3])))
+        undistort_points(points, Camera(Intrinsics(300, 300, 320, 240), Distortion("k1", [-0.3])))
 
 
 # The new camera
@@ -173,9 +167,9 @@ def test_the_new_camera_is_opencv_s_nearly(model: str, alpha: float) -> None:
     """OpenCV looks at nine pixels along each side."""
     cam = camera(model)
     k = np.zeros(5)
-    k[: len(cam.distortion)] = cam.distortion
-    theirs, _ = cv2.getOptimalNewCameraMatrix(cam.K, k, SIZE, alpha)
-    assert pytest.approx(np.asarray(theirs), abs=2.0) == undistortion(cam, alpha, SIZE).new.A
+    k[: len(cam.distortion.coefficients)] = cam.distortion.coefficients
+    theirs, _ = cv2.getOptimalNewCameraMatrix(cam.A, k, SIZE, alpha)
+    assert pytest.approx(np.asarray(theirs), abs=2.0) == undistorted_camera(cam, alpha).A
 
 
 @pytest.mark.parametrize("model", BENDING)
@@ -183,30 +177,31 @@ def test_the_new_camera_is_opencv_s_nearly(model: str, alpha: float) -> None:
 def test_alpha_0_shows_only_seen_pixels_and_alpha_1_all_of_them(model: str, skew: bool) -> None:
     cam = camera(model, skew)
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
-    su, sv = undistortion(cam, 0.0, SIZE).sources(u, v)
+    su, sv = sources(cam, undistorted_camera(cam, 0.0), u, v)
     assert su.min() > -0.02
     assert sv.min() > -0.02
     assert su.max() < 639.02
     assert sv.max() < 479.02
-    shown = undistortion(cam, 1.0, SIZE).points(np.column_stack([u.ravel(), v.ravel()]))
+    new = undistorted_camera(cam, 1.0)
+    shown = undistort_pixels(cam, new, np.column_stack([u.ravel(), v.ravel()]))
     assert shown.min() > -0.02
     assert (shown.max(axis=0) < [639.02, 479.02]).all()
-    assert undistortion(cam, 1.0, SIZE).new.skewed is False
+    assert new.intrinsics.skewed is False
 
 
 def test_a_lens_that_sees_to_the_side_shows_at_most_79_degrees() -> None:
     """Half of the circle of a fisheye lies behind any plane."""
-    new = new_camera(np.array([[200.0, 0, 320], [0, 200, 240], [0, 0, 1]]), Lens("fisheye"), SIZE, 1.0)
+    new = new_matrix(Camera(Intrinsics(200, 200, 320, 240), Distortion("fisheye")), SIZE, 1.0)
     assert new.alpha_u == pytest.approx(639 / 10.0, rel=0.01)
 
 
 def test_alpha_needs_a_size_and_a_sensible_lens() -> None:
     with pytest.raises(InputError, match="size of the images"):
-        undistortion(replace(camera("k1"), image_size=None), 0.5, None)
+        undistorted_camera(replace(camera("k1"), image_size=None), 0.5)
     with pytest.raises(InputError, match="between 0 and 1"):
-        undistortion(camera("k1"), 2.0, SIZE)
+        undistorted_camera(camera("k1"), 2.0)
     with pytest.raises(InputError, match="leaves no rectangle"):
-        undistortion(Camera(Intrinsics(100, 100, 9000, 240), "k1", np.array([-0.3])), 0.0, SIZE)
+        undistorted_camera(Camera(Intrinsics(100, 100, 9000, 240), Distortion("k1", [-0.3]), SIZE), 0.0)
 
 
 # Images
@@ -221,7 +216,7 @@ def smooth(dtype: type = np.uint8, channels: int = 0) -> np.ndarray:
 
 def full(cam: Camera) -> Array:
     k = np.zeros(8)
-    k[: len(cam.distortion)] = cam.distortion
+    k[: len(cam.distortion.coefficients)] = cam.distortion.coefficients
     return k
 
 
@@ -229,9 +224,9 @@ def full(cam: Camera) -> Array:
 def test_images_are_those_of_opencv(model: str) -> None:
     cam, image = camera(model), smooth()
     if model == "fisheye":
-        theirs = cv2.fisheye.undistortImage(image, cam.K, cam.distortion, Knew=cam.K)
+        theirs = cv2.fisheye.undistortImage(image, cam.A, cam.distortion.coefficients, Knew=cam.A)
     else:
-        theirs = cv2.undistort(image, cam.K, full(cam))
+        theirs = cv2.undistort(image, cam.A, full(cam))
     ours = undistort_image(image, cam, interpolation="linear").astype(int)
     # Up to the 1/32 px to which remap rounds, and the border where one of them is black.
     assert np.abs(ours - theirs)[30:-30, 30:-30].max() <= 3
@@ -260,40 +255,39 @@ def test_an_image_and_its_points_agree() -> None:
     """A dot is found where its pixel is corrected to."""
     cam = camera("plumb_bob", True)
     for alpha in (None, 0.0, 1.0):
-        step = undistortion(cam, alpha, SIZE)
+        new = undistorted_camera(cam, alpha)
         for u, v in ((100.0, 90.0), (500.0, 330.0), (320.0, 200.0)):
             x, y = np.meshgrid(np.arange(640), np.arange(480))
             dot = 255 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * 4.0**2))
             done = undistort_image(dot.astype(np.uint8), cam, alpha).astype(float)
             centre = np.array([(done * x).sum(), (done * y).sum()]) / done.sum()
-            assert centre == pytest.approx(step.points(np.array([[u, v]]))[0], abs=0.15)
+            assert centre == pytest.approx(undistort_pixels(cam, new, np.array([[u, v]]))[0], abs=0.15)
 
 
 def test_nothing_is_mirrored_beyond_the_fold() -> None:
     """A strong barrel: without care a ring of false picture surrounds the true one."""
-    cam = Camera(Intrinsics(250, 250, 320, 240), "k1", np.array([-0.25]))
+    cam = Camera(Intrinsics(250, 250, 320, 240), Distortion("k1", [-0.25]), SIZE)
     white = np.full((480, 640), 255, np.uint8)
     zoomed_out = Camera(Intrinsics(60, 60, 320, 240))
-    step = replace(undistortion(cam), new=zoomed_out.intrinsics)
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
-    su, _ = step.sources(u, v)
+    su, _ = sources(cam, zoomed_out, u, v)
     radius = np.hypot(u - 320, v - 240) / 60
     fold = 1 / np.sqrt(0.75)
     assert np.isfinite(su[radius < fold - 0.01]).all()
     assert np.isnan(su[radius > fold + 0.01]).all()
-    naive = cv2.undistort(white, cam.K, np.array([-0.25, 0, 0, 0]), newCameraMatrix=zoomed_out.K)
+    naive = cv2.undistort(white, cam.A, np.array([-0.25, 0, 0, 0]), newCameraMatrix=zoomed_out.A)
     assert naive[radius > 1.5].any()  # what others show there
     from neurocal_cli.distortion.remapping import Remapping
 
-    done = Remapping(step, SIZE)(white)
+    done = Remapping(cam, zoomed_out, SIZE)(white)
     assert done[radius < fold - 0.05].min() == 255
     assert not done[radius > fold + 0.05].any()
 
 
 def test_large_images_are_done_in_parts() -> None:
-    cam = Camera(Intrinsics(1500, 1500, 1000, 800), "k1k2", np.array([-0.2, 0.1]), (2000, 1600))
+    cam = Camera(Intrinsics(1500, 1500, 1000, 800), Distortion("k1k2", [-0.2, 0.1]), (2000, 1600))
     image = np.random.default_rng(0).integers(0, 255, (1600, 2000), dtype=np.uint8)
-    theirs = cv2.undistort(image, cam.K, full(cam))
+    theirs = cv2.undistort(image, cam.A, full(cam))
     close = np.abs(undistort_image(image, cam, interpolation="linear").astype(int) - theirs)
     assert np.mean(close <= 9) > 0.99
 
@@ -316,7 +310,8 @@ def test_any_lens_gives_a_picture_or_a_reason(seed: int) -> None:
     rng = np.random.default_rng(seed)
     model = str(rng.choice(BENDING))
     k = rng.normal(size=len(LENSES[model])) * 0.3
-    cam = Camera(Intrinsics(rng.uniform(20, 500), 60, 30, 20, rng.uniform(1.4, 1.7)), model, k, (64, 48))
+    intrinsics = Intrinsics(rng.uniform(20, 500), 60, 30, 20, rng.uniform(1.4, 1.7))
+    cam = Camera(intrinsics, Distortion(model, k), (64, 48))
     image = rng.integers(0, 255, (48, 64), dtype=np.uint8)
     try:
         done = undistort_image(image, cam, [None, 0.0, 0.5, 1.0][rng.integers(4)])
@@ -328,18 +323,16 @@ def test_any_lens_gives_a_picture_or_a_reason(seed: int) -> None:
 # Photographs
 
 
-def test_a_photograph_has_straight_edges_afterwards() -> None:
+def test_a_photograph_has_straight_edges_afterwards(real_files: RealFiles) -> None:
     from neurocal_cli import Board, detect_points, read_image
 
-    path = Path(__file__).resolve().parents[2] / "shared" / "data" / "opencv_stereo"
-    if not path.is_dir():
-        pytest.skip("the photographs are not beside the project")
+    (path,) = real_files("opencv_stereo/left02.jpg")
     cam = Camera(
         Intrinsics(533.93, 533.89, 342.6, 233.37),
-        "plumb_bob",
-        np.array([-0.256, -0.150, 0.00117, -0.0002, 0.543]),
+        Distortion("plumb_bob", [-0.256, -0.150, 0.00117, -0.0002, 0.543]),
+        SIZE,
     )
-    image = read_image(str(path / "left02.jpg")).grey
+    image = read_image(str(path)).grey
     rms = []
     for picture in (image, undistort_image(image, cam)):
         found = detect_points(picture, Board.single(9, 6, 25.0))

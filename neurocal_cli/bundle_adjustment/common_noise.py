@@ -1,19 +1,19 @@
 """What the points' stated covariances leave out: errors that are alike for all points.
 
 A detector knows how sharply it sees each point, not how far the target's squares or the camera's model
-are off. Where that is the larger error, weighing points by the stated covariances C alone gives the
-sharpest few all the say. So the noise is taken for
+are off. Where that is the larger error, weighing points by the stated covariances C alone lets the sharpest
+few points decide everything. So the noise is taken for
 
     k ((1 - m) C + m c I),   c the mean variance of C,
 
 k being the residuals' level. As long as they do not contradict it, m is 0; otherwise it is the largest
-share that they do not contradict: too much say for a few points costs more than too little. Where C says
+share that they do not contradict: too much weight for a few points costs more than too little. Where C says
 nothing of the residuals, m is 1 and all points count the same.
 
 Covariances that are round for every point (a column ``sigma``) are weights that somebody chose: they are
 taken as they are.
 
-Of points measured across edges (`directions`) C and the residuals count there. Their covariances are
+Of points measured across edges (`measured_directions`) C and the residuals count there. Their covariances are
 those of the measurement and of the board's unevenness. Where k is 4 and more, most of the residuals is
 of a target or a lens that are not as modelled, which shows along the edges as much as across: all points
 then count the same in both directions, and up to k = 2 as they were measured.
@@ -36,6 +36,9 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Noise", "common_share", "measured", "noise_of", "with_common_share"]
 
+# Repeated by tests/test_noise.py and tests/test_directions.py: with these, true covariances lower the
+# errors of the camera and wrong ones do no harm; boards that are not flat have levels of 4 and more,
+# rendered ones of about 1.
 _MOST_POINTS = 20000  # enough to tell a share to a percent
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _STEPS = 12  # of golden section and of bisection

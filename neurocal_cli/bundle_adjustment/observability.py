@@ -6,14 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.covariance import Covariance
-from neurocal_cli.bundle_adjustment.problem import Known
+from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["check_determined", "check_points", "parameter_count", "refuse_undetermined"]
+__all__ = ["check_points", "refuse_undetermined"]
 
+# Repeated by tests/test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal
+# matrix.
 _COLLINEAR = 1e-6  # second extent as a share of the first
 _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which rounding rules
 # Std of a focal length over its value. Parallel boards under noise fit best with tilts of about one
@@ -23,12 +25,7 @@ _MEANINGLESS = 0.5
 _NEARLY_PARALLEL = 5.0  # degrees
 
 
-def parameter_count(known: Known, n_views: int) -> int:
-    """Number of unknowns."""
-    return int(known.free_camera.sum()) + (6 * n_views if known.free_poses else 0)
-
-
-def check_points(views: Views, known: Known) -> None:
+def check_points(problem: Problem) -> None:
     """Refuse points that cannot do, each with its reason.
 
     Raises
@@ -36,18 +33,19 @@ def check_points(views: Views, known: Known) -> None:
     DegenerateGeometryError
         Points on one line or too few, a single plane, too few views.
     """
-    if known.free_poses:
+    views = problem.views
+    if problem.free_poses:
         _check_each_view(views)
-    if known.type in (1, 2):
-        _check_planes(views, known)
-        _check_helpers(views, known)
-    unknowns, equations = parameter_count(known, views.n_views), views.n_distinct_equations
+    if problem.type in (1, 2):
+        _check_planes(problem)
+        _check_views_with_few_points(problem)
+    unknowns, equations = problem.n_parameters, views.n_distinct_equations
     if equations <= unknowns:
         of_point = 2 if views.across is None else 1
         raise DegenerateGeometryError(
             f"{views.distinct.sum()} different points give {equations:.0f} equations for {unknowns} "
             f"unknowns; give at least {unknowns // of_point + 1} points"
-            + (f", or more of the camera ({_givable(known)})" if known.type == 1 else "")
+            + (f", or known parameters ({_givable(problem)})" if problem.type == 1 else "")
         )
 
 
@@ -76,50 +74,50 @@ def _on_one_line(views: Views) -> NDArray[np.bool_]:
     return np.asarray(total - np.hypot(suu - svv, 2 * suv) <= 2 * _COLLINEAR**2 * total)
 
 
-def _check_planes(views: Views, known: Known) -> None:
+def _check_planes(problem: Problem) -> None:
     """Each flat view gives two conditions on the intrinsics, a solid one all five."""
-    free = int(known.free.sum())
-    flat = views.exactly_flat
+    free = int(problem.free.sum())
+    flat = problem.views.exactly_flat
     if not flat.all() or 2 * len(flat) >= free:
         return
     needed = -(-free // 2)
-    names = "the intrinsics and the pose" if known.type == 1 else "alpha_u, alpha_v and theta"
+    names = "the intrinsics and the pose" if problem.type == 1 else "alpha_u, alpha_v and theta"
     ways = [f"{needed} views of the board from different angles", "points in two planes"]
-    if 2 * len(flat) >= free - known.free[1]:
+    if 2 * len(flat) >= free - problem.free[1]:
         ways.append("--no-skew")
-    elif known.type == 1:
-        ways.append("--type 2 --no-skew" if known.free[1] else "--type 2")
+    elif problem.type == 1:
+        ways.append("--type 2 --no-skew" if problem.free[1] else "--type 2")
     views_text = "one view" if len(flat) == 1 else f"{len(flat)} views"
     raise DegenerateGeometryError(
-        f"{views_text} of one plane cannot tell {names} apart; give {', '.join(ways[:-1])} or {ways[-1]}"
+        f"{views_text} of one plane cannot determine {names}; give {', '.join(ways[:-1])} or {ways[-1]}"
     )
 
 
-def _check_helpers(views: Views, known: Known) -> None:
+def _check_views_with_few_points(problem: Problem) -> None:
     """Views with too few points of their own join the others, which must tell the camera alone.
 
     All together might have the equations for it, but from the wrong camera that they begin with they
     mostly end in a wrong minimum, and nothing shows it.
     """
+    views = problem.views
     able = views.distinct >= np.where(views.nearly_flat, 4, 6)
-    needed = -(-int(known.free.sum()) // 2)
+    needed = -(-int(problem.free.sum()) // 2)
     if able.all() or not able.any() or (able & ~views.nearly_flat).any() or able.sum() >= needed:
         return
     which = int(np.argmin(able))
     raise DegenerateGeometryError(
         f"view {views.names[which]!r} has only {views.distinct[which]} different points, and the views of "
-        f"one plane cannot tell the camera without it; give it at least 6 points, or {needed} views of the "
-        "board from different angles"
+        f"one plane cannot determine the camera without it; give it at least 6 points, or {needed} views of "
+        "the board from different angles"
     )
 
 
-def refuse_undetermined(views: Views, known: Known, state: CameraState, cov: Covariance) -> None:
+def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -> None:
     """Refuse an answer that the points leave open.
 
     Parameters
     ----------
-    views : Views
-    known : Known
+    problem : Problem
     state : CameraState
         At the minimum.
     cov : Covariance
@@ -127,58 +125,36 @@ def refuse_undetermined(views: Views, known: Known, state: CameraState, cov: Cov
     Raises
     ------
     DegenerateGeometryError
-        A singular normal matrix, or a focal length that is hardly known.
+        A singular normal matrix, or a focal length known no better than to `_MEANINGLESS`.
     """
-    free = np.flatnonzero(known.free)
+    free = np.flatnonzero(problem.free)
     relative = np.zeros(2)
     for slot, entry in enumerate((0, 2)):
         if entry in free:
             place = int(np.flatnonzero(free == entry)[0])
             relative[slot] = np.sqrt(cov.entries[place, place]) / state.entries[0, entry]
-    check_determined(views, known, relative, cov.smallest, (state.R @ views.basis)[:, :, 2])
-
-
-def check_determined(
-    views: Views, known: Known, relative_std: Array, smallest: float, normals: Array
-) -> None:
-    """Refuse an answer that the points leave open.
-
-    Parameters
-    ----------
-    views : Views
-    known : Known
-    relative_std : (2,) array
-        Standard deviations of A11 and A22 over their values; 0 where given.
-    smallest : float
-        Smallest eigenvalue of the normal matrix scaled to a unit diagonal: 0 when singular.
-    normals : (V, 3) array
-        Normal of each view's plane in the camera's frame.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        A singular normal matrix, or a focal length known no better than to `_MEANINGLESS`.
-    """
-    singular = not smallest > _SINGULAR
-    boards = views.nearly_flat.all() and known.free_poses and known.free[[0, 2]].any()
+    views, relative_std = problem.views, relative.max(initial=0.0)
+    singular = not cov.smallest > _SINGULAR
+    boards = views.nearly_flat.all() and problem.free_poses and problem.free[[0, 2]].any()
     limit = _MEANINGLESS / np.sqrt(2 * views.n_views) if boards else _MEANINGLESS
-    if not singular and relative_std.max(initial=0.0) < limit:
+    if not singular and relative_std < limit:
         return
     if boards:
-        _check_tilts(views, normals, singular)
-    more = f", or give more of the camera ({ways})" if (ways := _givable(known)) else ""
-    if singular and known.free_lens:
+        _check_tilts(views, (state.R @ views.basis)[:, :, 2], singular)
+    more = f", or give known parameters ({ways})" if (ways := _givable(problem)) else ""
+    if singular and problem.free_lens:
         raise DegenerateGeometryError(
-            f"the points do not determine all coefficients of the {known.lens.model} lens; choose a simpler "
-            "--distortion, or give points over more of the image"
+            f"the points do not determine all coefficients of the distortion model {problem.lens.model}; "
+            "choose a simpler --distortion, or give points over more of the image"
         )
     if singular:
         raise DegenerateGeometryError(
             "the points do not determine all unknowns (the normal matrix is singular); "
             f"spread the points in depth{more}"
         )
-    share = relative_std.max()
-    known_to = f"is known no better than to {100 * share:.0f} % of itself" if share < 1 else "cannot be told"
+    known_to = "cannot be determined"
+    if relative_std < 1:
+        known_to = f"has a std of {100 * relative_std:.0f} % of its value"
     raise DegenerateGeometryError(
         f"the focal length {known_to}; bring the target nearer, tilt it more{more}, and check that each "
         "pixel belongs to its point"
@@ -189,23 +165,23 @@ def _check_tilts(views: Views, normals: Array, singular: bool) -> None:
     """Refuse flat boards that stand parallel, to the image or to each other."""
     if views.n_views == 1:
         raise DegenerateGeometryError(
-            "one view of a board that is (nearly) parallel to the image cannot tell the focal length; "
+            "one view of a board that is (nearly) parallel to the image cannot determine the focal length; "
             "tilt the board by 20 to 50 degrees"
         )
     angle = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T).min(), 0, 1)))
     if singular and angle >= _NEARLY_PARALLEL:
         return
     # Noise on parallel boards reads as a long lens and large tilts: the angle means nothing then.
-    found = "parallel as far as the noise lets one tell"
+    found = "parallel within the noise"
     if angle < _NEARLY_PARALLEL:
         found = f"all parallel (within {angle:.1f} degrees)"
     raise DegenerateGeometryError(
-        f"the {views.n_views} boards are {found}, so no focal length can be told from them; "
+        f"the {views.n_views} boards are {found}, so they cannot determine the focal length; "
         "tilt the board by 20 to 50 degrees in different directions"
     )
 
 
-def _givable(known: Known) -> str:
+def _givable(problem: Problem) -> str:
     """Options that would leave fewer unknowns."""
-    ways = ["--no-skew"] if known.free[1] else []
-    return ", ".join(ways + [f"--type {more}" for more in (2, 3) if more > known.type])
+    ways = ["--no-skew"] if problem.free[1] else []
+    return ", ".join(ways + [f"--type {more}" for more in (2, 3) if more > problem.type])

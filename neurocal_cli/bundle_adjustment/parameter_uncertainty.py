@@ -10,12 +10,13 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
 from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
 
 __all__ = ["parameter_covariance", "parameter_warnings", "pose_std"]
 
+# What users are warned of; no result depends on it.
 # A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
 _POOR = 0.05
 _POOR_THETA = 0.02  # rad
@@ -75,7 +76,7 @@ def pose_std(R: Array, centre: Array, scale: Array, covariance: Array) -> Array:
 
 
 def parameter_warnings(
-    intrinsics: Intrinsics, lens: Lens, std: Mapping[str, float], lens_chosen: bool
+    intrinsics: Intrinsics, lens: Distortion, std: Mapping[str, float], lens_chosen: bool
 ) -> tuple[str, ...]:
     """Parameters that exist but are badly determined, and coefficients that the data does not tell from 0.
 
@@ -98,12 +99,12 @@ def _poor(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:
     if not poor:
         return ()
     return (
-        f"badly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
-        "the target more, or give what is known (--no-skew, --type 2)",
+        f"poorly determined: {', '.join(poor)}; spread the points more in depth and over the image, tilt "
+        "the target more, or give known parameters (--no-skew, --type 2)",
     )
 
 
-def _noise_coefficients(lens: Lens, std: Mapping[str, float]) -> tuple[str, ...]:
+def _noise_coefficients(lens: Distortion, std: Mapping[str, float]) -> tuple[str, ...]:
     """Warn of coefficients that the data does not tell from 0."""
     pairs = zip(coefficient_names(lens.model), lens.coefficients, strict=True)
     noise = [
@@ -111,4 +112,4 @@ def _noise_coefficients(lens: Lens, std: Mapping[str, float]) -> tuple[str, ...]
     ]
     if not noise:
         return ()
-    return (f"not told from 0: {', '.join(noise)}; a simpler --distortion would do",)
+    return (f"not significantly different from 0: {', '.join(noise)}; choose a simpler --distortion",)

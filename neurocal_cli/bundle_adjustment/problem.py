@@ -1,89 +1,92 @@
-"""The four calibration problems of the paper's section 4.1: which weights are given.
+"""One calibration problem: the points, and what is given of the camera (the paper's section 4.1).
 
-Type 1: none. Type 2: the image centre, W13 and W23. Type 3: the intrinsics, all of W.
+Type 1: nothing. Type 2: the image centre, W13 and W23. Type 3: the intrinsics, all of W.
 Type 4: the extrinsics, V.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Protocol
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
-from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names
+from neurocal_cli.bundle_adjustment.adjust import Adjusted, Restraint, adjust
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
+from neurocal_cli.bundle_adjustment.views import Views, arrange
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.projection import undistorted_pixels
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Known", "KnownCamera", "intrinsic_matrix", "known_for"]
-
+__all__ = ["Problem", "intrinsic_matrix", "problem_for"]
 
 _LARGEST = 1e9  # px; no image is larger
-
-
-class KnownCamera(Protocol):
-    """A camera with a lens: a `Calibration`, or what `read_intrinsics` returns."""
-
-    @property
-    def intrinsics(self) -> Intrinsics:
-        """Its five parameters."""
-        ...
-
-    @property
-    def distortion_model(self) -> str:
-        """One of `lens.MODELS`."""
-        ...
-
-    @property
-    def distortion(self) -> Array:
-        """The model's coefficients."""
-        ...
+_PINHOLE_STEPS = 2  # enough to make the points agree on a camera; a distorted image has no exact one
+_MAX_ITERATIONS = 200
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
-    """What is given.
+class Problem:
+    """Which parameters are estimated from which points.
 
     Attributes
     ----------
+    points : Correspondences
+    views : Views
+        The same points, normalised. A given distortion is taken off their pixels, because the networks
+        know a pinhole only, until `with_seen_pixels`.
     type : int
     entries : (5,) array
         A11, A12, A22, A13, A23 [px]; only the given ones mean something.
     free : (5,) bool array
         Entries to estimate.
     poses : dict of Pose by view, or None
+        The given ones.
     fixed : frozenset of str
-        Names of the given intrinsic parameters, and of coefficients of the lens that stay as they are.
+        Names of the given intrinsic parameters, and of distortion coefficients that stay as they are.
     intrinsics : Intrinsics or None
         All of them, for type 3: returned as they are.
-    lens : Lens
-        The model to end with; its coefficients where they are given.
+    lens : Distortion
+        The distortion model to end with; its coefficients where they are given.
     free_lens : bool
         Whether the other coefficients are estimated.
+    restraint : callable, optional
+        What the distortion has to obey beside the points.
     """
 
+    points: Correspondences
+    views: Views
     type: int
     entries: Array
     free: NDArray[np.bool_]
     poses: Mapping[str, Pose] | None
     fixed: frozenset[str]
     intrinsics: Intrinsics | None
-    lens: Lens = field(default_factory=Lens)
-    free_lens: bool = False
+    lens: Distortion
+    free_lens: bool
+    restraint: Restraint | None = None
 
     @property
     def free_camera(self) -> NDArray[np.bool_]:
-        """(5 + K,) which of A's entries and of the lens's coefficients are estimated."""
+        """(5 + K,) which of A's entries and of the distortion coefficients are estimated."""
         coefficients = [
             self.free_lens and name not in self.fixed for name in coefficient_names(self.lens.model)
         ]
         return np.concatenate([self.free, np.array(coefficients, dtype=bool)])
+
+    @property
+    def free_poses(self) -> bool:
+        """Whether the poses are estimated."""
+        return self.poses is None
+
+    @property
+    def n_parameters(self) -> int:
+        """Number of unknowns."""
+        return int(self.free_camera.sum()) + (6 * self.views.n_views if self.free_poses else 0)
 
     @property
     def given_centre(self) -> Array | None:
@@ -91,21 +94,64 @@ class Known:
         return None if self.free[3] else self.entries[3:]
 
     @property
-    def free_poses(self) -> bool:
-        """Whether the poses are estimated."""
-        return self.poses is None
-
-    def normalised_entries(self, views: Views) -> Array:
-        """The given entries in normalised pixels, ``S1^-1 A``; (5,)."""
+    def normalised_entries(self) -> Array:
+        """The given entries in normalised pixels, ``S1^-1 A``; (5,). The free ones mean nothing."""
         scaled = self.entries.copy()
-        scaled[3:] -= views.pixel_centre
-        return scaled / views.pixel_scale
+        scaled[3:] -= self.views.pixel_centre
+        return scaled / self.views.pixel_scale
 
-    def matrix(self, entries: Array, views: Views) -> Array:
+    def matrix(self, entries: Array) -> Array:
         """A [px] from normalised entries; given entries come back exactly as given."""
-        pixels = entries * views.pixel_scale
-        pixels[3:] += views.pixel_centre
+        pixels = entries * self.views.pixel_scale
+        pixels[3:] += self.views.pixel_centre
         return intrinsic_matrix(np.where(self.free, pixels, self.entries))
+
+    def with_points(self, points: Correspondences) -> Problem:
+        """The same question asked of other points.
+
+        Raises
+        ------
+        InputError
+            A pixel at which the given distortion cannot have seen anything.
+        DegenerateGeometryError
+            All pixels coincide.
+        """
+        return replace(self, points=points, views=_arranged(points, self), restraint=None)
+
+    def with_model(self, model: str) -> Problem:
+        """The same points with another distortion model to be estimated."""
+        # Coefficients that stay as they are belong to the model before.
+        fixed = self.fixed & set(INTRINSIC_NAMES)
+        return replace(self, lens=Distortion(model), free_lens=model != "none", fixed=fixed, restraint=None)
+
+    def with_seen_pixels(self) -> Problem:
+        """The same problem with the pixels as they were seen, normalised as before."""
+        views = self.views
+        order = slice(None) if views.order is None else views.order
+        pixels = (self.points.pixels[order] - views.pixel_centre) / views.pixel_scale
+        return replace(self, views=replace(views, pixels=pixels))
+
+    def adjust(self, start: CameraState | Adjusted, max_iterations: int = _MAX_ITERATIONS) -> Adjusted:
+        """Minimise the reprojection error (3) from a state; see `adjust`.
+
+        A distortion that is to be estimated joins after a few steps of the pinhole, with coefficients
+        that leave it one. Iterations are counted on from a start that is itself an adjustment.
+        """
+        done = start.iterations if isinstance(start, Adjusted) else 0
+        state = start.state if isinstance(start, Adjusted) else start
+        if self.free_lens and state.lens == "none":
+            pinhole = self._adjusted(state, _PINHOLE_STEPS)
+            done += pinhole.iterations
+            model = self.lens.model
+            state = replace(pinhole.state, lens=model, k=pinhole_coefficients(model))
+        adjusted = self._adjusted(state, max_iterations)
+        return replace(adjusted, iterations=done + adjusted.iterations)
+
+    def _adjusted(self, state: CameraState, steps: int) -> Adjusted:
+        batches = self.views.batches
+        if state.lens == "none":
+            return adjust(batches, state, self.free, self.free_poses, steps)
+        return adjust(batches, state, self.free_camera, self.free_poses, steps, self.restraint)
 
 
 def intrinsic_matrix(entries: Array) -> Array:
@@ -115,22 +161,35 @@ def intrinsic_matrix(entries: Array) -> Array:
     return A
 
 
-def known_for(
+def problem_for(
     points: Correspondences,
     type: int,
-    image_center: tuple[float, float] | None,
-    intrinsics: Intrinsics | None,
-    extrinsics: Mapping[str, Pose] | None,
-    skew: bool,
-) -> Known:
+    image_center: tuple[float, float] | None = None,
+    intrinsics: Intrinsics | None = None,
+    extrinsics: Mapping[str, Pose] | None = None,
+    skew: bool = True,
+    lens: Distortion | None = None,
+) -> Problem:
     """Check what is given against what the problem type needs.
+
+    Parameters
+    ----------
+    points : Correspondences
+    type : int
+    image_center, intrinsics, extrinsics, skew
+        As for `calibrate`.
+    lens : Distortion, optional
+        The distortion: given with type 3, else the model to be estimated.
 
     Raises
     ------
     UsageError
         A type that does not exist, something missing for the type, or given but of no use to it.
     InputError
-        Values that are not finite, extrinsics without one of the views.
+        Values that are not finite, extrinsics without one of the views, a pixel at which the given
+        distortion cannot have seen anything.
+    DegenerateGeometryError
+        All pixels coincide.
     """
     if not isinstance(type, (int, np.integer)) or type not in (1, 2, 3, 4):
         raise UsageError(f"type must be 1, 2, 3 or 4, not {type!r}")
@@ -140,7 +199,7 @@ def known_for(
         ("extrinsics", extrinsics, 4),
     ):
         if value is not None and type != wanted:
-            raise UsageError(f"{name} belongs to type {wanted}, not to type {type}; give type={wanted}")
+            raise UsageError(f"{name} needs type {wanted}, but the type is {type}; give type={wanted}")
     entries, free = np.zeros(5), np.ones(5, dtype=bool)
     fixed: set[str] = set()
     poses: dict[str, Pose] | None = None
@@ -153,17 +212,45 @@ def known_for(
         fixed |= {"u0", "v0"}
     elif type == 3:
         if intrinsics is None:
-            raise UsageError("type 3 needs the intrinsics of the camera")
+            raise UsageError("type 3 needs the intrinsics of the camera; give them")
         entries = intrinsics.A[ENTRIES]
         if not np.abs(entries[[0, 2]]).min() > 1 / _LARGEST or np.abs(entries).max() > _LARGEST:
             raise InputError(
-                "the given intrinsics are no camera's: alpha and the centre must be of an image's size"
+                "the given intrinsics are out of range: alpha and the centre must be of the size of an "
+                "image; correct them"
             )
         free[:] = False
         fixed = set(INTRINSIC_NAMES)
     elif type == 4:
         poses = _poses(points, extrinsics)
-    return Known(type, entries, free, poses, frozenset(fixed), intrinsics)
+    lens = lens or Distortion()
+    free_lens = type != 3 and lens.model != "none"
+    if type == 3:
+        fixed |= set(coefficient_names(lens.model))
+    given = type, entries, free, poses, frozenset(fixed), intrinsics, lens, free_lens
+    return Problem(points, arrange(points if free_lens else _undistorted(points, lens, entries)), *given)
+
+
+def _arranged(points: Correspondences, problem: Problem) -> Views:
+    if problem.free_lens:
+        return arrange(points)
+    return arrange(_undistorted(points, problem.lens, problem.entries))
+
+
+def _undistorted(points: Correspondences, lens: Distortion, entries: Array) -> Correspondences:
+    """Points without a given distortion."""
+    if lens.is_identity:
+        return points
+    pixels = undistorted_pixels(lens, intrinsic_matrix(entries), points.pixels)
+    lost = ~np.isfinite(pixels[:, 0])
+    if lost.any():
+        row = int(np.argmax(lost))
+        u, v = points.pixels[row]
+        raise InputError(
+            f"{points.place(row)}: the given distortion maps nothing to the pixel ({u:g}, {v:g}); "
+            "check that the camera belongs to these images"
+        )
+    return replace(points, pixels=pixels)
 
 
 def _centre(points: Correspondences, image_center: tuple[float, float] | None) -> Array:
@@ -178,13 +265,13 @@ def _centre(points: Correspondences, image_center: tuple[float, float] | None) -
     except (TypeError, ValueError):
         values = np.zeros(0)
     if values.shape != (2,) or not (np.abs(values) < _LARGEST).all():  # False for nan as well
-        raise InputError("the image centre must be two finite numbers of an image's size")
+        raise InputError("the image centre must be two finite numbers of the size of an image; correct it")
     return values
 
 
 def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
     if extrinsics is None:
-        raise UsageError("type 4 needs the extrinsics of each view")
+        raise UsageError("type 4 needs the extrinsics of each view; give them")
     missing = [name for name in points.view_names if name not in extrinsics]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""

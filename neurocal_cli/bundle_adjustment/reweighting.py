@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 from neurocal_cli.bundle_adjustment.common_noise import Noise, measured, noise_of, with_common_share
-from neurocal_cli.bundle_adjustment.job import Job, Solution
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
+from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views, arrange, noise_model
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -17,33 +17,28 @@ _PASSES = 10
 _SETTLED = 0.005  # change of the share that no result depends on
 
 
-def reweighted(job: Job, solution: Solution, points: Correspondences) -> tuple[Job, Solution, float]:
-    """Refine again with the share of the noise that is the same for all points; see `noise`.
+def reweighted(solution: Solution) -> Solution:
+    """Adjust again with the share of the noise that is the same for all points; see `common_noise`.
 
     Parameters
     ----------
-    job, solution
+    solution : Solution
         Adjusted by the stated covariances alone.
-    points : Correspondences
-        What the job's views are of.
-
-    Returns
-    -------
-    job, solution
-    share : float
     """
+    points = solution.problem.points
     if points.covariance is None or not measured(points.covariance):
-        return job, solution, 0.0
-    # From equal weights: residuals of a fit that a few points rule would confirm that they should.
+        return solution
+    # From equal weights: residuals of a fit that a few points dominate would confirm that they should.
     noise = Noise(share=1.0)
-    job, solution = _weighed(job, solution, points, noise)
+    solution = _weighed(solution, noise)
     for _ in range(_PASSES):
-        residuals = point_residuals(job.views, solution.adjusted.state) * job.views.pixel_scale
-        last, noise = noise, noise_of(_stated(points, job.views), residuals, job.views.across)
+        views = solution.problem.views
+        residuals = point_residuals(views, solution.state) * views.pixel_scale
+        last, noise = noise, noise_of(_stated(points, views), residuals, views.across)
         if max(abs(noise.share - last.share), abs(noise.along - last.along)) < _SETTLED:
             break
-        job, solution = _weighed(job, solution, points, noise)
-    return job, solution, noise.share
+        solution = _weighed(solution, noise)
+    return replace(solution, common_noise=noise.share)
 
 
 def weighed(points: Correspondences, residuals: Array) -> Views:
@@ -67,6 +62,7 @@ def _with_noise(views: Views, points: Correspondences, noise: Noise) -> Views:
     return replace(views, whitening=whitening, along=noise.along)
 
 
-def _weighed(job: Job, solution: Solution, points: Correspondences, noise: Noise) -> tuple[Job, Solution]:
-    job = replace(job, views=_with_noise(job.views, points, noise), tally=job.tally)
-    return job, Solution(job.adjust(solution.adjusted.state), job.tally)
+def _weighed(solution: Solution, noise: Noise) -> Solution:
+    problem = solution.problem
+    problem = replace(problem, views=_with_noise(problem.views, problem.points, noise))
+    return replace(solution, problem=problem, adjusted=problem.adjust(solution.adjusted))

@@ -17,6 +17,7 @@ from neurocal_cli.points import Correspondences
 
 __all__ = ["Views", "arrange", "noise_model"]
 
+# Repeated by tests/test_convergence.py, with targets of every thickness.
 # A target thinner than this share of its length is a plane up to rounding ...
 _EXACTLY_FLAT = 1e-6
 # ... and thinner than this it is treated as one until the last step, which sees every coordinate.

@@ -1,8 +1,8 @@
-"""Where a lens model means something: up to the radius at which it folds the image back.
+"""Where a distortion model is monotonic, and its inverse there.
 
 A polynomial goes on beyond the largest angle that its lens sees: with barrel distortion the image turns
-back inwards from some radius on, and a pixel then has a second, false straight point far outside. The
-true one lies within the first fold.
+back inwards from some radius on, and a pixel then has a second, false point far outside. The true one lies
+where the model is monotonic.
 """
 
 from __future__ import annotations
@@ -10,30 +10,35 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.camera.distortion_models import Coefficients, Lens, bend, coefficient_names, distort
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, distort_with_jacobian
 from neurocal_cli.geometry import Array
 
-__all__ = ["first_fold", "is_seen", "radial_slope", "straight_pixels", "straightened", "undistort"]
+__all__ = ["is_monotonic", "monotonic_radius", "nearly_undistorted", "radial_slope", "undistort"]
 
-_FARTHEST = 1e3  # radius of straight points that no image reaches
-_TABLE = 4096
+# Where Newton's method starts, and when it ends: random models of tests/test_monotonic.py, up to 95 % of
+# the radius where they cease to be monotonic, come back to 1e-8.
+_FARTHEST = 1e3  # undistorted radius that no image reaches
+_TABLE = 4096  # radii
 _NEWTON_STEPS = 30
-_STEP = 1e-15
-_ACCURACY = 1e-11
+_STEP = 1e-9  # of Newton's: the next one, its square, is rounding
+_ACCURACY = 1e-11  # of the point distorted again: more is no inverse
+_SMALL_STEP = 0.02  # of Newton's in the image plane: the next one would be a thousandth
+_SMALLEST = 1e-100  # coefficient; what is less overflows, and has no root near any image
 _REAL = 1e-6  # imaginary part of a double root, over its real part, that rounding makes
 
 
-def first_fold(lens: Lens) -> float:
-    """Radius of straight normalised points from which on the lens maps inwards; infinity if it never does.
+def monotonic_radius(distortion: Distortion) -> float:
+    """Undistorted normalised radius up to which the distorted one grows; infinity if it always does.
 
     The first zero of the slope of the radius, or of the rational model's denominator; tangential terms,
     small within any image, are left out.
     """
-    if lens.model == "fisheye":
-        slope = np.array([1.0, *(lens.coefficients * [3, 5, 7, 9])])
+    k = distortion.coefficients
+    if distortion.model == "fisheye":
+        slope = np.array([1.0, *(k * [3, 5, 7, 9])])
         theta = np.sqrt(_first_root(slope))
         return float(np.tan(theta)) if theta < np.pi / 2 else np.inf
-    k1, k2, _, _, k3, k4, k5, k6 = np.r_[lens.coefficients, np.zeros(8 - len(lens.coefficients))]
+    k1, k2, _, _, k3, k4, k5, k6 = np.r_[k, np.zeros(8 - len(k))]
     top, bottom = np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
     # With s = r^2: d/dr (r top / bottom) is 0 where (top + 2 s top') bottom = 2 s top bottom'.
     slope = np.convolve(top + _twice_s_slope(top), bottom) - np.convolve(top, _twice_s_slope(bottom))
@@ -41,19 +46,19 @@ def first_fold(lens: Lens) -> float:
 
 
 def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
-    """How fast the bent radius grows with the straight one, or a fisheye's with the angle.
+    """How fast the distorted radius grows with the undistorted one, or a fisheye's with the angle.
 
     Parameters
     ----------
     model : str
     k : (K,) array
     r : (m,) array
-        Straight radii, or a fisheye's angles.
+        Undistorted radii, or a fisheye's angles.
 
     Returns
     -------
     slope : (m,) array
-        Without the tangential terms; not positive from the first fold on.
+        Without the tangential terms; not positive from `monotonic_radius` on.
     by_k : (m, K) array
     """
     s = r[:, None] ** 2
@@ -80,89 +85,99 @@ def _twice_s_slope(p: Array) -> Array:
 
 def _first_root(coefficients: Array) -> float:
     """Smallest positive real root of a polynomial, infinity if there is none; lowest order first."""
-    roots = np.roots(coefficients[::-1])
+    roots = np.roots(np.where(np.abs(coefficients) > _SMALLEST, coefficients, 0.0)[::-1])
     real = roots.real[(np.abs(roots.imag) <= _REAL * np.abs(roots.real)) & (roots.real > 0)]
     return float(real.min(initial=np.inf))
 
 
-def is_seen(lens: Lens, x: Array, y: Array) -> NDArray[np.bool_]:
-    """Whether straight normalised points lie where the lens does not fold."""
+def is_monotonic(distortion: Distortion, x: Array, y: Array) -> NDArray[np.bool_]:
+    """Whether undistorted normalised points lie where the model is monotonic."""
     with np.errstate(all="ignore"):
-        _, (xx, xy, yx, yy), _ = bend(lens.model, lens.coefficients, x, y)
-        return np.asarray((np.hypot(x, y) < first_fold(lens)) & (xx * yy - xy * yx > 0))
+        _, (xx, xy, yx, yy), _ = distort_with_jacobian(distortion.model, distortion.coefficients, x, y)
+        return np.asarray((x * x + y * y < monotonic_radius(distortion) ** 2) & (xx * yy - xy * yx > 0))
 
 
-def undistort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
-    """Straighten bent points, the inverse of `distort` within the lens's first fold.
+def undistort(
+    distortion: Distortion, x: Array, y: Array, near: tuple[Array, Array] | None = None
+) -> tuple[Array, Array]:
+    """Undistort normalised image points: the inverse of `distort` where the model is monotonic.
+
+    Newton's method from where the model without its tangential terms has the point, so that no false
+    point is found, nor a true one lost.
 
     Parameters
     ----------
-    model : str
-    k : sequence of float
+    distortion : Distortion
     x, y : arrays of one shape
-        Bent normalised points.
+        Distorted points.
+    near : two arrays of that shape, optional
+        Undistorted points nearby, to start from.
 
     Returns
     -------
     x, y : arrays of that shape
-        ``nan`` where no straight point bends to the given one.
-    """
-    return straightened(Lens(model, np.asarray(k, dtype=float)), x, y)
-
-
-def straightened(lens: Lens, x: Array, y: Array) -> tuple[Array, Array]:
-    """Take a lens off normalised points, within its first fold.
-
-    Newton's method from where the lens without its tangential terms has the point, so that no point
-    beyond the fold is found, nor one before it lost.
-
-    Parameters
-    ----------
-    lens : Lens
-    x, y : arrays of one shape
-
-    Returns
-    -------
-    x, y : arrays of that shape
-        ``nan`` where the lens cannot have seen any.
+        ``nan`` where no undistorted point belongs to the given one.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    if not lens.bends:
+    if distortion.is_identity:
         return x, y
-    sx, sy = _radially(lens, x, y)
+    if near is None:
+        sx, sy, good = _newton(distortion, x, y, *_radially(distortion, x, y))
+        return np.where(good, sx, np.nan), np.where(good, sy, np.nan)
+    sx, sy, good = _newton(distortion, x, y, *near)
+    if not good.all():
+        sx[~good], sy[~good] = undistort(distortion, x[~good], y[~good])
+    return sx, sy
+
+
+def _newton(
+    distortion: Distortion, x: Array, y: Array, sx: Array, sy: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Undistorted points by Newton's method from (sx, sy), and which of them are true."""
+    model, k = distortion.model, distortion.coefficients
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
-            (bx, by), (xx, xy, yx, yy), _ = bend(lens.model, lens.coefficients, sx, sy)
+            (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(model, k, sx, sy)
             dx, dy, det = x - bx, y - by, xx * yy - xy * yx
             step = (yy * dx - xy * dy) / det, (xx * dy - yx * dx) / det
             sx, sy = sx + step[0], sy + step[1]
             if not np.nanmax(np.hypot(*step) / (1 + np.hypot(sx, sy)), initial=0.0) > _STEP:
                 break
-        bx, by = distort(lens.model, lens.coefficients, sx, sy)
+        (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(model, k, sx, sy)
         good = np.hypot(bx - x, by - y) < _ACCURACY * (1 + np.hypot(x, y))
-    good &= is_seen(lens, sx, sy)
-    return np.where(good, sx, np.nan), np.where(good, sy, np.nan)
+        good &= (sx * sx + sy * sy < monotonic_radius(distortion) ** 2) & (xx * yy - xy * yx > 0)
+    return sx, sy, good
 
 
-def _radially(lens: Lens, x: Array, y: Array) -> tuple[Array, Array]:
-    """Straight points without the tangential terms, nearly: by a table of radii."""
-    names = coefficient_names(lens.model)
-    radial = [0.0 if name in ("p1", "p2") else k for name, k in zip(names, lens.coefficients, strict=True)]
+def _radially(distortion: Distortion, x: Array, y: Array) -> tuple[Array, Array]:
+    """Undistorted points without the tangential terms, nearly: by a table of radii."""
+    names = coefficient_names(distortion.model)
+    k = distortion.coefficients
+    radial = [0.0 if name in ("p1", "p2") else k for name, k in zip(names, k, strict=True)]
     # Even steps of the angle reach any radius.
-    last = min(np.arctan(first_fold(lens)), np.arctan(_FARTHEST))
+    last = min(np.arctan(monotonic_radius(distortion)), np.arctan(_FARTHEST))
     r = np.tan(np.linspace(0, last, _TABLE, endpoint=False))  # at a pole there is no image
     with np.errstate(all="ignore"):
-        bent, _ = distort(lens.model, radial, r, np.zeros(_TABLE))
+        distorted, _ = distort(distortion.model, radial, r, np.zeros(_TABLE))
         seen = np.hypot(x, y)
-        straight = np.interp(seen, bent, r)
-        stretch = np.where(seen > 0, straight / seen, 1.0)
+        stretch = np.where(seen > 0, np.interp(seen, distorted, r) / seen, 1.0)
     return x * stretch, y * stretch
 
 
-def straight_pixels(lens: Lens, A: Array, pixels: Array) -> Array:
-    """Pixels without the lens, (N, 2); nan where the lens cannot have seen any."""
-    a, s, b, u0, v0 = A[0, 0], A[0, 1], A[1, 1], A[0, 2], A[1, 2]
-    y = (pixels[:, 1] - v0) / b
-    x = (pixels[:, 0] - u0 - s * y) / a
-    x, y = straightened(lens, x, y)
-    return np.column_stack([a * x + s * y + u0, b * y + v0])
+def nearly_undistorted(distortion: Distortion, x: Array, y: Array) -> tuple[Array, Array]:
+    """The same as `undistort` to a thousandth or so, by two of Newton's steps wherever these do."""
+    if distortion.is_identity:
+        return x, y
+    sx, sy = x, y
+    for _ in range(2):
+        (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(
+            distortion.model, distortion.coefficients, sx, sy
+        )
+        det = xx * yy - xy * yx
+        step_x = (yy * (x - bx) - xy * (y - by)) / det
+        step_y = (xx * (y - by) - yx * (x - bx)) / det
+        sx, sy = sx + step_x, sy + step_y
+    far = ~((det > 0) & (step_x * step_x + step_y * step_y < _SMALL_STEP**2))
+    if far.any():
+        sx[far], sy[far] = undistort(distortion, x[far], y[far])
+    return sx, sy

@@ -1,4 +1,4 @@
-"""The pinhole camera of the paper's section 2: A, D, P = A D, its 11 parameters and derivatives.
+"""The pinhole camera of the paper's section 2: A, D, P = A D and its 11 parameters.
 
 Five intrinsic parameters make A, six extrinsic ones make D = [R | t]. The estimators work on the
 five free entries of A, which are the network's output weights; the paper's alpha_v and theta
@@ -8,6 +8,7 @@ follow from them. Conventions: see `geometry`.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -20,8 +21,7 @@ __all__ = [
     "Intrinsics",
     "Pose",
     "decompose",
-    "project",
-    "projection_jacobian",
+    "entries_of",
 ]
 
 INTRINSIC_NAMES = ("alpha_u", "alpha_v", "u0", "v0", "theta")
@@ -70,13 +70,8 @@ class Intrinsics:
     @property
     def A(self) -> Array:
         """(3, 3) array: the paper's A without its last, zero column."""
-        return np.array(
-            [
-                [self.alpha_u, -self.alpha_u / np.tan(self.theta) if self.skewed else 0.0, self.u0],
-                [0.0, self.alpha_v / np.sin(self.theta), self.v0],
-                [0.0, 0.0, 1.0],
-            ]
-        )
+        a, s, b, u0, v0 = entries_of(self.alpha_u, self.alpha_v, self.u0, self.v0, self.theta)
+        return np.array([[a, s, u0], [0.0, b, v0], [0.0, 0.0, 1.0]])
 
     @property
     def skewed(self) -> bool:
@@ -158,6 +153,10 @@ class Pose:
         """Pose from Euler angles [rad] and a translation."""
         return cls(euler_to_rotation(R_x, R_y, R_z), t)
 
+    def to_camera(self, world: Array) -> Array:
+        """World points (..., 3) in the camera's frame."""
+        return np.asarray(world @ self.R.T + self.t)
+
     @property
     def euler(self) -> Array:
         """(3,) array R_x, R_y, R_z [rad]."""
@@ -169,57 +168,11 @@ class Pose:
         return np.column_stack([self.R, self.t])
 
 
-def project(A: Array, pose: Pose, world: Array) -> tuple[Array, Array]:
-    """Project world points into the image, paper eq. (1).
-
-    Parameters
-    ----------
-    A : (3, 3) array
-    pose : Pose
-    world : (N, 3) array
-
-    Returns
-    -------
-    pixels : (N, 2) array [px]
-    depth : (N,) array
-        z in the camera's frame; a pixel means something only where it is positive.
-    """
-    camera = world @ pose.R.T + pose.t
-    depth = camera[:, 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        image = camera[:, :2] / depth[:, None]
-    return image @ A[:2, :2].T + A[:2, 2], depth
-
-
-def projection_jacobian(A: Array, camera: Array) -> tuple[Array, Array]:
-    """Derivatives of the pixels, paper eq. (1), by A's entries and by the pose.
-
-    Parameters
-    ----------
-    A : (3, 3) array
-    camera : (..., 3) array
-        Points in the camera's frame, ``R M + t``.
-
-    Returns
-    -------
-    by_A : (..., 2, 5) array
-        By A11, A12, A22, A13, A23.
-    by_pose : (..., 2, 6) array
-        By omega and tau of ``Xc -> exp(omega) Xc + tau``, so R -> exp(omega) R and
-        t -> exp(omega) t + tau.
-    """
-    q = 1.0 / camera[..., 2]
-    x, y = camera[..., 0] * q, camera[..., 1] * q
-    by_A = np.zeros((*q.shape, 2, 5))
-    by_A[..., 0, 0], by_A[..., 0, 1], by_A[..., 0, 3] = x, y, 1.0
-    by_A[..., 1, 2], by_A[..., 1, 4] = y, 1.0
-    # Derivatives of (x, y): the interaction matrix of a point.
-    normal = np.zeros((*q.shape, 2, 6))
-    normal[..., 0, 0], normal[..., 0, 1], normal[..., 0, 2] = -x * y, 1 + x * x, -y
-    normal[..., 1, 0], normal[..., 1, 1], normal[..., 1, 2] = -1 - y * y, x * y, x
-    normal[..., 0, 3] = normal[..., 1, 4] = q
-    normal[..., 0, 5], normal[..., 1, 5] = -x * q, -y * q
-    return by_A, A[:2, :2] @ normal
+def entries_of(alpha_u: Any, alpha_v: Any, u0: Any, v0: Any, theta: float) -> tuple[Any, Any, Any, Any, Any]:
+    """A11, A12, A22, A13, A23 of numbers, or of arrays for a camera each; theta [rad] is a number."""
+    # The float nearest to pi/2 is not quite pi/2, and its tangent not infinite.
+    skew = -alpha_u / np.tan(theta) if theta != np.pi / 2 else 0.0
+    return alpha_u, skew, alpha_v / np.sin(theta), u0, v0
 
 
 def decompose(P: Array, world: Array | None = None) -> tuple[Intrinsics, Pose]:
@@ -244,14 +197,16 @@ def decompose(P: Array, world: Array | None = None) -> tuple[Intrinsics, Pose]:
     lengths = np.linalg.norm(M, axis=1, keepdims=True)
     if not lengths.min() > 0 or np.linalg.cond(M / lengths) > 1e14:
         raise DegenerateGeometryError(
-            "the projection matrix is singular: it is no camera with a focal length"
+            "the projection matrix is singular, so it has no focal length; check the points"
         )
     if world is None:
         sign = np.sign(np.linalg.det(M))
     else:
         depth = world @ P[2, :3] + P[2, 3]
         if depth.min() < 0 < depth.max():
-            raise DegenerateGeometryError("the points lie on both sides of the camera")
+            raise DegenerateGeometryError(
+                "the points lie on both sides of the camera; check that each pixel belongs to its point"
+            )
         sign = np.sign(depth.sum())
     if sign * np.linalg.det(M) < 0:
         raise DegenerateGeometryError(

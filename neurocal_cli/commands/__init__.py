@@ -24,13 +24,13 @@ __all__ = ["neurocal"]
 # Each command is the function of this name in the module of this name; None: hidden. The summaries
 # stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
-    "calibrate": "Calibrate a camera from known points and the pixels where they were seen.",
-    "detect": "Find chessboards in images and measure the mid-points of their squares' edges.",
-    "evaluate": "Measure how good a result is.",
-    "lens": "Calibrate a camera whose zoom and focus move.",
-    "stereo": "Calibrate two cameras and how the right one stands to the left, X_right = R X_left + t.",
-    "triangulate": "Find points in space from their pixels in the left and the right image.",
-    "undistort": "Take a lens's distortion off images and points.",
+    "calibrate": "Calibrate a camera from known points and their pixels.",
+    "detect": "Detect chessboards in images and measure points on them.",
+    "evaluate": "Measure the error of a calibrated camera or stereo rig.",
+    "lens": "Calibrate a zoom lens, whose zoom and focus change.",
+    "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
+    "triangulate": "Compute points in space from their pixels in the left and the right image.",
+    "undistort": "Remove the lens distortion from images and points.",
     "man": None,
 }
 
@@ -104,9 +104,9 @@ def _explain(error: Exception) -> str:
     if isinstance(error, MemoryError):
         return "not enough memory; use fewer points"
     if isinstance(error, RecursionError):
-        return "the input is nested too deeply to be read"
+        return "the input is nested too deeply; give a file that neurocal wrote"
     if isinstance(error, UnicodeError):
-        return f"text that cannot be read or written ({error}); use UTF-8"
+        return f"a text cannot be read or written as UTF-8 ({error}); save the file as UTF-8"
     if isinstance(error, OSError) and error.strerror:
         place = "" if error.filename is None else f"{os.fsdecode(error.filename)}: "
         return f"{place}{error.strerror}"
@@ -123,18 +123,23 @@ def _explain(error: Exception) -> str:
 def neurocal() -> None:
     """Calibrate cameras with a neural network whose weights are the camera.
 
-    The network starts from random weights, learns from known points and where they were seen, and
-    ends as the camera: its output weights are the intrinsic parameters, its hidden weights the pose.
+    The network learns to project known points onto their pixels. Its output weights become the
+    intrinsic parameters, and its hidden weights become the pose. It starts from random weights, so
+    no initial guess is needed.
 
-    Results go to standard output and all else to standard error; `-` as a file name stands for
-    standard input or output, so commands can be chained.
+    Results go to standard output. Tables, warnings and errors go to standard error. The file name
+    `-` stands for standard input or standard output, so commands can be joined in a pipeline.
 
     \b
     Examples:
+      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
+          -o points.csv
       neurocal calibrate points.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
+      neurocal undistort camera.yaml sample_data/board*.png -o undistorted
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          -o rig.yaml
+      neurocal triangulate rig.yaml sample_data/matches.csv -o xyz.csv
+      neurocal lens fit sample_data/zoom.csv -o lens.yaml
       cat points.csv | neurocal calibrate - | neurocal evaluate camera -
-      neurocal stereo left.csv right.csv -o rig.yaml
-      neurocal triangulate rig.yaml matches.csv -o xyz.csv
-      neurocal detect left*.png --cols 9 --rows 6 --square 25 -o points.csv
     """  # noqa: D301 - click's mark of a paragraph not to be wrapped

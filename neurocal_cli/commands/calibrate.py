@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import click
@@ -26,7 +25,7 @@ _NOT_CONVERGED = 3
 @points_argument
 @estimation_options
 @click.option(
-    "--camera-name", metavar="NAME", default="camera", help="Name of the camera, written to the file."
+    "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
 )
 @plot_option
 @output_option("CAMERA.yaml", "the calibration")
@@ -39,32 +38,40 @@ def calibrate(
     plot: str | None,
     output: str,
 ) -> None:
-    """Calibrate a camera from known points and the pixels where they were seen.
+    """Calibrate a camera from known points and their pixels.
 
-    A pinhole camera has 5 intrinsic parameters (the scale factors alpha_u and alpha_v, the image
-    centre u0, v0 and the angle theta between the image axes) and, for each view, 6 extrinsic ones
-    (three angles and a translation: where the camera stood). A network that starts from random
-    weights learns them; --type says what is known beforehand:
+    The camera has 5 intrinsic parameters: the scale factors alpha_u and alpha_v, the image centre
+    (u0, v0) and the angle theta between the image axes. Each view adds a pose of 6 parameters: three
+    angles and a translation. The command estimates all of them with their standard deviations, and
+    the coefficients of the lens distortion. Use --type to give what is known already:
 
     \b
-      1  nothing: learn all the parameters
-      2  the image centre, from --image-center: learn all the others
-      3  the intrinsic parameters, from --intrinsics: learn where the camera stood
-      4  the poses, from --extrinsics: learn the intrinsic parameters
+      type  known                     option              estimated
+      1     nothing                                       all parameters
+      2     the image centre          --image-center      all others
+      3     the intrinsic parameters  --intrinsics        the poses
+      4     the poses                 --extrinsics        the intrinsic parameters
 
-    Points of a single view must not all lie in one plane for types 1 and 2; several views of a flat
-    board will do.
+    Types 1 and 2 need several views of a flat board, or one view of a target that is not flat.
 
-    The calibration, a YAML file that ROS reads as camera_info, goes to standard output or to -o.
-    A summary with standard deviations and a verdict (good, usable or poor, with the reasons and what
-    to do next) goes to standard error.
+    The command writes the calibration as a YAML file, which ROS reads as camera_info. It prints a
+    summary and a verdict on standard error. The verdict is good, usable or poor; it comes with the
+    reasons and with advice.
 
     \b
     Examples:
-      neurocal calibrate sample_data/points.csv -o camera.yaml
-      neurocal calibrate sample_data/points.csv --type 2
-      neurocal calibrate moved.csv --type 3 --intrinsics camera.yaml -o moved.yaml
-      cat points.csv | neurocal calibrate - | neurocal evaluate camera -
+      neurocal calibrate sample_data/flat.csv -o camera.yaml --camera-name left
+      neurocal calibrate sample_data/flat.csv --distortion k1 --no-skew \\
+          --plot errors.png -o camera.yaml
+      neurocal calibrate sample_data/flat.csv --outliers keep --image-size 640 480
+      neurocal calibrate sample_data/points.csv --type 2 --image-center 172 121
+      neurocal calibrate sample_data/stereo_left.csv --type 3 \\
+          --intrinsics camera.yaml -o poses.yaml
+      neurocal calibrate sample_data/flat.csv --type 4 --extrinsics camera.yaml
+      neurocal calibrate sample_data/flat.csv --method neuro --starts 40 --seed 1
+      neurocal calibrate sample_data/points.csv --trainer backprop \\
+          --epochs 20000 --rate 0.05 --rate-gamma 0.4
+      cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
     estimation.check()
     check_one_stdin(*points, *estimation.stdin_candidates)
@@ -78,7 +85,7 @@ def calibrate(
 
 def _check_outputs(output: str, plot: str | None, camera_name: str) -> None:
     if not camera_name.strip() or not camera_name.isprintable():
-        raise UsageError("--camera-name must be a name of printable characters")
+        raise UsageError("--camera-name must hold printable characters only; give another name")
     check_plot(plot, output)
 
 
@@ -91,11 +98,9 @@ def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) 
     points, arguments = estimation.prepare(points)
 
     from neurocal_cli.methods import calibrate as learn
-    from neurocal_cli.verdict.assessment import judged
 
     with ProgressBar() as progress:
-        calibration = learn(points, **arguments, camera_name=camera_name, progress=progress)
-    return replace(calibration, verdict=judged(calibration))
+        return learn(points, **arguments, camera_name=camera_name, progress=progress)
 
 
 def _write(calibration: Calibration, output: str, plot: str | None) -> None:

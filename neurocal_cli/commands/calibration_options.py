@@ -14,7 +14,7 @@ from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
-    from neurocal_cli.io.camera_files import CameraFile
+    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
     from neurocal_cli.training.backprop import BackpropOptions
 
@@ -61,18 +61,23 @@ class Estimation:
             (self.extrinsics, "--extrinsics", "4"),
         ):
             if name is not None and self.type != type_:
-                raise UsageError(f"{option} belongs to --type {type_}; this is --type {self.type}")
+                raise UsageError(
+                    f"{option} needs --type {type_}, but the type is {self.type}; give --type {type_}"
+                )
         if self.type == "3" and self.intrinsics is None:
             raise UsageError("--type 3 needs the known intrinsic parameters; give --intrinsics CAMERA.yaml")
         if self.type == "4" and self.extrinsics is None:
             raise UsageError("--type 4 needs the known poses; give --extrinsics CAMERA.yaml")
         if self.type == "3" and self.no_skew:
-            raise UsageError("--no-skew cannot change the given camera of --type 3; leave it out")
+            raise UsageError("--type 3 does not change the given camera; leave out --no-skew")
         if self.type == "3" and self.distortion not in ("auto", "none"):
-            raise UsageError("--type 3 takes the lens of the given camera; leave out --distortion")
+            raise UsageError("--type 3 uses the distortion model of the given camera; leave out --distortion")
         for name, option in _BACKPROP_ONLY.items():
             if getattr(self, name) is not None and self.trainer != "backprop":
-                raise UsageError(f"{option} belongs to --trainer backprop; this is --trainer {self.trainer}")
+                raise UsageError(
+                    f"{option} needs --trainer backprop, but the trainer is {self.trainer}; give --trainer "
+                    "backprop"
+                )
 
     def prepare(self, points: Correspondences) -> tuple[Correspondences, dict[str, Any]]:
         """Read the given files; return the points and the library's keyword arguments.
@@ -86,7 +91,7 @@ class Estimation:
         """
         if self.image_size is not None:
             if points.image_size not in (None, self.image_size):
-                note([f"--image-size replaces the image_size of {points.source}"])
+                note([f"--image-size is used instead of the image_size in {points.source}"])
             points = replace(points, image_size=self.image_size)
         arguments: dict[str, Any] = {
             "type": int(self.type),
@@ -126,21 +131,21 @@ class Estimation:
             return points.image_center
         if points.image_size is None:
             raise UsageError(
-                f"--type 2 needs the image centre, and {points.source} names neither image_center nor "
+                f"--type 2 needs the image centre, but {points.source} has neither image_center nor "
                 "image_size; give --image-center U V"
             )
         width, height = points.image_size
         center = (width - 1) / 2, (height - 1) / 2
         warn(
             [
-                f"no image centre is given; the middle of the image, ({center[0]:g}, {center[1]:g}), is "
-                "taken, and a real lens's centre may be tens of pixels away"
+                "no image centre is given, so the middle of the image, "
+                f"({center[0]:g}, {center[1]:g}), is used; the true centre may be tens of pixels away"
             ]
         )
         return center
 
 
-def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, CameraFile]:
+def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera]:
     """Read a known camera; give the points its image size if they have none.
 
     Raises
@@ -156,9 +161,9 @@ def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, C
             points = replace(points, image_size=camera.image_size)
         elif points.image_size != tuple(camera.image_size):
             raise InputError(
-                f"{path}: made for images of {camera.image_size[0]} x {camera.image_size[1]} px, but "
-                f"{points.source} has {points.image_size[0]} x {points.image_size[1]}; give the camera "
-                "at the size of the points"
+                f"{path}: the camera is for images of {camera.image_size[0]} x {camera.image_size[1]} px, "
+                f"but {points.source} has {points.image_size[0]} x {points.image_size[1]} px; give a camera "
+                "for this image size"
             )
     return points, camera
 
@@ -192,14 +197,14 @@ _GIVEN = [
         type=INPUT,
         metavar="CAMERA.yaml",
         show_default="none",
-        help="Type 3: the known camera, a neurocal, ROS or OpenCV file.",
+        help="With --type 3: the known camera, a neurocal, ROS or OpenCV file.",
     ),
     click.option(
         "--extrinsics",
         type=INPUT,
         metavar="CAMERA.yaml",
         show_default="none",
-        help="Type 4: a neurocal file with the known poses of the views.",
+        help="With --type 4: a neurocal file with the known pose of each view.",
     ),
 ]
 
@@ -210,70 +215,70 @@ _OPTIONS = [
         "type",
         type=click.Choice(["1", "2", "3", "4"]),
         default="1",
-        help="What is unknown: 1 all, 2 all but the image centre, 3 the pose, 4 the intrinsic parameters.",
+        help="What is known: 1 nothing, 2 the image centre, 3 the intrinsic parameters, 4 the poses.",
     ),
     click.option(
         "--image-center",
         type=FiniteNumber(),
         nargs=2,
         metavar="U V",
-        show_default="image_center of POINTS, else the middle of the image",
-        help="Type 2: the known image centre in pixels.",
+        show_default="image_center in POINTS, else the middle of the image",
+        help="With --type 2: the known image centre in pixels.",
     ),
     click.option(
         "--image-size",
         type=click.IntRange(min=1),
         nargs=2,
         metavar="W H",
-        show_default="image_size of POINTS",
+        show_default="image_size in POINTS",
         help="Width and height of the images in pixels.",
     ),
     click.option(
         "--method",
         type=click.Choice(["neuro"]),
         default="neuro",
-        help="How to estimate: neuro trains the network.",
+        help="Estimation method: neuro trains the network and refines its result by bundle adjustment.",
     ),
     click.option(
         "--trainer",
         type=click.Choice(["lm", "backprop"]),
         default="lm",
-        help="How the network learns: Levenberg-Marquardt, or the paper's back-propagation.",
+        help="Training of the network: lm is Levenberg-Marquardt, backprop is the paper's back-propagation.",
     ),
     click.option(
         "--starts",
         type=click.IntRange(min=2),
         metavar="N",
         default=20,
-        help="Try at most this many random starts until two of them agree.",
+        help="Maximum number of random starts. Training ends when two of them agree.",
     ),
     click.option(
         "--seed",
         type=click.IntRange(min=0),
         metavar="S",
         default=0,
-        help="Seed of the random weights; the same seed gives the same file.",
+        help="Seed of the random weights. The same seed gives the same output.",
     ),
     click.option(
         "--epochs",
         type=click.IntRange(min=1),
         metavar="N",
         show_default="50000",
-        help="Backprop: pass over the points at most this many times.",
+        help="With --trainer backprop: maximum number of passes over the points.",
     ),
     click.option(
         "--rate",
         type=FiniteNumber(positive=True),
         metavar="RATE",
         show_default="0.05",
-        help="Backprop: learning rate of the weights.",
+        help="With --trainer backprop: learning rate of the weights.",
     ),
     click.option(
         "--rate-gamma",
         type=FiniteNumber(positive=True),
         metavar="RATE",
         show_default="0.4",
-        help="Backprop: learning rate of the factors gamma.",
+        help="With --trainer backprop: learning rate of the scale factors gamma.",
     ),
     click.option(
         "--distortion",
@@ -281,20 +286,21 @@ _OPTIONS = [
             ["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"]
         ),
         default="auto",
-        help="Lens model, estimated with everything else, coefficients as in OpenCV; none is the pinhole, "
-        "auto the simplest model that predicts data left out as well as any; plumb-line takes k1, k2, p1 and "
-        "p2 from the images of straight lines alone.",
+        help="Distortion model, with coefficients as in OpenCV; none is a pinhole camera. auto compares the "
+        "models by cross-validation and chooses the simplest one whose error is as low as any. plumb-line "
+        "estimates k1, k2, p1 and p2 from the straight lines of the target alone.",
     ),
     click.option(
         "--no-skew",
         is_flag=True,
-        help="Hold the angle between the image axes at 90 degrees.",
+        show_default="estimate the angle",
+        help="Fix the angle between the image axes at 90 degrees.",
     ),
     click.option(
         "--outliers",
         type=click.Choice(["reject", "keep"]),
         default="reject",
-        help="What to do with points, and whole views, that contradict the others: reject names them and "
-        "leaves them out, keep uses all of them.",
+        help="Treatment of outliers, which are points or whole views that contradict the others: reject "
+        "leaves them out and lists them, keep uses all points.",
     ),
 ]

@@ -32,49 +32,65 @@ _VERTICES = click.IntRange(2, 1000)
     metavar="IMAGE...",
     type=INPUT,
     cls=Argument,
-    description="Images of one camera (PNG, JPEG, TIFF, BMP, PGM, PPM; of 8 or 16 bits), folders of them, "
-    "or patterns; - is standard input.",
+    description="Images of one camera (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits), folders of "
+    "images, or file name patterns; - is standard input.",
 )
 @click.option(
-    "--board", metavar="BOARD.yaml", type=INPUT, show_default="none", help="Board of one plane or several."
+    "--board",
+    metavar="BOARD.yaml",
+    type=INPUT,
+    show_default="none",
+    help="Board file; a board may have several planes.",
 )
-@click.option("--cols", metavar="C", type=_VERTICES, show_default="none", help="Inner vertices in a row.")
-@click.option("--rows", metavar="R", type=_VERTICES, show_default="none", help="Rows of inner vertices.")
 @click.option(
-    "--square", metavar="S", type=FiniteNumber(positive=True), show_default="none", help="Side of a square."
+    "--cols",
+    metavar="C",
+    type=_VERTICES,
+    show_default="none",
+    help="Number of inner vertices in a row of the board.",
+)
+@click.option(
+    "--rows", metavar="R", type=_VERTICES, show_default="none", help="Number of rows of inner vertices."
+)
+@click.option(
+    "--square",
+    metavar="S",
+    type=FiniteNumber(positive=True),
+    show_default="none",
+    help="Side length of a square.",
 )
 @click.option(
     "--unit",
     metavar="UNIT",
     show_default="mm",
-    help="Unit of --square, for the file; a board file has its own.",
+    help="Unit of --square. A board file names its own unit.",
 )
 @click.option(
     "--points",
     type=click.Choice(["midpoints", "vertices"]),
     default="midpoints",
-    help="Measure the mid-points of the squares' edges, or the inner vertices.",
+    help="Points to measure: the mid-points of the squares' edges, or the inner vertices.",
 )
 @click.option(
     "--gamma",
     metavar="G",
     type=FiniteNumber(positive=True),
     show_default="unknown",
-    help="Gamma of the images, 2.2 for many cameras; unknown, its effect is corrected a little less well.",
+    help="Gamma of the images, 2.2 for many cameras. The points are slightly more accurate if it is given.",
 )
 @click.option(
     "--overlay",
     metavar="DIR",
     type=click.Path(readable=False),
     show_default="none",
-    help="Draw what was found over each image, as DIR/VIEW.png.",
+    help="Draw the detected points over each image and write it to DIR/VIEW.png.",
 )
 @click.option(
     "--jobs",
     metavar="N",
     type=click.IntRange(min=1),
     show_default="the number of cores",
-    help="Processes that share the images.",
+    help="Number of processes that examine images at the same time.",
 )
 @output_option("POINTS.csv", "the points")
 def detect(
@@ -90,23 +106,30 @@ def detect(
     jobs: int | None,
     output: str,
 ) -> None:
-    """Find chessboards in images and measure the mid-points of their squares' edges.
+    """Detect chessboards in images and measure points on them.
 
-    The board is named by the number of its inner vertices and the side of a square, or by a file
-    that may hold several planes. Each image becomes a view, named after its file. Boards that are
-    partly hidden or cut by the image's border are used where their visible ends tell which part
-    is seen. Points have the same id in all images: vertex 0:0 is the corner, in dark inner square,
-    where OpenCV's findChessboardCorners begins; if the number of columns and rows are both even or
-    both odd, a board looks the same after a turn, and a warning says so.
+    Describe the board by --cols, --rows and --square, or by a board file. Each image becomes a view
+    with the name of its file. A board that is partly hidden or cut off by the image is used if enough
+    of its outer border is visible to tell which part it is.
 
-    The points, CSV with the covariance of each and the direction across its edge (nu,nv), in which a
-    mid-point is measured by itself, go to standard output or to -o. Images without the board are named
-    on standard error with the reason.
+    A point has the same id in all images. Vertex 0:0 is the corner where OpenCV's
+    findChessboardCorners begins; the inner square there is dark. If the numbers of columns and rows
+    are both even or both odd, the board looks the same after a turn of 180 degrees, and a warning
+    says so.
+
+    The command writes the points as CSV, each with its covariance. A mid-point is measured only in
+    the direction (nu,nv) across its edge. Images in which no board is detected are listed on standard
+    error with the reason.
 
     \b
     Examples:
-      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 -o points.csv
-      neurocal detect left*.jpg --board corner.yaml --overlay seen | neurocal calibrate -
+      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
+          --unit mm -o points.csv
+      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
+          --points vertices --gamma 1 --jobs 2 --overlay overlays \\
+          | neurocal calibrate - -o camera.yaml
+      echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
+      neurocal detect sample_data/board*.png --board board.yaml -o points.csv
     """  # noqa: D301 - as in the group
     check_one_stdin(*images, board)
     compute_in_one_thread()
@@ -125,14 +148,14 @@ def _board(
     if path is not None:
         if numbers != (None, None, None) or unit is not None:
             raise UsageError(
-                "--board tells the size and the unit; leave out --cols, --rows, --square and --unit"
+                "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
             )
         from neurocal_cli.io.board_yaml import read_board
 
         return read_board(path)
     if cols is None or rows is None or square is None:
         raise UsageError(
-            "the board is not described; give --cols, --rows and --square, or --board BOARD.yaml"
+            "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
         )
     return Board.single(cols, rows, square, "mm" if unit is None else unit)
 
@@ -167,9 +190,9 @@ def _examined(
 
 def _check_overlay(folder: str, paths: Sequence[str]) -> None:
     if os.path.exists(folder) and not os.path.isdir(folder):
-        raise UsageError(f"--overlay {folder}: is a file; give a folder")
+        raise UsageError(f"--overlay {folder} is a file; give a folder")
     if os.path.realpath(folder) in {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}:
-        raise UsageError(f"--overlay {folder}: holds the images themselves; give a folder of its own")
+        raise UsageError(f"--overlay {folder} is the folder of the images; give another folder")
 
 
 def _report(outcomes: Sequence[tuple[str, Outcome]]) -> None:
@@ -188,9 +211,9 @@ def _report(outcomes: Sequence[tuple[str, Outcome]]) -> None:
         what = (
             "the image does not show" if len(outcomes) == 1 else f"none of the {len(outcomes)} images shows"
         )
-        raise NeurocalError(f"{what} the board; the reason stands above")
+        raise NeurocalError(f"{what} the board; see the reason above")
     say(
-        f"found the board in {len(found)} of {len(outcomes)} images: "
+        f"board detected in {len(found)} of {len(outcomes)} images: "
         f"{sum(len(detection.ids) for detection in found)} points, "
         f"{sum(detection.rejected for detection in found)} rejected"
     )

@@ -24,13 +24,15 @@ __all__ = ["evaluate"]
 
 @click.group()
 def evaluate() -> None:
-    """Measure how good a result is.
+    """Measure the error of a calibrated camera or stereo rig.
 
     \b
     Examples:
+      neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
-      neurocal evaluate camera camera.yaml other_points.csv --json
-      neurocal evaluate stereo left.yaml right.yaml
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          -o rig.yaml
+      neurocal evaluate stereo rig.yaml
     """  # noqa: D301 - as in the group
 
 
@@ -43,7 +45,7 @@ evaluate.add_command(stereo)
     metavar="CAMERA.yaml",
     type=INPUT,
     cls=Argument,
-    description="A calibration written by neurocal; with POINTS.csv also a ROS or OpenCV camera; - is "
+    description="A calibration that neurocal wrote. With POINTS.csv also a ROS or OpenCV file; - is "
     "standard input.",
 )
 @click.argument(
@@ -52,31 +54,30 @@ evaluate.add_command(stereo)
     type=INPUT,
     required=False,
     cls=Argument,
-    description="Points to judge the camera by; without them, those it was calibrated from.",
+    description="Points to evaluate the camera on; without them, those it was calibrated from.",
 )
 @json_option
 def camera(calibration: str, points: str | None, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
 
-    Every point is projected through the camera and compared with the pixel where it was seen. The
-    error of a set of points is sqrt(mean(du^2 + dv^2)), with du, dv = predicted minus observed; bias
-    is the mean of du and of dv.
+    The residuals of a point are du and dv, its projected pixel minus its observed pixel. The rms error
+    is sqrt(mean(du^2 + dv^2)); the bias is the mean of du and of dv.
 
-    Without POINTS.csv the camera is judged by the points it was calibrated from, which flatters it.
-    With points of views that the calibration does not know, the pose of each such view is fitted
-    first, with the intrinsic parameters fixed (calibration type 3), and the view is marked `fitted`;
-    views that the calibration knows keep their calibrated pose. Points behind the camera are counted
-    and kept out of all averages.
+    Without POINTS.csv the points of the calibration itself are used, and the error is too optimistic.
+    With POINTS.csv a view of the calibration keeps its calibrated pose. The pose of any other view is
+    fitted first, with the intrinsic parameters fixed, and the view is marked `fitted`. Points behind
+    the camera are counted but are not part of any average.
 
-    A calibration is also given a verdict, from the points it was calibrated from: the error on data
-    left out, the points' own precision, whether halves of the data agree, how much of the image they
-    cover and how far predicted pixels can be trusted.
+    A calibration also gets a verdict. It rests on the points of the calibration: the cross-validation
+    error, the noise floor, the agreement of two halves of the data, the coverage of the image and the
+    uncertainty of predicted pixels.
 
     \b
     Examples:
+      neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
-      neurocal evaluate camera camera.yaml other_points.csv --json
-      cat points.csv | neurocal calibrate - | neurocal evaluate camera -
+      neurocal evaluate camera camera.yaml sample_data/stereo_left.csv --json
+      cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
     check_one_stdin(calibration, points)
     evaluation, verdict = _evaluate(calibration, _read_points(points))
@@ -99,11 +100,11 @@ def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluati
     """Evaluate a calibration or, given points, any camera file: then all poses are fitted."""
     from neurocal_cli.evaluation import evaluate_camera
     from neurocal_cli.io.calibration_yaml import read_calibration
-    from neurocal_cli.verdict.assessment import judged
+    from neurocal_cli.verdict.assessment import assess
 
     try:
         calibration = read_calibration(name)
-        return evaluate_camera(calibration, points), judged(calibration)
+        return evaluate_camera(calibration, points), assess(calibration)
     except FormatError as error:
         if points is None or name == "-":
             raise
@@ -111,7 +112,7 @@ def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluati
             points, camera = given_camera(name, points)
         except FormatError:
             raise error from None  # no camera file of any kind: tell why it is no calibration
-        note([f"only the intrinsic parameters and the lens are used: {error}"])
+        note([f"only the intrinsic parameters and the distortion are used: {error}"])
     return evaluate_camera(camera, points), None
 
 
@@ -119,7 +120,7 @@ def _tell(evaluation: CameraEvaluation) -> None:
     fitted = evaluation.fitted_views
     if fitted:
         names = ", ".join(fitted[:5]) + (", ..." if len(fitted) > 5 else "")
-        note([f"{names}: not in the calibration, so the pose is fitted with the intrinsic parameters fixed"])
+        note([f"{names}: not in the calibration; the pose is fitted with the intrinsic parameters fixed"])
     warn(evaluation.warnings)
 
 

@@ -29,7 +29,7 @@ __all__ = ["stereo"]
     required=True,
     type=INPUT,
     cls=Argument,
-    description="The calibrations of the left and the right camera, with --points also ROS or OpenCV ones; "
+    description="The calibrations of the left and the right camera, with --points also ROS or OpenCV files; "
     "or one RIG.yaml with both; - is standard input.",
 )
 @click.option(
@@ -37,39 +37,48 @@ __all__ = ["stereo"]
     nargs=2,
     metavar="LEFT.csv RIGHT.csv",
     type=INPUT,
-    show_default="those that the cameras were calibrated from",
-    help="Points of both cameras to judge them by.",
+    show_default="the points of the calibrations",
+    help="Points of both cameras to evaluate them on.",
 )
 @click.option(
     "--method",
     type=click.Choice(["optimal", "linear", "midpoint"]),
     default="optimal",
-    help="How to triangulate: least squares on the pixels, linear equations, or the middle between the rays.",
+    help="Triangulation: optimal is least squares on the pixels, linear solves linear equations, midpoint "
+    "takes the middle between the two rays.",
 )
 @json_option
 def stereo(cameras: tuple[str, ...], points: tuple[str, str] | None, method: str, as_json: bool) -> None:
-    """Measure how well two calibrated cameras tell where points are in space.
+    """Measure the triangulation error of two calibrated cameras.
 
-    Every point that both cameras saw is triangulated and compared with where it truly is: on the target,
-    put into the left camera's frame (x right, y down, z depth) by the view's pose. All errors are in that
-    frame and in the target's unit; NSCE is the normalised error of Weng, Cohen and Herniou, 1 being the
-    rounding of a pixel; the epipolar error is the smallest shift of both pixels that makes their rays meet.
+    Every point that both cameras saw is triangulated and compared with its true position on the target.
+    The errors are in the frame of the left camera (X right, Y down, Z depth) and in the unit of the target.
+    NSCE is the normalised stereo calibration error of Weng, Cohen and Herniou; a value of 1 corresponds to
+    rounding to whole pixels. The epipolar error is the smallest shift of both pixels that makes their rays
+    meet.
 
-    Points are triangulated twice: with the two poses of each view, and through one rig that is fitted to all
-    views, which is how other points will be. Views pair by name: equal names, else names equal without
-    left, l, cam0 and right, r, cam1 (left01 and right01). Points pair by their ids, else by X, Y, Z.
+    Each point is triangulated twice: with the two poses of its view, and with one rig that is fitted to all
+    views. The error of the rig is what to expect for new points.
 
-    Without --points, the cameras are judged by the points they were calibrated from, which flatters them;
-    the poses of views that the calibrations do not know are fitted.
+    Two views are a pair if their names are equal, or equal without left, l, cam0 and right, r, cam1 (such
+    as left01 and right01). Points are paired by their ids, else by X, Y, Z.
+
+    Without --points the points of the calibrations themselves are used, and the errors are too optimistic.
+    With --points the poses of views that are not in the calibrations are fitted.
 
     \b
     Examples:
-      neurocal evaluate stereo left.yaml right.yaml
-      neurocal evaluate stereo left.yaml right.yaml --points more_left.csv more_right.csv --json
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          -o rig.yaml
       neurocal evaluate stereo rig.yaml
+      neurocal calibrate sample_data/stereo_left.csv -o left.yaml
+      neurocal calibrate sample_data/stereo_right.csv -o right.yaml
+      neurocal evaluate stereo left.yaml right.yaml --method linear --json
+      neurocal evaluate stereo left.yaml right.yaml \\
+          --points sample_data/stereo_left.csv sample_data/stereo_right.csv
     """  # noqa: D301 - as in the group
     if len(cameras) > 2:
-        raise UsageError(f"evaluate stereo takes two calibrations or one rig, not {len(cameras)} files")
+        raise UsageError(f"there are {len(cameras)} files; give two calibrations, or one rig")
     check_one_stdin(*cameras, *(points or ()))
     evaluation = _evaluate(cameras, _read_points(points), method)
     from neurocal_cli.stereo.report import views_alone
@@ -77,7 +86,7 @@ def stereo(cameras: tuple[str, ...], points: tuple[str, str] | None, method: str
     note(views_alone(evaluation.alone))
     if evaluation.fitted:
         names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
-        note([f"{names}: not in the calibrations, so the poses are fitted with the cameras fixed"])
+        note([f"{names}: not in the calibrations; the poses are fitted with the cameras fixed"])
     warn(evaluation.warnings)
     _show(evaluation, as_json)
 
@@ -125,7 +134,7 @@ def _camera(name: str, points: Correspondences) -> Calibration:
             points, camera = given_camera(name, points)
         except FormatError:
             raise error from None  # no camera file of any kind: tell why it is no calibration
-        note([f"only the intrinsic parameters and the lens are used, and the poses fitted: {error}"])
+        note([f"only the intrinsic parameters and the distortion are used; the poses are fitted: {error}"])
     return calibrate(points, type=3, intrinsics=camera, outliers="keep")
 
 

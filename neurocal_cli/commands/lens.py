@@ -38,7 +38,7 @@ _LENS = click.argument(
     metavar="LENS.yaml",
     type=INPUT,
     cls=Argument,
-    description="A lens written by `neurocal lens fit`; - is standard input.",
+    description="A lens that `neurocal lens fit` wrote; - is standard input.",
 )
 
 
@@ -48,13 +48,16 @@ def _plot_option(what: str) -> Callable[[F], F]:
         metavar="FILE.png",
         type=click.Path(writable=False, readable=False),
         show_default="none",
-        help=f"Draw {what} to this .png, .pdf or .svg file.",
+        help=f"Plot {what} to this .png, .pdf or .svg file.",
     )
 
 
 @click.group()
 def lens() -> None:
-    """Calibrate a camera whose zoom and focus move.
+    """Calibrate a zoom lens, whose zoom and focus change.
+
+    Neural networks learn how the parameters of the camera depend on the settings of zoom and focus.
+    They then give the camera at any setting. The paper calls such a lens an active lens.
 
     \b
     Examples:
@@ -72,54 +75,60 @@ def lens() -> None:
     metavar="POINTS...",
     type=INPUT,
     cls=Argument,
-    description="CSV files with columns zoom and/or focus and X,Y,Z,u,v (and optionally view), read "
-    "as one; or "
-    "known cameras: zoom and/or focus, alpha_u,alpha_v,u0,v0 (and t_z), or zoom and/or focus and "
-    "camera, the name of a calibration file; - is standard input.",
+    description="CSV files of points with the columns zoom and/or focus, X,Y,Z,u,v and optionally view; or "
+    "of known cameras with zoom and/or focus and alpha_u,alpha_v,u0,v0 (and t_z), or with zoom and/or focus "
+    "and camera, the name of a calibration file. Several files are read as one; - is standard input.",
 )
 @click.option(
     "--distortion",
     type=click.Choice(["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye"]),
     default="auto",
-    help="Lens model, a network for each coefficient; auto takes the simplest that settings held out "
-    "do not deny.",
+    help="Distortion model, with a network for each coefficient; none is a pinhole camera. auto chooses a "
+    "richer model only if it lowers the cross-validation error over the settings.",
 )
 @click.option(
     "--training",
     type=click.Choice(["joint", "alternating"]),
     default="joint",
-    help="The last step: all weights at once, or networks and calibrating net in turns as in the paper.",
+    help="Last step of the training: joint changes all weights at once, alternating trains the networks of "
+    "the parameters and the calibrating network in turn, as in the paper.",
 )
 @click.option(
     "--camera",
     type=click.Choice(["auto", "still", "moving"]),
     default="auto",
-    help="still: camera and target stand still; moving: a pose for each view; auto: still if each "
-    "setting has one view.",
+    help="Motion of the camera relative to the target: still is none, moving estimates a pose for each view, "
+    "auto is still if each setting has one view.",
 )
 @click.option(
     "--hidden",
     type=click.IntRange(0, _MOST_UNITS),
     nargs=2,
     metavar="N1 N2",
-    show_default="chosen by the data",
-    help="Tanh units of each network: of the first layer for each control, and of the second.",
+    show_default="chosen from the data",
+    help="Size of each network: number of tanh units in the first layer, for each of zoom and focus, and in "
+    "the second layer.",
 )
 @click.option(
     "--outliers",
     type=click.Choice(["reject", "keep"]),
     default="reject",
-    help="Leave out settings whose data contradict those of all others, or keep them.",
+    help="Treatment of settings that contradict the others: reject leaves them out, keep uses them all.",
 )
-@click.option("--no-skew", is_flag=True, help="Hold the angle between the image axes at 90 degrees.")
+@click.option(
+    "--no-skew",
+    is_flag=True,
+    show_default="estimate the angle",
+    help="Fix the angle between the image axes at 90 degrees.",
+)
 @click.option(
     "--seed",
     type=click.IntRange(min=0),
     metavar="S",
     default=0,
-    help="Seed of the random weights; the same seed gives the same file.",
+    help="Seed of the random weights. The same seed gives the same output.",
 )
-@_plot_option("each parameter over the settings with its band, and the errors,")
+@_plot_option("each parameter over the settings, with its uncertainty, and the errors")
 @output_option("LENS.yaml", "the lens")
 @click.pass_context
 def fit(
@@ -135,25 +144,30 @@ def fit(
     plot: str | None,
     output: str,
 ) -> None:
-    """Learn how a camera follows zoom and focus, from points at many settings.
+    """Learn how the camera depends on zoom and focus.
 
-    Each setting is calibrated by itself; then a neural network for each of alpha_u, alpha_v, u0, v0
-    and t_z (and for each distortion coefficient) learns how it follows the settings; then all the
-    networks learn together with the calibrating net on the pixel error of all settings. The other
-    parameters are constants. The camera and the target stand still; or each setting has several views
-    of a flat board, and then t_z is no parameter. How many settings are needed is a question of how
-    much the lens bends between them: 5 of each control are a good start.
+    The input is points at many settings of zoom and focus. First, each setting is calibrated by itself.
+    Then a neural network for each of alpha_u, alpha_v, u0, v0 and t_z, and for each distortion
+    coefficient, learns how the parameter depends on the setting. Finally, all networks are trained
+    together to reduce the reprojection error at all settings. The other parameters are the same at all
+    settings.
 
-    Settings are in your own units (encoder counts, millimetres). Instead of points, a table of known
-    cameras will do; networks are fitted to it.
+    Keep the camera and the target still while the lens changes. Or take several views of a flat board
+    at each setting; then t_z is not a parameter of the lens. Five values each of zoom and focus are a
+    good start; a lens whose parameters change quickly needs more.
 
-    The lens, a YAML file, goes to standard output or to -o; a summary to standard error.
+    Settings are in your own units, such as encoder counts or millimetres. A table of known cameras
+    may be given instead of points.
+
+    The command writes the lens as a YAML file. It prints a summary on standard error.
 
     \b
     Examples:
       neurocal lens fit sample_data/zoom.csv -o lens.yaml
-      neurocal lens fit sample_data/zoom.csv --distortion k1 --plot lens.png -o lens.yaml
-      neurocal lens fit cameras.csv | neurocal lens camera - --zoom 35
+      neurocal lens fit sample_data/zoom.csv --distortion k1 --no-skew \\
+          --camera still --training alternating --plot lens.png -o lens.yaml
+      neurocal lens fit sample_data/zoom.csv --hidden 2 2 --outliers keep --seed 1 \\
+          -o lens.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     check_one_stdin(*points)
@@ -206,9 +220,11 @@ def _check_plot(plot: str | None, output: str | None) -> None:
     if plot is None:
         return
     if not plot.lower().endswith(_PICTURES):
-        raise UsageError(f"--plot {plot}: the name must end in {', '.join(_PICTURES)}")
+        raise UsageError(
+            f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
+        )
     if output not in (None, "-") and os.path.realpath(str(output)) == os.path.realpath(plot):
-        raise UsageError("-o and --plot name the same file; give each its own")
+        raise UsageError("-o and --plot name the same file; give two different files")
     from neurocal_cli.plots import check_available
 
     check_available()
@@ -228,11 +244,20 @@ def _write(learnt: ZoomLens, output: str, plot: str | None) -> None:
 
 @lens.command(cls=Command)
 @_LENS
-@click.option("--zoom", type=FiniteNumber(), metavar="Z", show_default="none", help="Zoom setting.")
-@click.option("--focus", type=FiniteNumber(), metavar="F", show_default="none", help="Focus setting.")
-@click.option("--extrapolate", is_flag=True, help="Allow a setting outside the calibrated range.")
 @click.option(
-    "--camera-name", metavar="NAME", default="camera", help="Name of the camera, written to the file."
+    "--zoom", type=FiniteNumber(), metavar="Z", show_default="none", help="Zoom setting of the camera."
+)
+@click.option(
+    "--focus", type=FiniteNumber(), metavar="F", show_default="none", help="Focus setting of the camera."
+)
+@click.option(
+    "--extrapolate",
+    is_flag=True,
+    show_default="refuse such a setting",
+    help="Allow a setting outside the calibrated range.",
+)
+@click.option(
+    "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
 )
 @output_option("CAMERA.yaml", "the calibration")
 def camera(
@@ -243,19 +268,21 @@ def camera(
     camera_name: str,
     output: str,
 ) -> None:
-    """Give the camera that a lens is at one setting.
+    """Write the camera at one setting of a zoom lens.
 
-    An ordinary calibration file, with standard deviations, goes to standard output or to -o. It holds
-    no points, and for a camera that stood still it holds the pose, as of the view `view`.
+    The output is an ordinary calibration file with standard deviations. It contains no points. If the
+    camera stood still during the calibration, it contains the pose as that of the view `view`.
 
     \b
     Examples:
+      neurocal lens fit sample_data/zoom.csv -o lens.yaml
       neurocal lens camera lens.yaml --zoom 1250 --focus 400 -o camera.yaml
-      neurocal lens camera lens.yaml --zoom 1250 --focus 400 | neurocal evaluate camera - points.csv
+      neurocal lens camera lens.yaml --zoom 3100 --focus 400 --extrapolate \\
+          --camera-name tele -o tele.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     if not camera_name.strip() or not camera_name.isprintable():
-        raise UsageError("--camera-name must be a name of printable characters")
+        raise UsageError("--camera-name must hold printable characters only; give another name")
     from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.lens_yaml import read_lens
     from neurocal_cli.zoom_lens.camera_at import camera_at
@@ -278,21 +305,24 @@ def camera(
     metavar="POINTS.csv",
     type=INPUT,
     cls=Argument,
-    description="Points with columns zoom and/or focus, at any settings; - is standard input.",
+    description="A CSV file of points at any settings, with the columns zoom and/or focus; - is standard "
+    "input.",
 )
-@_plot_option("the error over the settings, and beside it the rivals',")
+@_plot_option("the error over the settings, and the errors of the baseline models")
 @json_option
 def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> None:
-    """Measure the error of a lens at other settings, beside that of the usual models.
+    """Measure the reprojection error of a zoom lens.
 
-    The rivals are made from the same calibration data: a lookup table with linear and with spline
-    interpolation, thin-plate splines, polynomials of degree 1 to 6; each parameter by itself, and
-    (joint) all together with the constants. A camera that stood still is judged with its own pose,
-    otherwise the pose of each view is fitted with the intrinsic parameters held.
+    The error is compared with that of baseline models. These are fitted to the data that the lens was
+    calibrated from: a lookup table with linear and with spline interpolation, thin-plate splines, and
+    polynomials of degree 1 to 6. Each is fitted to one parameter at a time, and (joint) to all parameters
+    at once. If the camera stood still during the calibration, its pose is used; otherwise the pose of
+    each view is fitted with the intrinsic parameters fixed.
 
     \b
     Examples:
-      neurocal lens evaluate lens.yaml sample_data/zoom_between.csv
+      neurocal lens fit sample_data/zoom.csv -o lens.yaml
+      neurocal lens evaluate lens.yaml sample_data/zoom_between.csv --plot errors.png
       neurocal lens evaluate lens.yaml sample_data/zoom_between.csv --json
     """  # noqa: D301 - as in the group
     compute_in_one_thread()

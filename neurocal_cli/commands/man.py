@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import textwrap
 from collections.abc import Iterator
 
 import click
@@ -15,39 +16,40 @@ __all__ = ["man", "man_pages"]
 
 _EXIT_STATUS = (
     ("0", "Done."),
-    ("1", "The data cannot give an answer: unreadable, malformed or degenerate. No file was changed."),
+    ("1", "The data give no answer: they are unreadable, malformed or degenerate. No file was changed."),
     ("2", "Wrong usage."),
-    ("3", "An answer was written, but training did not converge; it says `converged: false`."),
+    ("3", "A result was written, but training did not converge; the file says `converged: false`."),
     ("130", "Interrupted."),
 )
 
 _FILES = (
     (
         "POINTS.csv",
-        "A line for each known point, with columns X, Y, Z (world) and u, v (pixels; the centre of the "
-        "top-left pixel is 0, 0), and optionally view, which names the image. Columns are found by the "
-        "names in the first line, in any order; five columns without a first line of names are X, Y, Z, "
-        "u, v. Lines that begin with # are comments or say `image_size: 640 480`, `image_center: 320 240` "
-        "or `unit: mm`.",
+        "One line for each known point. The columns X, Y, Z are the world point; u, v are its pixel, where "
+        "(0, 0) is the centre of the top-left pixel; the optional column view names the image. The first "
+        "line names the columns, in any order. A file without this line has the five columns X, Y, Z, u, v. "
+        "Lines that begin with # are comments or give `image_size: 640 480`, `image_center: 320 240` or "
+        "`unit: mm`.",
     ),
     (
         "CAMERA.yaml",
-        "A ROS camera_info file with one more block, `neurocal`: all parameters with their standard "
-        "deviations, the pose of each view, how the training went, and the points.",
+        "A ROS camera_info file with one more block, `neurocal`. It contains all parameters with their "
+        "standard deviations, the pose of each view, a record of the training, and the points.",
     ),
     (
         "RIG.yaml",
-        "Two calibrations, `left` and `right`, and `stereo`: how the right camera stands to the left one, "
-        "X_right = R X_left + t.",
+        "Two calibrations, `left` and `right`, and `stereo`, the pose of the right camera relative to the "
+        "left one, X_right = R X_left + t.",
     ),
     (
         "MATCHES.csv",
-        "A line for each point seen by both cameras, with columns uL, vL, uR, vR (pixels of the images as "
-        "taken) and optionally point, an id.",
+        "One line for each point that both cameras saw. The columns uL, vL, uR, vR are its pixels in the "
+        "original images; the optional column point is its id.",
     ),
 )
 
-_ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, unexpected errors show where in the program they arose."),)
+_WIDTH = 78  # of lines of the source
+_ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, an unexpected error shows where in the program it arose."),)
 
 
 @click.command(hidden=True)
@@ -56,7 +58,7 @@ _ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, unexpected errors show where in
     metavar="DIR",
     type=click.Path(file_okay=False),
     cls=Argument,
-    description="Folder for the pages.",
+    description="Folder for the man pages.",
 )
 @click.pass_context
 def man(ctx: click.Context, directory: str) -> None:
@@ -124,7 +126,7 @@ def _split_help(text: str) -> tuple[str, list[str], list[str]]:
     paragraphs = [p for p in re.split(r"\n\s*\n", _dedent(text)) if p.strip()]
     examples = [p for p in paragraphs if p.startswith("\b\nExamples:")]
     others = [p for p in paragraphs[1:] if p not in examples]
-    lines = [line.strip() for p in examples for line in p.splitlines()[2:]]
+    lines = [line.removeprefix("  ") for p in examples for line in p.splitlines()[2:]]
     return " ".join(paragraphs[0].split()), others, lines
 
 
@@ -185,7 +187,7 @@ def _neighbours(name: str, names: list[str]) -> list[str]:
 
 
 def _section(title: str, body: list[str]) -> list[str]:
-    return [f".SH {title}", *body] if body else []
+    return [f".SH {title}", *(body[1:] if body[:1] == [".PP"] else body)] if body else []
 
 
 def _prose(paragraphs: list[str]) -> list[str]:
@@ -194,8 +196,8 @@ def _prose(paragraphs: list[str]) -> list[str]:
         if paragraph.startswith("\b\n"):
             lines += _verbatim(paragraph.splitlines()[1:])
         else:
-            lines += [".PP", _escape(" ".join(paragraph.split()))]
-    return lines[1:] if lines[:1] == [".PP"] else lines
+            lines += [".PP", *_fill(paragraph)]
+    return lines
 
 
 def _verbatim(text: list[str]) -> list[str]:
@@ -204,7 +206,13 @@ def _verbatim(text: list[str]) -> list[str]:
 
 
 def _terms(rows: tuple[tuple[str, str], ...] | list[tuple[str, str]]) -> list[str]:
-    return [line for term, text in rows for line in (".TP", rf"\fB{_escape(term)}\fR", _escape(text))]
+    return [line for term, text in rows for line in (".TP", rf"\fB{_escape(term)}\fR", *_fill(text))]
+
+
+def _fill(text: str) -> list[str]:
+    """Lines of running text, none of which troff would read as a request."""
+    lines = textwrap.wrap(_escape(text), _WIDTH, break_long_words=False, break_on_hyphens=False)
+    return [rf"\&{line}" if line.startswith((".", "'")) else line for line in lines]
 
 
 def _escape(text: str) -> str:

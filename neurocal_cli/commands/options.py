@@ -83,7 +83,8 @@ def points_argument(f: F) -> F:
         metavar="POINTS...",
         type=INPUT,
         cls=Argument,
-        description="CSV files with columns X,Y,Z,u,v and optionally view, read as one; - is standard input.",
+        description="CSV files with the columns X,Y,Z,u,v and optionally view. Several files are read as "
+        "one; - is standard input.",
     )(f)
 
 
@@ -96,15 +97,19 @@ def output_option(metavar: str, what: str) -> Callable[[F], F]:
         type=click.Path(writable=False, readable=False, allow_dash=True),
         default="-",
         show_default="standard output",
-        help=f"Write {what} to this file, whole or not at all.",
+        help=f"Write {what} to this file.",
     )
 
 
 def json_option(f: F) -> F:
     """Add ``--json``, for programs that read the result."""
-    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of a table.")(
-        f
-    )
+    return click.option(
+        "--json",
+        "as_json",
+        is_flag=True,
+        show_default="print tables",
+        help="Print one JSON object instead of tables.",
+    )(f)
 
 
 def plot_option(f: F) -> F:
@@ -114,7 +119,7 @@ def plot_option(f: F) -> F:
         metavar="FILE.png",
         type=click.Path(writable=False, readable=False),
         show_default="none",
-        help="Draw the errors and the learning curve to this .png, .pdf or .svg file.",
+        help="Plot the residuals and the learning curve to this .png, .pdf or .svg file.",
     )(f)
 
 
@@ -131,9 +136,11 @@ def check_plot(plot: str | None, output: str) -> None:
     if plot is None:
         return
     if not plot.lower().endswith(_PICTURES):
-        raise UsageError(f"--plot {plot}: the name must end in {', '.join(_PICTURES)}")
+        raise UsageError(
+            f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
+        )
     if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
-        raise UsageError("-o and --plot name the same file; give each its own")
+        raise UsageError("-o and --plot name the same file; give two different files")
     from neurocal_cli.plots import check_available
 
     check_available()

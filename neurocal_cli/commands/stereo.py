@@ -40,22 +40,22 @@ _NOT_CONVERGED = 3
     type=INPUT,
     metavar="CAMERA.yaml",
     show_default="none",
-    help="The left camera, if it is known: a neurocal, ROS or OpenCV file (type 3 for it alone).",
+    help="The left camera, if it is known: a neurocal, ROS or OpenCV file. Only its poses are estimated.",
 )
 @click.option(
     "--right-intrinsics",
     type=INPUT,
     metavar="CAMERA.yaml",
     show_default="none",
-    help="The right camera, if it is known.",
+    help="The right camera, if it is known. Only its poses are estimated.",
 )
 @click.option(
     "--alpha",
     type=click.FloatRange(0, 1),
     metavar="A",
     show_default="not scaled",
-    help="Scale the rectified images so that all their pixels have been seen (0) or all that was seen is in "
-    "them (1).",
+    help="Zoom of the rectified images: 0 shows valid pixels only, 1 shows all pixels of the original "
+    "images.",
 )
 @click.option(
     "--ros",
@@ -63,7 +63,7 @@ _NOT_CONVERGED = 3
     metavar="LEFT.yaml RIGHT.yaml",
     type=click.Path(writable=False, readable=False),
     show_default="none",
-    help="Also write two files that ROS's stereo nodes read, in metres.",
+    help="Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
 @plot_option
 @output_option("RIG.yaml", "the rig")
@@ -80,24 +80,36 @@ def stereo(
     plot: str | None,
     output: str,
 ) -> None:
-    """Calibrate two cameras and how the right one stands to the left, X_right = R X_left + t.
+    """Calibrate two cameras and the pose of the right one relative to the left one.
 
-    Each camera's network learns from random weights as in `neurocal calibrate`, whose options hold for both.
-    The views that both cameras saw then agree on one rig, and both cameras, the rig and all poses are refined
-    together. Views of one camera alone help that camera.
+    The pose of the right camera is X_right = R X_left + t. Each camera is first calibrated by itself as
+    in `neurocal calibrate`; the options of that command apply to both cameras. A bundle adjustment then
+    refines both cameras, the rig and all poses together. A view of one camera alone helps that camera.
 
-    Views pair by name: equal names, else names equal without left, l, cam0 and right, r, cam1 (left01 and
-    right01). Points pair by their ids, else by X, Y, Z. Pairs of views that contradict the others are named:
-    a board turned in one image, images exchanged, or not taken at the same moment.
+    Two views are a pair if their names are equal, or equal without left, l, cam0 and right, r, cam1 (such
+    as left01 and right01). Points are paired by their ids, else by X, Y, Z. Pairs of views that contradict
+    the others are named with the likely reason: the board is turned in one image, the images are exchanged,
+    or they were not taken at the same moment.
 
-    The rig, a YAML file with both calibrations, R, t, E, F, the baseline and the rectification as OpenCV
-    defines it, goes to standard output or to -o; a summary with standard deviations to standard error.
+    The command writes the rig as a YAML file: both calibrations, R, t, E, F, the baseline, and the
+    rectification as OpenCV defines it. It prints a summary with standard deviations on standard error.
 
     \b
     Examples:
-      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv -o rig.yaml
-      neurocal stereo left.csv right.csv --no-skew --left-intrinsics left.yaml
-      neurocal stereo left.csv right.csv | neurocal evaluate stereo -
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          -o rig.yaml --plot errors.png --ros left.yaml right.yaml --alpha 0
+      neurocal calibrate sample_data/stereo_left.csv -o left.yaml
+      neurocal calibrate sample_data/stereo_right.csv -o right.yaml
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          --left-intrinsics left.yaml --right-intrinsics right.yaml -o rig.yaml
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          --no-skew --distortion k1 --outliers keep --image-size 640 480 \\
+          --method neuro --starts 40 --seed 1 | neurocal evaluate stereo -
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          --type 2 --image-center 319.5 239.5 -o rig.yaml
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          --trainer backprop --epochs 20000 --rate 0.05 --rate-gamma 0.4 \\
+          -o rig.yaml
     """  # noqa: D301 - as in the group
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
@@ -116,14 +128,14 @@ def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
     """What is asked for one camera."""
     if estimation.type == "4":
         raise UsageError(
-            "--type 4 knows the poses of all views, so there is no rig to find; calibrate each camera by "
-            "itself"
+            "with --type 4 the poses of all views are known, so there is no rig to estimate; use neurocal "
+            "calibrate for each camera"
         )
     if intrinsics is None:
         if estimation.type == "3":
             raise UsageError(
-                "--type 3 needs both cameras; give --left-intrinsics and --right-intrinsics, or leave out "
-                "--type"
+                "--type 3 needs both known cameras; give --left-intrinsics and --right-intrinsics, or leave "
+                "out --type"
             )
         return estimation
     return replace(
@@ -139,7 +151,7 @@ def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
 def _check_outputs(output: str, ros: tuple[str, str] | None) -> None:
     names = [os.path.realpath(name) for name in (output, *(ros or ())) if name != "-"]
     if len(set(names)) < len(names):
-        raise UsageError("-o and --ros name the same file twice; give each its own")
+        raise UsageError("-o and --ros name the same file twice; give three different files")
 
 
 def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], estimation: Estimation) -> Rig:

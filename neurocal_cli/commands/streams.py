@@ -43,4 +43,4 @@ def is_terminal(stream: TextIO | None) -> bool:
 def check_one_stdin(*names: str | None) -> None:
     """Refuse a request to read standard input twice."""
     if names.count("-") > 1:
-        raise UsageError("standard input (-) can be read only once; put the rest in files")
+        raise UsageError("standard input (-) can be read only once; give the other inputs as files")

@@ -30,50 +30,58 @@ _MANY_OFF = 0.5  # share of the points that no bad luck explains
     required=True,
     type=INPUT,
     cls=Argument,
-    description="A rig, or LEFT.yaml RIGHT.yaml, two calibrations that share a view; then the pixels, "
-    "columns uL,vL,uR,vR and optionally point. - is standard input.",
+    description="A rig, or LEFT.yaml RIGHT.yaml, two calibrations with a view in common; then a CSV file of "
+    "pixels with the columns uL,vL,uR,vR and optionally point. - is standard input.",
 )
 @click.option(
     "--sigma",
     type=FiniteNumber(positive=True),
     metavar="PX",
-    show_default="what the calibration's own points had",
-    help="Standard deviation of the pixels, in u and in v.",
+    show_default="the noise of the calibration's points",
+    help="Standard deviation of the pixels, in u and in v, for the covariances.",
 )
 @click.option(
     "--epipolar-limit",
     type=FiniteNumber(positive=True),
     metavar="PX",
     show_default="5 sigma",
-    help="Flag points whose pixels must move by more than this for their rays to meet.",
+    help="Flag points whose pixels must be moved by more than this for their rays to meet.",
 )
 @output_option("XYZ.csv", "the points")
 def triangulate(
     inputs: tuple[str, ...], sigma: float | None, epipolar_limit: float | None, output: str
 ) -> None:
-    """Find points in space from their pixels in the left and the right image.
+    """Compute points in space from their pixels in the left and the right image.
 
-    The pixels are those of the images as taken: distorted, not rectified. Each point is the one whose two
-    images are nearest to its pixels, by least squares. X, Y, Z are in the left camera's frame (X right, Y
-    down, Z forward) and in the calibration's unit; sXX to sZZ is their covariance for pixels of standard
-    deviation --sigma, the cameras taken for exact; epipolar is by how much both pixels together must move
-    for their rays to meet. No row is dropped; the column flag says
+    Give the pixels of the original images, neither undistorted nor rectified. The command computes the
+    point with the smallest squared reprojection error. It writes a row with these columns for each point:
 
     \b
-      ok      nothing is wrong
-      off     the pixels are not each other's: far off the epipolar lines
-      behind  not in front of both cameras, or at infinity; nan if nowhere
+      X, Y, Z     the point in the frame of the left camera (X right, Y down,
+                  Z forward), in the unit of the calibration
+      sXX to sZZ  its covariance, for pixels of standard deviation --sigma and
+                  cameras without error
+      epipolar    the smallest shift of both pixels that makes their rays meet
+      flag        ok, or off: the pixels are too far from their epipolar lines,
+                  or behind: the point is behind a camera or at infinity
 
-    Rows are read and written as they come, so there may be any number of them.
+    A point that does not exist has X, Y, Z of nan. No row is dropped. The rows are processed in batches, so
+    the file may have any length.
 
     \b
     Examples:
-      neurocal triangulate rig.yaml matches.csv -o xyz.csv
-      neurocal triangulate left.yaml right.yaml matches.csv --sigma 0.3
-      cat matches.csv | neurocal triangulate rig.yaml - > xyz.csv
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          -o rig.yaml
+      neurocal triangulate rig.yaml sample_data/matches.csv -o xyz.csv
+      neurocal triangulate rig.yaml sample_data/matches.csv --sigma 0.3 \\
+          --epipolar-limit 2
+      cat sample_data/matches.csv | neurocal triangulate rig.yaml - > xyz.csv
     """  # noqa: D301 - as in the group
     if len(inputs) not in (2, 3):
-        raise UsageError("triangulate takes RIG.yaml MATCHES.csv or LEFT.yaml RIGHT.yaml MATCHES.csv")
+        raise UsageError(
+            f"{len(inputs)} file{'s' * (len(inputs) > 1)} given; give RIG.yaml MATCHES.csv, or LEFT.yaml "
+            "RIGHT.yaml MATCHES.csv"
+        )
     check_one_stdin(*inputs)
     rig = _rig(inputs[:-1])
     from neurocal_cli.io.files import write_chunks
@@ -106,7 +114,7 @@ def _rig(names: tuple[str, ...]) -> Rig:
     left, right = (read_calibration(name) for name in names)
     rig = fit_rig(left, right)
     views = "1 view" if len(rig.pairs) == 1 else f"{len(rig.pairs)} views"
-    note([f"the rig is fitted to {views} that both cameras saw: baseline {rig.baseline:.6g} {rig.unit}"])
+    note([f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}"])
     warn(rig.warnings)
     return rig
 
@@ -137,16 +145,18 @@ class _Tally:
         """Say what came out, on stderr."""
         parts = [f"{self.points} point{'s' * (self.points != 1)}"]
         if self.off:
-            parts.append(f"{self.off} off their epipolar lines by more than {self.limit:.3g} px")
+            parts.append(f"{self.off} more than {self.limit:.3g} px off their epipolar lines")
         if self.behind:
-            parts.append(f"{self.behind} behind a camera or nowhere")
+            parts.append(f"{self.behind} behind a camera or at infinity")
         say(", ".join(parts))
         if self.outside:
-            warn([f"{self.outside} pixels lie outside their images; check that the cameras belong to them"])
+            warn(
+                [f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras"]
+            )
         if self.off + self.behind > _MANY_OFF * self.points:
             warn(
                 [
-                    "most points are off or behind; check that uL,vL are the left camera's pixels, and that "
-                    "they are those of the images as taken, neither undistorted nor rectified"
+                    "most points are flagged off or behind; check that uL,vL are pixels of the left camera, "
+                    "and that the pixels are neither undistorted nor rectified"
                 ]
             )

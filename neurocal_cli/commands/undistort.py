@@ -16,8 +16,8 @@ from neurocal_cli.commands.streams import check_one_stdin, is_terminal, note, on
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
+    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.distortion.remapping import Remapping
-    from neurocal_cli.io.camera_files import CameraFile
 
 __all__ = ["undistort"]
 
@@ -28,7 +28,7 @@ __all__ = ["undistort"]
     metavar="CAMERA.yaml",
     type=INPUT,
     cls=Argument,
-    description="The camera and its lens, a neurocal, ROS or OpenCV file; - is standard input.",
+    description="The camera, a neurocal, ROS or OpenCV file; - is standard input.",
 )
 @click.argument(
     "files",
@@ -37,21 +37,21 @@ __all__ = ["undistort"]
     metavar="FILE...",
     type=INPUT,
     cls=Argument,
-    description="Images (PNG, JPEG, TIFF, BMP, PGM, PPM; of 8 or 16 bits, grey or colour), folders of them, "
-    "patterns, or CSV files of points; - is points from standard input.",
+    description="Images (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits, grey or colour), folders of "
+    "images, file name patterns, or CSV files of points; - is points from standard input.",
 )
 @click.option(
     "--alpha",
     metavar="ALPHA",
     type=FiniteNumber(),
     show_default="keep the camera matrix",
-    help="Zoom so that only seen pixels are shown (0), all seen pixels are shown (1), or in between.",
+    help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
 )
 @click.option(
     "--interpolation",
     type=click.Choice(["nearest", "linear", "cubic", "lanczos"]),
     default="cubic",
-    help="How pixels of images are interpolated.",
+    help="Interpolation between the pixels of an image.",
 )
 @click.option(
     "--camera",
@@ -59,7 +59,7 @@ __all__ = ["undistort"]
     metavar="NEW.yaml",
     type=click.Path(writable=False, readable=False),
     show_default="none",
-    help="Write the camera of the corrected images, a ROS camera_info file without distortion.",
+    help="Write the camera of the undistorted images to this file, as a ROS camera_info without distortion.",
 )
 @click.option(
     "-o",
@@ -68,7 +68,7 @@ __all__ = ["undistort"]
     type=click.Path(writable=False, readable=False, allow_dash=True),
     default="-",
     show_default="standard output",
-    help="Write to this folder, under the names of the inputs; or one input to this file.",
+    help="Write to this folder, under the names of the inputs. A single input may go to a file.",
 )
 def undistort(
     camera: str,
@@ -78,27 +78,31 @@ def undistort(
     new_camera: str | None,
     output: str,
 ) -> None:
-    """Take a lens's distortion off images and points.
+    """Remove the lens distortion from images and points.
 
-    What comes out is what a camera without the lens would have seen. By default its camera matrix is
-    that of CAMERA.yaml, skew included, and images keep their size. With --alpha it is as from OpenCV's
-    getOptimalNewCameraMatrix: 0 shows the largest rectangle in which every pixel was seen, 1 all pixels
-    that were seen, and what was not is black. --camera writes the matrix.
+    The result is what a pinhole camera would have seen. By default its camera matrix is that of
+    CAMERA.yaml, skew included, and the images keep their size. With --alpha the matrix is that of
+    OpenCV's getOptimalNewCameraMatrix: 0 shows the largest rectangle of valid pixels, 1 shows all
+    pixels of the original image and fills the rest with black. --camera writes the new matrix.
 
-    Images go to a folder as PNG, or one image to a file of any kind. Images that cannot be corrected,
-    such as those of another size than the camera's, are named on standard error and left out. Points
-    keep their names and coordinates X,Y,Z; u,v and their covariances are corrected. A pixel that the
-    lens cannot have seen is an error. Inputs are never overwritten.
+    Several images are written to a folder as PNG; a single image may go to a file of any of the
+    kinds above. An image that cannot be undistorted, for example one of another size, is reported on
+    standard error and left out. In a CSV file of points, u,v and their covariances are undistorted.
+    A pixel that the distortion model cannot produce is an error. Inputs are never overwritten.
 
     \b
     Examples:
-      neurocal undistort camera.yaml left*.png -o straight
-      neurocal undistort camera.yaml frame.png --alpha 0 --camera new.yaml -o frame_straight.png
-      neurocal undistort camera.yaml points.csv | neurocal calibrate - --distortion none
+      neurocal calibrate sample_data/flat.csv --distortion k1 -o camera.yaml
+      neurocal undistort camera.yaml sample_data/flat.csv -o undistorted.csv
+      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
+          | neurocal calibrate - --distortion k1 -o small.yaml
+      neurocal undistort small.yaml sample_data/board*.png -o undistorted
+      neurocal undistort small.yaml sample_data/board01.png --alpha 0 \\
+          --interpolation linear --camera new.yaml -o board01_undistorted.png
     """  # noqa: D301 - as in the group
     check_one_stdin(camera, *files)
     if alpha is not None and not 0 <= alpha <= 1:
-        raise UsageError(f"--alpha {alpha:g}: must lie between 0 and 1")
+        raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
     from neurocal_cli.io.camera_files import read_intrinsics
     from neurocal_cli.io.image_paths import find_images
 
@@ -126,15 +130,15 @@ def _folder(paths: Sequence[str], output: str) -> str | None:
     several = len(paths) > 1
     if output == "-":
         if several:
-            raise UsageError("several files need a folder to go to; give -o DIR")
+            raise UsageError("several files cannot go to standard output; give a folder, -o DIR")
         if _is_image(paths[0]) and is_terminal(sys.stdout):
-            raise UsageError("an image is nothing to show on a terminal; give -o FILE")
+            raise UsageError("an image cannot be shown on a terminal; give a file, -o FILE")
         return None
     unlike = _is_image(paths[0]) and not _is_image(output)
     if not (several or os.path.isdir(output) or output.endswith(os.sep) or unlike):
         return None
     if os.path.exists(output) and not os.path.isdir(output):
-        raise UsageError(f"-o {output}: is a file; give a folder")
+        raise UsageError(f"-o {output} is a file; give a folder")
     return output
 
 
@@ -155,7 +159,7 @@ def _check_outputs(camera: str, paths: Sequence[str], outputs: Sequence[str], ne
     for target, source in targets:
         place = os.path.realpath(target) if target != "-" else "-"
         if place in read:
-            raise UsageError(f"{target} is an input and would be overwritten; give -o another place")
+            raise UsageError(f"{target} is an input and would be overwritten; give another output")
         if place in taken:
             raise UsageError(f"{taken[place]} and {source} would both be written to {target}; rename one")
         taken[place] = source
@@ -176,7 +180,7 @@ def _correct_all(work: _Work, paths: Sequence[str], outputs: Sequence[str]) -> i
                 say(one_line(str(error)))
             progress(f"{number} of {len(paths)} files", number / len(paths))
     if not done:
-        raise NeurocalError(f"none of the {len(paths)} files could be corrected; the reasons stand above")
+        raise NeurocalError(f"none of the {len(paths)} files could be undistorted; see the reasons above")
     return done
 
 
@@ -184,7 +188,7 @@ def _correct_all(work: _Work, paths: Sequence[str], outputs: Sequence[str]) -> i
 class _Work:
     """One camera, what is prepared for its images, and what there is to say."""
 
-    camera: CameraFile
+    camera: Camera
     alpha: float | None
     interpolation: str
     folder: str | None
@@ -212,14 +216,14 @@ class _Work:
 
     def _image(self, path: str, output: str) -> bytes:
         from neurocal_cli.distortion.remapping import Remapping
-        from neurocal_cli.distortion.undistortion import undistortion
+        from neurocal_cli.distortion.undistortion import undistorted_camera
         from neurocal_cli.io.images import encode_image, read_picture
 
         picture = read_picture(path)
         if self.remapping is None:
             self.size = self.size or picture.size
-            step = undistortion(self.camera, self.alpha, self.size)
-            self.remapping = Remapping(step, self.size, self.interpolation)
+            new = undistorted_camera(self.camera, self.alpha, self.size)
+            self.remapping = Remapping(self.camera, new, self.size, self.interpolation)
         try:
             corrected = self.remapping(picture.pixels)
             content = encode_image(corrected, ".png" if output == "-" else os.path.splitext(output)[1])
@@ -237,8 +241,8 @@ class _Work:
         self.size = self.size or points.image_size
         if points.image_size not in (None, self.size):
             raise InputError(
-                f"{points.source}: its image_size is {_size(points.image_size)}, the camera's "
-                f"{_size(self.size)}; give the camera at the size of the points"
+                f"{points.source}: the image_size is {_size(points.image_size)}, but the camera is for "
+                f"{_size(self.size)}; give a camera for this image size"
             )
         corrected = undistort_points(replace(points, image_size=self.size), self.camera, self.alpha)
         note(notes)
@@ -250,12 +254,12 @@ class _Work:
 
     def write_camera(self, path: str) -> None:
         """Write the camera of what was corrected."""
-        from neurocal_cli.distortion.undistortion import undistortion
+        from neurocal_cli.distortion.undistortion import undistorted_camera
         from neurocal_cli.io.camera_info import format_camera_info
         from neurocal_cli.io.files import write_whole
 
-        step = undistortion(self.camera, self.alpha, self.size)
-        write_whole(path, format_camera_info(self.camera.camera_name, self.size, step.new.A))
+        new = undistorted_camera(self.camera, self.alpha, self.size)
+        write_whole(path, format_camera_info(new.name, self.size, new.A))
 
 
 def _size(size: tuple[int, int] | None) -> str:

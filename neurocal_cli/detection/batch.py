@@ -100,7 +100,7 @@ def examine_all(paths: Sequence[str], task: Task, jobs: int = 1) -> Iterator[Out
     try:
         yield from pool.map(examine, paths, [task] * len(paths))
     except BrokenProcessPool as error:
-        raise NeurocalError("a process was stopped, perhaps for want of memory; use --jobs 1") from error
+        raise NeurocalError("a process was stopped, perhaps for lack of memory; use --jobs 1") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
@@ -143,9 +143,9 @@ def _remarks(found: Detection, board: Board) -> Iterator[str]:
     seen = {one.plane.name for one in found.located}
     names = [plane.name for plane in board.planes if plane.name not in seen]
     if names:
-        yield f"without {' and '.join(names)}: not found, or not to be told from something else"
+        yield f"no points of {' and '.join(names)}: not detected, or ambiguous"
     if found.rejected > len(found.ids):
-        yield "most points are rejected: blurred, shaken or reflecting; look at the overlay"
+        yield "most points are rejected: the image may be blurred, or the board may reflect; see --overlay"
 
 
 def keep_memory() -> None:

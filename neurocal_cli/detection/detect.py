@@ -163,7 +163,7 @@ def _check_enough(measured: Iterable[Measured]) -> None:
     found, rejected = np.sum([(len(one.kind), one.rejected) for one in measured], axis=0)
     if found < _FEWEST:
         share = f"{found} of {found + rejected} points"
-        raise NoBoardError(f"only {share} of the board can be measured; show it sharper or nearer")
+        raise NoBoardError(f"only {share} of the board can be measured; take a sharper or nearer image")
 
 
 def _directions(measured: Measured) -> Array:
@@ -225,8 +225,8 @@ def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Corresponde
         if one.image_size != found[0].image_size:
             sizes = ["{} x {}".format(*each.image_size) for each in (one, found[0])]
             raise InputError(
-                f"the image {name} has {sizes[0]} px but {names[0]} has {sizes[1]} px; detect the images of "
-                "each camera by themselves"
+                f"the image {name} has {sizes[0]} px but {names[0]} has {sizes[1]} px; run detect "
+                "for each camera separately"
             )
     return Correspondences(
         np.concatenate([one.world for one in found]),

@@ -1,4 +1,4 @@
-"""Every lens model fitted to the same points, each from the one before it."""
+"""Every distortion model fitted to the same points, each from the one before it."""
 
 from __future__ import annotations
 
@@ -7,25 +7,27 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.cross_validation import held_out_points, held_out_views
-from neurocal_cli.bundle_adjustment.job import Job
-from neurocal_cli.bundle_adjustment.observability import parameter_count, refuse_undetermined
+from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks
-from neurocal_cli.bundle_adjustment.problem import Known
+from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import Lens, bend, coefficient_names, pinhole_coefficients
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.distortion.monotonic_fit import MonotonicFit, fit_monotonic, where_not_monotonic
+from neurocal_cli.camera.distortion import coefficient_names, distort, pinhole_coefficients
+from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
-from neurocal_cli.points import Correspondences
 
 __all__ = ["Candidate", "falls_short", "fit_candidates", "supported", "worth"]
 
+# Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
+# tests/test_lens_starts.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
+# the tightest with which all of these end as they do; penalties and tests against 0 are chi-squared levels,
+# as said beside them.
+#
 # A fisheye's coefficients beyond the first few are of use only when the points reach far out.
 _FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
 # What each model has more than a simpler one.
@@ -44,42 +46,39 @@ _LARGEST_TERM = 3.0  # of one coefficient at the farthest point; all terms toget
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A lens model fitted to the points.
+    """A distortion model fitted to the points.
 
     Attributes
     ----------
-    known : Known
-        With the model to be estimated.
+    problem : Problem
+        With the model to be estimated, and what keeps it monotonic.
     adjusted : Adjusted
     lost : array
         Squared error of each part of the data when it is left out.
     noise : bool
         Whether its coefficients are noise.
-    folds : str or None
-        Where it folds back, within the points or within the image.
+    not_monotonic : str or None
+        Where it is not monotonic: within the "points" or within the "image".
     determined : bool
         Whether the points leave no parameter open.
-    restraint : MonotonicFit or None
-        What keeps it from folding back.
     """
 
-    known: Known
+    problem: Problem
     adjusted: Adjusted
     lost: Array
     noise: bool
-    folds: str | None
+    not_monotonic: str | None
     determined: bool
-    restraint: MonotonicFit | None = None
 
     @property
     def sound(self) -> bool:
         """Whether it may be chosen."""
-        return not self.noise and self.folds is None and self.determined
+        return not self.noise and self.not_monotonic is None and self.determined
 
     @property
     def coefficients(self) -> int:
-        """How many of the lens's coefficients were estimated."""
-        return int(self.known.free_camera[5:].sum())
+        """How many distortion coefficients were estimated."""
+        return int(self.problem.free_camera[5:].sum())
 
     @property
     def cost(self) -> float:
@@ -92,137 +91,125 @@ class Candidate:
         return float(n * np.log(max(self.cost, 1e-300)) + penalty)
 
 
-def supported(known: Known, model: str, views: Views) -> Known | None:
-    """What is known with this model to be estimated; None when there are too few points for it."""
-    # Coefficients that stay as they are belong to another model.
-    fixed = known.fixed & set(INTRINSIC_NAMES)
-    with_lens = replace(known, lens=Lens(model), free_lens=model != "none", fixed=fixed)
-    equations = views.n_distinct_equations
-    if model != "none" and equations < _SPARE * parameter_count(with_lens, views.n_views) + 4:
+def supported(problem: Problem, model: str) -> Problem | None:
+    """The problem with this model to be estimated; None when there are too few points for it."""
+    with_model = problem.with_model(model)
+    equations = problem.views.n_distinct_equations
+    if model != "none" and equations < _SPARE * with_model.n_parameters + 4:
         return None
-    return with_lens
+    return with_model
 
 
-def fit_candidates(
-    job: Job, state: CameraState, points: Correspondences, by_views: bool
-) -> dict[str, Candidate]:
+def fit_candidates(problem: Problem, state: CameraState, by_views: bool) -> dict[str, Candidate]:
     """Fit every model, beginning with a state of any of them.
 
     Parameters
     ----------
-    job : Job
+    problem : Problem
     state : CameraState
-    points : Correspondences
-        With the image's size, for `folds`.
     by_views : bool
-        Whether views are left out, or points.
+        Whether views are left out in cross-validation, or points.
     """
-    return _Bench(job, points, by_views, _reach(job.views, state)).all_from(state)
+    return _Chain(problem, by_views, _reach(problem.views, state)).all_from(state)
 
 
 @dataclass(frozen=True, eq=False)
-class _Bench:
+class _Chain:
     """What all fits have in common.
 
     Attributes
     ----------
-    job : Job
-    points : Correspondences
+    problem : Problem
     by_views : bool
     reach : float
         Of the points.
     """
 
-    job: Job
-    points: Correspondences
+    problem: Problem
     by_views: bool
     reach: float
 
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
         fitted: dict[str, Candidate] = {}
         for model in ("none", *_CHAIN):
-            known = supported(self.job.known, model, self.job.views)
-            candidate = None if known is None else self._fit(known, state)
+            problem = supported(self.problem, model)
+            candidate = None if problem is None else self._fit(problem, state)
             if candidate is None:
                 continue
             fitted[model] = candidate
-            if model != "none" and candidate.folds is None:
+            if model != "none" and candidate.not_monotonic is None:
                 state = candidate.adjusted.state
         for simple, more in zip(_CHAIN[-2::-1], _CHAIN[:0:-1], strict=True):
             self._fit_again(simple, more, fitted)
         fisheyes = self._fisheyes(state)
-        found = self._without_folds([*fitted.values(), *fisheyes])
+        found = self._monotonic([*fitted.values(), *fisheyes])
         fitted = dict(zip(fitted, found, strict=False))
-        best = _fewest_coefficients(found[len(fitted) :], self.job.views)
+        best = _fewest_coefficients(found[len(fitted) :], self.problem.views)
         return fitted if best is None else fitted | {"fisheye": best}
 
     def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
         """A model that is missing, or far behind one with more coefficients, lost its way: begin there."""
-        known = supported(self.job.known, simple, self.job.views)
-        if known is None or more not in fitted:
+        problem = supported(self.problem, simple)
+        if problem is None or more not in fitted:
             return
         cost = fitted[simple].cost if simple in fitted else np.inf
         if cost < _BEHIND * fitted[more].cost:
             return
-        candidate = self._fit(known, fitted[more].adjusted.state)
+        candidate = self._fit(problem, fitted[more].adjusted.state)
         if candidate is not None and candidate.cost < cost:
             fitted[simple] = candidate
 
     def _fisheyes(self, state: CameraState) -> list[Candidate]:
         """With one, two and four coefficients, each from the one before it."""
-        known = supported(self.job.known, "fisheye", self.job.views)
-        if known is None or self.reach < _WIDE:
+        problem = supported(self.problem, "fisheye")
+        if problem is None or self.reach < _WIDE:
             return []
         found = []
         for count, tail in _FISHEYES:
-            candidate = self._fit(replace(known, fixed=known.fixed | tail), state, count)
+            candidate = self._fit(replace(problem, fixed=problem.fixed | tail), state, count)
             if candidate is not None:
                 found.append(candidate)
                 state = candidate.adjusted.state
         return found
 
-    def _without_folds(self, fitted: list[Candidate]) -> list[Candidate]:
-        """The same models without folds that are but in corners which the points do not reach."""
+    def _monotonic(self, fitted: list[Candidate]) -> list[Candidate]:
+        """The same models, monotonic in the corners which the points do not reach."""
         lowest = min((c.cost for c in fitted), default=0.0)
-        near = [c.folds == "image" and not c.noise and c.cost <= _BEHIND * lowest for c in fitted]
-        if not any(near) or falls_short(self.job.views, fitted):
+        near = [c.not_monotonic == "image" and not c.noise and c.cost <= _BEHIND * lowest for c in fitted]
+        if not any(near) or falls_short(self.problem.views, fitted):
             return fitted
-        return [self._unfolded(c) if folds else c for c, folds in zip(fitted, near, strict=True)]
+        return [self._made_monotonic(c) if bad else c for c, bad in zip(fitted, near, strict=True)]
 
-    def _unfolded(self, candidate: Candidate) -> Candidate:
-        found = fit_monotonic(self.job.views, candidate.known, candidate.adjusted, self.points)
-        return candidate if found is None else self._judged(candidate.known, *found) or candidate
+    def _made_monotonic(self, candidate: Candidate) -> Candidate:
+        found = fit_monotonic(candidate.problem, candidate.adjusted)
+        return candidate if found is None else self._assessed(*found) or candidate
 
-    def _fit(self, known: Known, state: CameraState, most: int = 4) -> Candidate | None:
+    def _fit(self, problem: Problem, state: CameraState, most: int = 4) -> Candidate | None:
         """None when it did not settle, or too little is left for it without a part of the data."""
-        model = known.lens.model
+        model = problem.lens.model
         start = replace(state, lens=model, k=_coefficients(state, model, self.reach, most))
         steps = _RATIONAL_STEPS if model == "rational" else _STEPS
-        adjusted = adjust(self.job.views.batches, start, known.free_camera, known.free_poses, steps)
+        adjusted = problem.adjust(start, steps)
         if not adjusted.converged and model != "none":
             return None
-        return self._judged(known, adjusted)
+        return self._assessed(problem, adjusted)
 
-    def _judged(
-        self, known: Known, adjusted: Adjusted, restraint: MonotonicFit | None = None
-    ) -> Candidate | None:
-        views, state = self.job.views, adjusted.state
-        held = None if restraint is None else restraint.held(state, known.free_camera)
+    def _assessed(self, problem: Problem, adjusted: Adjusted) -> Candidate | None:
+        views, state, free = problem.views, adjusted.state, problem.free_camera
+        held = None if problem.restraint is None else normal_part(problem.restraint, state, free)
         if self.by_views:
-            lost = held_out_views(adjusted.normal, known.free_camera, known.free_poses, held)
+            lost = held_out_views(adjusted.normal, free, problem.free_poses, held)
         else:
-            lost = held_out_points(views, state, known.free_camera, known.free_poses, held)
+            lost = held_out_points(views, state, free, problem.free_poses, held)
         if not np.isfinite(lost).all():
             if state.lens != "none":
                 return None
             lost = np.full_like(lost, np.inf)
-        cov = covariance(adjusted.normal, known.free_camera, known.free_poses, views.n_equations)
-        noise = _noise(known, state, self.reach, cov.entries)
-        folds = where_not_monotonic(
-            Lens(state.lens, state.k), known.matrix(state.entries[0], views), self.points
-        )
-        determined = _determined(views, known, state, cov)
-        return Candidate(known, adjusted, lost, noise, folds, determined, restraint)
+        cov = covariance(adjusted.normal, free, problem.free_poses, views.n_equations)
+        noise = _noise(problem.lens.model, state, self.reach, cov.entries)
+        A = problem.matrix(state.entries[0])
+        bad = where_not_monotonic(state.distortion, A, problem.points)
+        return Candidate(problem, adjusted, lost, noise, bad, _determined(problem, state, cov))
 
 
 def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
@@ -250,20 +237,20 @@ def worth(views: Views, fitted: Collection[Candidate]) -> float:
     return effective_number(views.n_equations, correlation(views, point_residuals(views, closest)))
 
 
-def _determined(views: Views, known: Known, state: CameraState, cov: Covariance) -> bool:
+def _determined(problem: Problem, state: CameraState, cov: Covariance) -> bool:
     try:
-        refuse_undetermined(views, known, state, cov)
+        refuse_undetermined(problem, state, cov)
     except DegenerateGeometryError:
         return False
     return True
 
 
-def _noise(known: Known, state: CameraState, reach: float, cov: Array) -> bool:
+def _noise(model: str, state: CameraState, reach: float, cov: Array) -> bool:
     """Whether coefficients are noise: large ones that cancel each other, or new ones not told from 0.
 
     New ones are those that a simpler model does not have, taken together; a fisheye's may be 0.
     """
-    k, model = state.k, known.lens.model
+    k = state.k
     if (np.abs(_terms(model, reach) * k) > _LARGEST_TERM).any():
         return True
     new = _NEW.get(model, 0)
@@ -301,7 +288,7 @@ def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -
     # the straight one r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
     radial = [0.0 if name in ("p1", "p2") else k for name, k in old.items()]
-    bent = bend(state.lens, radial, r, np.zeros_like(r))[0][0]
+    bent = distort(state.lens, radial, r, np.zeros_like(r))[0]
     q = np.arctan(r) if fisheye else r
     of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][:most]
     powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)

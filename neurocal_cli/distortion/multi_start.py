@@ -1,53 +1,49 @@
-"""A lens model that was asked for, from another start where the first ends in a wrong minimum.
+"""A given choice of distortion model, fitted from other starts where the first ends in a local minimum.
 
-A strong lens can be told from a pinhole's mistakes only if the descent begins near it. Where the residuals of
-neighbours are alike, as a wrong lens leaves them (and a board that is not flat), every model is fitted, each
-from the one before it, from this start and from others; the wanted one is the best of these.
+The minimum of a strong distortion is found only from a start that is near it. Where the residuals of
+neighbours are correlated, as a wrong distortion leaves them (and a board that is not flat), every model is
+fitted, each from the one before it, from this start and from others; the best fit of the wanted model is
+the result.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
-from neurocal_cli.bundle_adjustment.job import Job, Solution
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
+from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.distortion.candidate_models import fit_candidates
-from neurocal_cli.points import Correspondences
 
 __all__ = ["with_more_starts"]
 
-_ALIKE = 0.15  # correlation of neighbours' residuals
+# Repeated by tests/test_lens_starts.py (slow: 200 lenses of each of five models): every local minimum there
+# showed more.
+_CORRELATED = 0.15  # correlation of neighbours' residuals
 
 
-def with_more_starts(
-    job: Job,
-    solution: Solution,
-    points: Correspondences,
-    more_starts: Callable[[], Iterable[CameraState]],
-) -> Solution:
-    """The better of a solution and what other starts lead to, where it may be a wrong minimum.
+def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[CameraState]]) -> Solution:
+    """The better of a solution and what other starts lead to, where it may be a local minimum.
 
     Parameters
     ----------
-    job : Job
-        With the model to be estimated; without one there is nothing to do.
     solution : Solution
-    points : Correspondences
+        Of a problem whose distortion model is to be estimated; without one there is nothing to do.
     more_starts : callable
         Other states to begin with.
     """
-    views, state = job.views, solution.adjusted.state
-    if not job.known.free_lens:
+    problem, best = solution.problem, solution.adjusted
+    if not problem.free_lens:
         return solution
-    if solution.adjusted.converged and correlation(views, point_residuals(views, state)) < _ALIKE:
+    views = problem.views
+    if best.converged and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
         return solution
-    best, cost = solution, float(solution.adjusted.cost.sum())
-    for start in (state, *more_starts()):
-        found = fit_candidates(job, start, points, by_views=False).get(job.known.lens.model)
-        if found is None or not found.adjusted.cost.sum() < cost:
+    for start in (best.state, *more_starts()):
+        found = fit_candidates(problem, start, by_views=False).get(problem.lens.model)
+        if found is None or not found.adjusted.cost.sum() < best.cost.sum():
             continue
-        adjusted = job.adjust(found.adjusted.state)
-        if adjusted.cost.sum() < cost:
-            best, cost = Solution(adjusted, job.tally), float(adjusted.cost.sum())
-    return best
+        adjusted = problem.adjust(found.adjusted)
+        if adjusted.cost.sum() < best.cost.sum():
+            best = adjusted
+    return replace(solution, adjusted=best)

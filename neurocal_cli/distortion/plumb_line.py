@@ -3,7 +3,7 @@
 No camera and no poses are needed. The lens is radial, k1 and k2 about a centre that is estimated as
 well, in pixels of a fixed scale s:
 
-    m = c + s bend(x; k1, k2),  x on straight lines
+    m = c + s distort(x; k1, k2),  x on straight lines
 
 Collinearity survives any homography, so lines tell nothing of the scale, the skew and the tilt of the
 ideal image, which stay as the form of the lens leaves them; the camera that is calibrated from the
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.measured_directions import rounded
 from neurocal_cli.bundle_adjustment.views import noise_model
 from neurocal_cli.calibration import StraightLines
-from neurocal_cli.camera.distortion_models import Lens
-from neurocal_cli.camera.monotonic import straightened
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, LinesSeen, find_lines
 from neurocal_cli.distortion.straightness import Curves, SeenLines, bent_lines, crookedness
 from neurocal_cli.errors import DegenerateGeometryError
@@ -43,7 +43,7 @@ _LARGEST_DAMPING = 1e8
 _SINGULAR = 1e-10  # eigenvalue of a normal matrix with unit diagonal
 _UNBENT = 1e-6  # share of what a lens moves points by that bends their lines: all go through the centre
 _UNTOLD = (
-    "the straight lines do not tell the lens; give points on lines all over the image, or use "
+    "the straight lines do not determine the distortion; give points on lines all over the image, or use "
     "--distortion none"
 )
 
@@ -59,7 +59,7 @@ class PlumbLine:
         Of distortion.
     scale : float [px]
         The unit s of its radii.
-    lens : Lens
+    lens : Distortion
     rms_before, rms : float [px]
         Distance of the points from straight lines, as seen, and from these lines seen through the lens:
         root of the sum of squares over equations less unknowns, all points alike.
@@ -68,7 +68,7 @@ class PlumbLine:
     lines: LinesSeen
     centre: Array
     scale: float
-    lens: Lens
+    lens: Distortion
     rms_before: float
     rms: float
 
@@ -88,12 +88,12 @@ class PlumbLine:
             A pixel that the lens cannot see.
         """
         x, y = ((points.pixels - self.centre) / self.scale).T
-        straight = np.column_stack(straightened(self.lens, x, y))
+        straight = np.column_stack(undistort(self.lens, x, y))
         lost = ~np.isfinite(straight[:, 0])
         if lost.any():
             row = int(np.argmax(lost))
             raise DegenerateGeometryError(
-                f"{points.place(row)}: the lens that the straight lines show cannot have seen anything at "
+                f"{points.place(row)}: the distortion that the straight lines show maps nothing to the pixel "
                 f"({points.pixels[row, 0]:g}, {points.pixels[row, 1]:g}); check this point, or use another "
                 "--distortion"
             )
@@ -118,15 +118,15 @@ def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> Plum
     equations = len(lines.row) - 2 * len(lines)
     if equations < _FEWEST_EQUATIONS:
         raise DegenerateGeometryError(
-            f"plumb-line needs straight lines of {FEWEST_ON_LINE} known points or more, and finds "
-            f"{len(lines) or 'none'}; give more points of each board, or use --distortion k1k2"
+            f"plumb-line finds too few straight lines of {FEWEST_ON_LINE} or more known points "
+            f"({len(lines) or 'none'}); give more points of each board, or use --distortion k1k2"
         )
     middle, scale = _frame(points)
     start = (np.asarray(centre) - middle) / scale if centre is not None else np.zeros(2)
     whitening = noise_model(points.covariance, points.across)[1]
     whitening = None if whitening is None else rounded(whitening, points.across)
     seen = lines_in_pixels(points, lines, middle, scale, whitening)
-    curves = bent_lines(seen, np.array([1.0, 0.0, 1.0, *start]), Lens(_MODEL))
+    curves = bent_lines(seen, np.array([1.0, 0.0, 1.0, *start]), Distortion(_MODEL))
     free = _COEFFICIENTS if centre is not None else _CENTRE + _COEFFICIENTS
     spare = equations - len(free)
     _check_lines(curves)
@@ -153,9 +153,9 @@ def lines_in_pixels(
     return SeenLines(lines, pixels, None if whitening is None else whitening[lines.row])
 
 
-def _start(curves: Curves) -> Lens:
+def _start(curves: Curves) -> Distortion:
     """The lens of some, of no fold, that makes the lines straightest: descent may not reach a strong one."""
-    lenses = [Lens(_MODEL, np.array([k1, max(-k1, 0.0) ** 2 / 2])) for k1 in _STRENGTHS]
+    lenses = [Distortion(_MODEL, np.array([k1, max(-k1, 0.0) ** 2 / 2])) for k1 in _STRENGTHS]
     crooked = [crookedness(curves.seen, curves.entries, lens) for lens in lenses]
     return lenses[int(np.argmin(crooked))]
 

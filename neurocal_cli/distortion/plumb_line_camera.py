@@ -30,8 +30,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
-from neurocal_cli.bundle_adjustment.job import Job, Solution
 from neurocal_cli.bundle_adjustment.measured_directions import rounded
+from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import (
     POSE,
     CameraState,
@@ -39,7 +39,9 @@ from neurocal_cli.bundle_adjustment.reprojection import (
     derivatives,
     normal_blocks,
 )
-from neurocal_cli.camera.distortion_models import Lens, bend, coefficient_names
+from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort_with_jacobian
+from neurocal_cli.camera.projection import normalised_points
 from neurocal_cli.distortion.plumb_line import PlumbLine, lines_in_pixels
 from neurocal_cli.distortion.straightness import CAMERA, Curves, bent_lines
 from neurocal_cli.errors import DegenerateGeometryError
@@ -58,14 +60,12 @@ _K = len(coefficient_names(MODEL))
 _BY_K = CAMERA + np.arange(_K)  # columns of the lines' derivatives
 
 
-def lens_and_camera(
-    job: Job, solution: Solution, plumb: PlumbLine, points: Correspondences
-) -> tuple[Job, Solution]:
+def lens_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondences) -> Solution:
     """Make lens and camera agree, from the result of the corrected points.
 
     Parameters
     ----------
-    job, solution
+    solution : Solution
         Of the corrected points, without a lens.
     plumb : PlumbLine
     points : Correspondences
@@ -73,7 +73,7 @@ def lens_and_camera(
 
     Returns
     -------
-    job, solution
+    Solution
         Of the points as they were seen, with the lens; `Solution.shared` is its covariance.
 
     Raises
@@ -81,7 +81,7 @@ def lens_and_camera(
     DegenerateGeometryError
         Lines and points do not tell lens and camera.
     """
-    views = job.views
+    problem, views = solution.problem, solution.problem.views
     order = slice(None) if views.order is None else views.order
     seen = replace(views, pixels=(points.pixels[order] - views.pixel_centre) / views.pixel_scale)
     weighed = whitening = views.whitening
@@ -92,27 +92,25 @@ def lens_and_camera(
     lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
     start = solution.adjusted.state
     start = replace(start, lens=MODEL, k=_same_lens(start.entries[0], seen.pixels, views.pixels))
-    known = replace(job.known, lens=Lens(MODEL, start.k), free_lens=True)
-    job = replace(job, views=seen, known=known, tally=job.tally)
-    together = _Together(job, bent_lines(lines, start.entries[0], Lens(MODEL, start.k)))
+    problem = replace(problem, points=points, views=seen, lens=Distortion(MODEL, start.k), free_lens=True)
+    together = _Together(problem, bent_lines(lines, start.entries[0], Distortion(MODEL, start.k)))
     adjusted = together.solved(start)
-    job.tally.refinements += adjusted.iterations
-    return job, Solution(adjusted, job.tally, together.covariance(adjusted))
+    done = solution.adjusted.iterations + adjusted.iterations
+    return replace(
+        solution,
+        problem=problem,
+        adjusted=replace(adjusted, iterations=done),
+        shared=together.covariance(adjusted),
+    )
 
 
 def _same_lens(entries: Array, seen: Array, corrected: Array) -> Array:
     """Coefficients that take corrected pixels to the seen ones, in the terms of a camera."""
-    x, y = _normalised(entries, corrected)
-    bent_x, bent_y = _normalised(entries, seen)
-    _, _, by = bend(MODEL, np.zeros(_K), x, y)
+    x, y = normalised_points(entries, *corrected.T)
+    bent_x, bent_y = normalised_points(entries, *seen.T)
+    _, _, by = distort_with_jacobian(MODEL, np.zeros(_K), x, y)
     columns = np.column_stack([np.concatenate(pair) for pair in by])
     return np.linalg.lstsq(columns, np.concatenate([bent_x - x, bent_y - y]), rcond=None)[0]
-
-
-def _normalised(entries: Array, pixels: Array) -> tuple[Array, Array]:
-    a, s, b, u0, v0 = entries
-    y = (pixels[:, 1] - v0) / b
-    return (pixels[:, 0] - u0 - s * y) / a, y
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,11 +138,11 @@ class _PointEquations:
 
 
 class _Together:
-    """The lines' and the points' equations of one job."""
+    """The lines' and the points' equations of one problem."""
 
-    def __init__(self, job: Job, curves: Curves) -> None:
-        self.job, self.curves = job, curves
-        self.free = np.flatnonzero(job.known.free)
+    def __init__(self, problem: Problem, curves: Curves) -> None:
+        self.problem, self.curves = problem, curves
+        self.free = np.flatnonzero(problem.free)
         self.columns = np.concatenate([self.free, _BY_K])  # of A and k among the lines' derivatives
 
     def solved(self, start: CameraState) -> Adjusted:
@@ -162,7 +160,7 @@ class _Together:
                 iterations += 1
                 if not taken:
                     break
-            normal, _ = normal_blocks(self.job.views.batches, state)
+            normal, _ = normal_blocks(self.problem.views.batches, state)
         return Adjusted(state, normal, normal[:, -1, -1].copy(), iterations, np.array([settled]))
 
     def _matrix(self, points: _PointEquations) -> tuple[Array, Array]:
@@ -175,22 +173,22 @@ class _Together:
         """Take the step, or as much of it as keeps the points in front and the lens fit_monotonic."""
         by_camera = np.zeros((1, 5 + _K))
         by_camera[0, self.columns] = step
-        by_pose = np.zeros((self.job.views.n_views, 6))
-        if self.job.known.free_poses:
+        by_pose = np.zeros((self.problem.views.n_views, 6))
+        if self.problem.free_poses:
             by_pose = points.pose_step - points.gain @ step
         length = 1.0
         for _ in range(_HALVINGS):
             trial = state.moved(length * by_camera, length * by_pose)
             if (trial.entries[0, [0, 2]] > 0).all() and np.isfinite(trial.k).all():
                 curves = self.curves.seen_through(trial.entries[0], trial.k).settled()
-                if curves.sensible and normal_blocks(self.job.views.batches, trial)[1].all():
+                if curves.sensible and normal_blocks(self.problem.views.batches, trial)[1].all():
                     self.curves = curves
                     return trial, length
             length *= 0.5
         return state, 0.0
 
     def _points(self, state: CameraState) -> _PointEquations:
-        batches, width = self.job.views.batches, 12 + _K
+        batches, width = self.problem.views.batches, 12 + _K
         own = camera_columns(_K)[[*self.free, *range(5, 5 + _K)]]
         fixed = width + np.arange(5)
         taken = np.concatenate([np.arange(POSE.start, POSE.stop), fixed])
@@ -208,7 +206,7 @@ class _Together:
         wanted = np.array([*own, *fixed[self.free], width - 1])  # and the residual
         rows, poses = N[:, 6 + self.free][:, :, wanted], N[:, :6]
         solved = np.zeros((0, 6, len(wanted)))
-        if self.job.known.free_poses:
+        if self.problem.free_poses:
             solved = _solve(poses[:, :, POSE], poses[:, :, wanted])
             rows = rows - np.swapaxes(poses[:, :, fixed[self.free]], 1, 2) @ solved
         total, n = rows.sum(axis=0), len(own)
@@ -216,7 +214,7 @@ class _Together:
 
     def covariance(self, adjusted: Adjusted) -> Array:
         """(f + K, f + K) covariance of A's free entries and the coefficients."""
-        known, n = self.job.known, len(self.free)
+        n = len(self.free)
         points = self._points(adjusted.state)
         B, _ = self._matrix(points)
         r, J, nu = self.curves.derivatives()
@@ -226,8 +224,8 @@ class _Together:
         M = np.tensordot(G, G, axes=((0, 1), (0, 1)))
         taken = float(np.trace(_solve(by_k.T @ by_k, M)))
         of_lines = float(r @ r) / max(len(r) - 2 * len(lines) - taken, 1.0)
-        unknowns = n + _K + (6 * self.job.views.n_views if known.free_poses else 0)
-        of_points = float(adjusted.cost.sum()) / max(self.job.views.n_equations - unknowns, 1)
+        unknowns = n + _K + (6 * self.problem.views.n_views if self.problem.free_poses else 0)
+        of_points = float(adjusted.cost.sum()) / max(self.problem.views.n_equations - unknowns, 1)
         noise = np.zeros_like(B)
         noise[:n, :n], noise[n:, n:] = of_points * points.square, of_lines * M
         return _solve(B, _solve(B, noise).T)
@@ -249,7 +247,7 @@ def _through_fixed_lens(buffer: Array, entries: Array, Xc: Array) -> None:
 
 
 _UNTOLD = (
-    "straight lines and points do not determine lens and camera; give more views of the board from "
+    "the straight lines and points do not determine the camera; give more views of the board from "
     "different angles and over more of the image, or use another --distortion"
 )
 

@@ -1,4 +1,4 @@
-"""Corrected images: pixels taken from where the lens put them."""
+"""Undistorted images: each pixel is taken from where the distorted image shows it."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.problem import KnownCamera
-from neurocal_cli.distortion.undistortion import Undistortion, undistortion
+from neurocal_cli.calibration import Calibration, camera_of
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.distortion.undistortion import sources, undistorted_camera
 from neurocal_cli.errors import InputError
 
 __all__ = ["INTERPOLATIONS", "Remapping", "undistort_image"]
@@ -31,11 +32,12 @@ Sources = tuple[slice, NDArray[np.float32], NDArray[np.float32]]
 
 
 class Remapping:
-    """Takes the lens off images of one size.
+    """Undistorts images of one size.
 
     Parameters
     ----------
-    step : Undistortion
+    camera, new : Camera
+        With and without distortion.
     size : (width, height) [px]
     interpolation : str
         One of `INTERPOLATIONS`.
@@ -46,13 +48,16 @@ class Remapping:
         A side too long for OpenCV.
     """
 
-    def __init__(self, step: Undistortion, size: tuple[int, int], interpolation: str = "cubic") -> None:
+    def __init__(
+        self, camera: Camera, new: Camera, size: tuple[int, int], interpolation: str = "cubic"
+    ) -> None:
         if max(size) > _LONGEST:
             raise InputError(
-                f"images of {size[0]} x {size[1]} px cannot be corrected: a side has at most {_LONGEST} px; "
+                f"images of {size[0]} x {size[1]} px cannot be undistorted: a side has at most {_LONGEST} "
+                "px; "
                 "cut them into parts"
             )
-        self.step, self.size = step, size
+        self.camera, self.new, self.size = camera, new, size
         self._how = INTERPOLATIONS[interpolation]
         self._kept: list[Sources] = []
 
@@ -73,8 +78,8 @@ class Remapping:
         height, width = image.shape[:2]
         if (width, height) != self.size:
             raise InputError(
-                f"has {width} x {height} px, the camera's images have {self.size[0]} x {self.size[1]}; give "
-                "images as the camera took them"
+                f"has {width} x {height} px, but the camera is for {self.size[0]} x {self.size[1]} px; give "
+                "original images of this camera"
             )
         whole: NDArray[Any] = np.ascontiguousarray(image)
         corrected = np.empty_like(image, order="C")
@@ -96,7 +101,8 @@ class Remapping:
             part = slice(start, min(start + rows, height))
             u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(part.start, part.stop, dtype=float))
             places = [
-                np.nan_to_num(s, nan=_NOWHERE).clip(_NOWHERE, -_NOWHERE) for s in self.step.sources(u, v)
+                np.nan_to_num(s, nan=_NOWHERE).clip(_NOWHERE, -_NOWHERE)
+                for s in sources(self.camera, self.new, u, v)
             ]
             block = (part, places[0].astype(np.float32), places[1].astype(np.float32))
             if keep:
@@ -107,16 +113,16 @@ class Remapping:
 
 def undistort_image(
     image: NDArray[np.uint8] | NDArray[np.uint16],
-    camera: KnownCamera,
+    camera: Camera | Calibration,
     alpha: float | None = None,
     interpolation: str = "cubic",
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Image as a camera without the lens would have seen it.
+    """Image as a camera without distortion would have seen it.
 
     Parameters
     ----------
     image : (height, width) or (height, width, channels) uint8 or uint16 array
-    camera : Calibration, or a camera file
+    camera : Camera or Calibration
     alpha : float, optional
         See `undistortion.new_camera`; None keeps the camera's own matrix.
     interpolation : {"nearest", "linear", "cubic", "lanczos"}
@@ -134,5 +140,6 @@ def undistort_image(
     if interpolation not in INTERPOLATIONS:
         raise InputError(f"interpolation must be one of {', '.join(INTERPOLATIONS)}, not {interpolation!r}")
     height, width = image.shape[:2]
-    size = getattr(camera, "image_size", None) or (width, height)
-    return Remapping(undistortion(camera, alpha, size), size, interpolation)(image)
+    camera = camera_of(camera)
+    size = camera.image_size or (width, height)
+    return Remapping(camera, undistorted_camera(camera, alpha, size), size, interpolation)(image)

@@ -2,7 +2,7 @@
 
 A line of the ideal image, normalised by a camera A, is ``x(t) = b + t e``; its points are seen at
 
-    m = F(x(t)) = A bend(x(t); k)
+    m = F(x(t)) = A distort(x(t); k)
 
 and the error of a point is its distance from this curve, across it, in (whitened) pixels. It is
 minimal over the line (two parameters) and over the foot t of each point. With nu the unit normal of the
@@ -17,8 +17,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import Lens, bend
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.monotonic import undistort
+from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 from neurocal_cli.distortion.collinear_points import LinesSeen
 from neurocal_cli.geometry import Array
 
@@ -67,7 +68,7 @@ class Curves:
     seen : SeenLines
     entries : (5,) array
         A11, A12, A22, A13, A23 of the camera.
-    lens : Lens
+    lens : Distortion
     base, along : (L, 2) arrays
         A point and the direction of each line in the normalised image.
     feet : (M,) array
@@ -76,14 +77,14 @@ class Curves:
 
     seen: SeenLines
     entries: Array
-    lens: Lens
+    lens: Distortion
     base: Array
     along: Array
     feet: Array
 
     def seen_through(self, entries: Array, coefficients: Array) -> Curves:
         """The same lines through another camera and another lens of the same model."""
-        return replace(self, entries=entries, lens=Lens(self.lens.model, coefficients))
+        return replace(self, entries=entries, lens=Distortion(self.lens.model, coefficients))
 
     def settled(self) -> Curves:
         """Lines and feet moved to where the errors are smallest."""
@@ -162,14 +163,12 @@ class _Places:
         index = self.seen.lines.line
         self.along = curves.along[index]
         x, y = (curves.base[index] + curves.feet[:, None] * self.along).T
-        (self.x, self.y), (xx, xy, yx, yy), self.by_k = bend(
-            curves.lens.model, curves.lens.coefficients, x, y
-        )
-        a, s, b, u0, v0 = curves.entries
-        self.determinant = xx * yy - xy * yx
-        self.slope = a * xx + s * yx, a * xy + s * yy, b * yx, b * yy
-        u = self.seen.pixels[:, 0] - (a * self.x + s * self.y + u0)
-        v = self.seen.pixels[:, 1] - (b * self.y + v0)
+        lens = curves.lens
+        image = image_points_with_jacobian(curves.entries, lens.model, lens.coefficients, x, y)
+        self.x, self.y, self.slope, self.by_k = image.x, image.y, image.by_point, image.by_coefficient
+        ux, uy, vx, vy = self.slope
+        self.determinant = ux * vy - uy * vx
+        u, v = self.seen.pixels[:, 0] - image.u, self.seen.pixels[:, 1] - image.v
         self.error = self.seen.whiten(u, v)
         self.tangent = self._through(self.along)
         length = np.hypot(*self.tangent)
@@ -208,7 +207,7 @@ class _Places:
         return J
 
 
-def bent_lines(seen: SeenLines, entries: Array, lens: Lens) -> Curves:
+def bent_lines(seen: SeenLines, entries: Array, lens: Distortion) -> Curves:
     """Lines through the straightened points, as a camera and its lens show them.
 
     The errors are smallest over lines and feet. Points that the lens cannot have seen make a result
@@ -221,7 +220,7 @@ def bent_lines(seen: SeenLines, entries: Array, lens: Lens) -> Curves:
     return Curves(seen, entries, lens, base, along, feet).settled()
 
 
-def crookedness(seen: SeenLines, entries: Array, lens: Lens) -> float:
+def crookedness(seen: SeenLines, entries: Array, lens: Distortion) -> float:
     """How far straightened points lie beside lines, by how far they spread along them, both squared.
 
     Whatever the lens does to the scale, this stays; infinity where it cannot have seen a point.
@@ -232,12 +231,11 @@ def crookedness(seen: SeenLines, entries: Array, lens: Lens) -> float:
     return share if np.isfinite(share) else np.inf
 
 
-def _straight_lines(seen: SeenLines, entries: Array, lens: Lens) -> tuple[Array, Array, tuple[Array, ...]]:
+def _straight_lines(
+    seen: SeenLines, entries: Array, lens: Distortion
+) -> tuple[Array, Array, tuple[Array, ...]]:
     """Straightened points: each line's centre (L, 2), the points about it (M, 2), its scatter xx, xy, yy."""
-    a, s, b, u0, v0 = entries
-    y = (seen.pixels[:, 1] - v0) / b
-    x = (seen.pixels[:, 0] - u0 - s * y) / a
-    straight = np.column_stack(undistort(lens.model, lens.coefficients, x, y))
+    straight = np.column_stack(undistort(lens, *normalised_points(entries, *seen.pixels.T)))
     base = seen.sum_by_line(straight) / seen.lines.counts[:, None]
     off = straight - base[seen.lines.line]
     products = off[:, 0] ** 2, off[:, 0] * off[:, 1], off[:, 1] ** 2

@@ -6,20 +6,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.job import Job
-from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
+from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.orthogonality import pose_from_product, shared_intrinsics
 from neurocal_cli.initialisation.view_networks import Group
 
 __all__ = ["cameras_from_products", "candidate_intrinsics"]
 
+# Repeated by tests/test_convergence.py: the wrong minima of the conditions that its 1300 scenes show, and
+# depths that keep all their points in front of the first camera.
 _MOST_CANDIDATES = 4
 _NEAREST = 1.05  # depth of the nearest point's side, in units of what puts it into the focal plane
 
 
-def candidate_intrinsics(job: Job, groups: Sequence[Group]) -> Array:
+def candidate_intrinsics(problem: Problem, groups: Sequence[Group], rng: np.random.Generator) -> Array:
     """Entries of W that the orthogonality conditions of all views agree on, best first; (C, 1, 5)."""
     flat, solid = np.zeros((0, 3, 2)), np.zeros((0, 3, 3))
     for group in groups:
@@ -27,29 +29,29 @@ def candidate_intrinsics(job: Job, groups: Sequence[Group]) -> Array:
             flat = group.product[:, :, :2]
         else:
             solid = group.product[:, :, :3]
-    shared = shared_intrinsics(solid, flat, job.entries, job.known.free, job.rng)
+    shared = shared_intrinsics(solid, flat, problem.normalised_entries, problem.free, rng)
     return shared.entries[:_MOST_CANDIDATES, None]
 
 
-def cameras_from_products(job: Job, groups: Sequence[Group], entries: Array) -> CameraState:
+def cameras_from_products(problem: Problem, groups: Sequence[Group], entries: Array) -> CameraState:
     """Poses of the trained views, given W's entries (1, 5); all points in front.
 
     Views that are in no group get the identity.
     """
-    V = job.views.n_views
+    views = problem.views
+    V = views.n_views
     R, t = np.tile(np.eye(3), (V, 1, 1)), np.tile([0.0, 0.0, 2.0], (V, 1))
     W = intrinsic_matrix(entries[0])
     for group in groups:
         rotation, t[group.views] = pose_from_product(W, group.product)
         if group.flat:
-            rotation = rotation @ np.swapaxes(job.views.basis[group.views], 1, 2)
+            rotation = rotation @ np.swapaxes(views.basis[group.views], 1, 2)
         R[group.views] = rotation
-    return CameraState(entries, R, _in_front(job, R, t))
+    return CameraState(entries, R, _in_front(views, R, t))
 
 
-def _in_front(job: Job, R: Array, t: Array) -> Array:
+def _in_front(views: Views, R: Array, t: Array) -> Array:
     """Push views that an inexact W puts partly behind the camera out along their ray."""
-    views = job.views
     # The local coordinates are at most 1: a quick bound that nearly always decides.
     if (t[:, 2] > np.abs(R[:, 2]).sum(axis=1)).all():
         return t

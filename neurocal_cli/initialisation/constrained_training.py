@@ -9,34 +9,37 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.job import Job
-from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
+from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
 from neurocal_cli.geometry import nearest_rotation
+from neurocal_cli.initialisation.options import Options
 from neurocal_cli.training import Task
 
 __all__ = ["train_constrained"]
 
 
-def train_constrained(job: Job, state: CameraState) -> CameraState:
+def train_constrained(problem: Problem, options: Options, state: CameraState) -> tuple[CameraState, int]:
     """Train one view's network on E_tot from a camera; a flat board's V cannot be constrained.
 
-    Returns the state unchanged where the strategy has no such training or it is of no use.
+    Returns
+    -------
+    state : CameraState
+        Unchanged where the trainer has no such training or it is of no use.
+    iterations : int
     """
-    strategy, views = job.strategy, job.views
-    if strategy.constrained is None or views.n_views > 1 or views.nearly_flat[0]:
-        return state
+    views = problem.views
+    if options.constrained is None or views.n_views > 1 or views.nearly_flat[0]:
+        return state, 0
     depth = float(state.t[0, 2])
     # V is scaled so that depths, and with them every gamma, are about 1: E_orth's a takes that up.
     V = np.concatenate([state.R, state.t[:, :, None]], axis=2) / depth
     free_W = np.zeros((3, 3), dtype=bool)
-    free_W[ENTRIES] = job.known.free
-    patterns = views.patterns(np.array([0]), False, strategy.finish_points)
+    free_W[ENTRIES] = problem.free
+    patterns = views.patterns(np.array([0]), False, options.finish_points)
     task = Task(patterns, intrinsic_matrix(state.entries[0])[None], V, free_W, np.ones((3, 4), dtype=bool))
-    trained = strategy.constrained(task, 1.0 / depth**2)
-    job.tally.iterations += int(trained.iterations.sum())
+    trained = options.constrained(task, 1.0 / depth**2)
     entries, R = trained.W[0][ENTRIES], nearest_rotation(trained.V[:, :, :3])
     t = trained.V[:, :, 3] * depth
     moved = CameraState(entries[None], R, t)
     usable = np.isfinite(entries).all() and entries[[0, 2]].min() > 0 and t[0, 2] > 0
-    return moved if usable else state
+    return moved if usable else state, int(trained.iterations.sum())

@@ -21,6 +21,7 @@ from neurocal_cli.network import Patterns
 
 __all__ = ["Found", "find_camera", "find_poses"]
 
+# Repeated by tests/test_convergence.py, whose scenes of 3 to 8 points begin here.
 _MOST_POINTS = 64
 _NEAREST = 1.2  # depth of the nearest point's side of the target, in target radii
 _TIE = 1e-4
@@ -67,7 +68,7 @@ def find_poses(
     many = patterns.take(np.repeat(np.arange(len(which)), starts))
     R = nearest_rotation(rng.uniform(-1, 1, (len(many.weights), 3, 3)))
     state = CameraState(entries, R, _translation(entries, R, many))
-    adjusted = adjust(_as_tiles(many), state, np.zeros(5, dtype=bool))
+    adjusted = adjust(_as_batches(many), state, np.zeros(5, dtype=bool))
     cost = adjusted.cost.reshape(len(which), starts)
     best = cost.argmin(axis=1)
     lowest = cost[np.arange(len(which)), best]
@@ -109,7 +110,7 @@ def find_camera(
         entries[:, [0, 2]] = np.where(free[[0, 2]], focal[:, None], entries[:, [0, 2]])
         entries[:, 1] = 0.0 if free[1] else given[1]
         R = nearest_rotation(rng.uniform(-1, 1, (_BATCH, 3, 3)))
-        batches = _as_tiles(many)
+        batches = _as_batches(many)
         # The pose first, then everything.
         state = CameraState(entries, R, _translation(entries, R, many))
         posed = adjust(batches, state, np.zeros(5, dtype=bool))
@@ -131,7 +132,7 @@ def find_camera(
     return Found(best, np.array([cost]), np.array([agreed]), used, iterations)
 
 
-def _as_tiles(patterns: Patterns) -> PointBatches:
+def _as_batches(patterns: Patterns) -> PointBatches:
     """One batch for each network."""
     networks = np.arange(len(patterns.weights))
     root = np.sqrt(patterns.weights)

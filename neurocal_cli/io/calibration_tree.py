@@ -85,7 +85,7 @@ def calibration_from_field(root: Field) -> Calibration:
         camera_name=root["camera_name"].text() if "camera_name" in root else "camera",
         warnings=tuple(entry.text() for entry in block["warnings"].items()) if "warnings" in block else (),
         rejected=rejected,
-        verdict=read_verdict(block.get("verdict")),
+        judgement=read_verdict(block.get("verdict")),
         lens_choice=_lens_choice(block.get("lens_choice")),
     )
 

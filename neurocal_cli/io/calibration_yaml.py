@@ -15,7 +15,7 @@ import numpy as np
 
 from neurocal_cli import __version__
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
 from neurocal_cli.io.camera_info import camera_info_lines

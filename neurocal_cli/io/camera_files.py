@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
@@ -15,7 +16,7 @@ from neurocal_cli.io.distortion_names import from_ros
 from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.tree_fields import Field
 
-__all__ = ["CameraFile", "read_extrinsics", "read_intrinsics"]
+__all__ = ["read_extrinsics", "read_intrinsics"]
 
 # The names in use, ours and ROS's first; a stereo file of OpenCV's sample has M1, D1 for the left camera.
 _MATRIX_KEYS = ("camera_matrix", "cameraMatrix", "camera_Matrix", "K", "k", "M1", "intrinsic_matrix")
@@ -25,30 +26,8 @@ _HEIGHT_KEYS = ("image_height", "height")
 _SIZE_KEYS = ("imageSize", "image_size")
 
 
-@dataclass(frozen=True, eq=False)
-class CameraFile:
-    """A camera as a file states it.
-
-    Attributes
-    ----------
-    intrinsics : Intrinsics
-    distortion_model : str
-        ``none``, ``k1``, ``k1k2``, ``k1k2p1p2``, ``plumb_bob``, ``rational`` or ``fisheye``.
-    distortion : (n,) array
-        Coefficients in OpenCV's order.
-    image_size : (width, height), optional [px]
-    camera_name : str
-    """
-
-    intrinsics: Intrinsics
-    distortion_model: str
-    distortion: Array
-    image_size: tuple[int, int] | None
-    camera_name: str
-
-
-def read_intrinsics(path: str | Path) -> CameraFile:
-    """Read a camera's intrinsic parameters.
+def read_intrinsics(path: str | Path) -> Camera:
+    """Read a camera without its poses.
 
     Parameters
     ----------
@@ -76,7 +55,7 @@ def read_intrinsics(path: str | Path) -> CameraFile:
     except InputError as error:
         raise FormatError(str(error), root.source) from error
     name = root["camera_name"].text() if "camera_name" in root else "camera"
-    return CameraFile(intrinsics, model, distortion, _image_size(root), name)
+    return Camera(intrinsics, Distortion(model, distortion), _image_size(root), name)
 
 
 def read_extrinsics(path: str | Path) -> dict[str, Pose]:

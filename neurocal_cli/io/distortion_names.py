@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 

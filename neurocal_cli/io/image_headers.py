@@ -69,7 +69,7 @@ def read_header(data: bytes, source: str) -> Header:
         raise FormatError("is empty; give an image", source)
     reader = next((read for mark, read in _READERS if re.match(mark, data, re.DOTALL)), None)
     if reader is None:
-        raise FormatError("is no image that can be read; give PNG, JPEG, TIFF, BMP, PGM or PPM", source)
+        raise FormatError("is not a readable image; give PNG, JPEG, TIFF, BMP, PGM or PPM", source)
     try:
         header = reader(data)
     except (_TruncatedError, struct.error, IndexError) as error:

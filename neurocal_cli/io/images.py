@@ -194,9 +194,11 @@ def encode_image(pixels: NDArray[np.uint8] | NDArray[np.uint16], ending: str) ->
         The kind of file does not hold such a picture.
     """
     if pixels.dtype == np.uint16 and ending.lower() not in _SIXTEEN_BITS:
-        raise InputError(f"16 bits a pixel do not go into {ending} files; write {', '.join(_SIXTEEN_BITS)}")
+        raise InputError(
+            f"an image of 16 bits cannot be written to a {ending} file; use {', '.join(_SIXTEEN_BITS)}"
+        )
     if pixels.ndim == 3 and ending.lower() == ".pgm":
-        raise InputError("colours do not go into .pgm files; write .ppm or .png")
+        raise InputError("a colour image cannot be written to a .pgm file; use .ppm or .png")
     ordered = pixels[..., ::-1] if pixels.ndim == 3 else pixels
     settings = _QUALITY if ending.lower() in _JPEG else []
     try:
@@ -227,7 +229,9 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> NDArray[np
     turned = header.orientation >= 5
     size = (header.width, header.height) if turned else (header.height, header.width)
     if pixels.shape[:2] != size:
-        raise FormatError(f"is no single picture of {header.width} x {header.height} px", source)
+        raise FormatError(
+            f"does not hold a single picture of {header.width} x {header.height} px; save it again", source
+        )
     if pixels.dtype == np.uint8:
         return pixels.astype(np.uint8, copy=False)
     if pixels.dtype == np.uint16:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import MODELS
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_files import read_intrinsics
@@ -76,7 +76,7 @@ def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> Len
     parts = [_listed(table) if _FILES in table.labels else _tabled(table) for table in tables]
     sizes = set().union(*(part.sizes for part in parts))
     if len(sizes) > 1:
-        raise InputError(f"{tables[0].source}: the cameras' image_size differs; those of one lens have one")
+        raise InputError(f"{tables[0].source}: the cameras differ in image_size; give cameras of one lens")
     model, coefficients = _common_model(parts, tables[0].source)
     shared = [name for name in parts[0].columns if all(name in part.columns for part in parts)]
     columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in shared}
@@ -110,8 +110,8 @@ def _listed(table: Table) -> _Rows:
     return _Rows(
         dict(table.numbers) | parameters,
         np.array([k.theta for k in K]),
-        [camera.distortion_model for camera in cameras],
-        [camera.distortion for camera in cameras],
+        [camera.distortion.model for camera in cameras],
+        [camera.distortion.coefficients for camera in cameras],
         {size for size in sizes if size is not None},
     )
 
@@ -122,7 +122,9 @@ def _common_model(parts: Sequence[_Rows], source: str) -> tuple[str, Array]:
     rows = [row for part in parts for row in part.coefficients]
     if "fisheye" in models:
         if set(models) != {"fisheye"}:
-            raise InputError(f"{source}: some cameras are fisheyes and some are not; give those of one lens")
+            raise InputError(
+                f"{source}: some cameras are fisheyes and some are not; give cameras of one lens"
+            )
         return "fisheye", np.array(rows)
     padded = np.zeros((len(rows), len(MODELS[_NESTED[-1]])))
     for k, row in enumerate(rows):
@@ -147,5 +149,8 @@ def require_setting(tables: Sequence[Table]) -> tuple[str, ...]:
                 "there is no column zoom or focus; name the setting of each row in one or both", table.source
             )
         if found != names[0]:
-            raise FormatError(f"has not the same of zoom and focus as {tables[0].source}", table.source)
+            raise FormatError(
+                f"must have the same columns of zoom and focus as {tables[0].source}; add or remove one",
+                table.source,
+            )
     return tuple(name for name in CONTROLS if name in names[0])

@@ -144,9 +144,9 @@ def _check_settings(tables: list[Table], notes: list[str]) -> None:
             if differs.any():
                 row = int(np.argmax(differs))
                 raise InputError(
-                    f"{table.source}:{table.lines[row]}: {name} changes from {setting:g} to {column[row]:g}: "
-                    "points at several zoom/focus settings; `neurocal lens fit` takes them, calibrate "
-                    "one setting at a time"
+                    f"{table.source}:{table.lines[row]}: {name} changes from {setting:g} to {column[row]:g}, "
+                    "but a calibration has one setting of zoom and focus; give one setting, or use "
+                    "`neurocal lens fit`"
                 )
         if setting is not None:
             notes.append(f"{tables[0].source}: {name} is {setting:g} throughout; the column is not used")

@@ -57,7 +57,7 @@ def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
         A unit that is no length, or images without one known size.
     """
     if rig.unit not in _METRES:
-        raise InputError(f"ROS measures in metres, and {rig.unit!r} is none of {', '.join(_METRES)}")
+        raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(_METRES)}")
     rectified = rectify(rig, alpha)
     if rectified is None:
         raise InputError(

@@ -16,8 +16,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import distort
-from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.pinhole import Pose, entries_of
+from neurocal_cli.camera.projection import image_points
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.zoom_lens.settings import LensPoints
@@ -117,9 +117,8 @@ def see(
     world = np.round(local @ pose.R, 4)
     camera = world @ pose.R.T + np.column_stack([np.tile(pose.t[:2], (n, 1)), p["t_z"]])[:, None]
     x, y = camera[..., 0] / camera[..., 2], camera[..., 1] / camera[..., 2]
-    x, y = distort("k1", [p["k1"][:, None]], x, y)
-    u = p["alpha_u"][:, None] * (x - y / np.tan(theta)) + p["u0"][:, None]
-    v = p["alpha_v"][:, None] / np.sin(theta) * y + p["v0"][:, None]
+    alpha_u, alpha_v, u0, v0, k1 = (p[name][:, None] for name in ("alpha_u", "alpha_v", "u0", "v0", "k1"))
+    u, v = image_points(entries_of(alpha_u, alpha_v, u0, v0, theta), "k1", [k1], x, y)
     pixels = np.stack([u, v], axis=-1) + sigma * rng.normal(size=(n, per, 2))
     names = np.repeat([f"setting{k + 1:02d}" for k in range(n)], per)
     points = Correspondences(world.reshape(-1, 3), np.round(pixels, 5).reshape(-1, 2), names, image_size)

@@ -64,7 +64,8 @@ def calibrate_stereo(
     sides = [dict(options) | dict(extra or {}) for extra in (left_options, right_options)]
     if any(side.get("type", 1) == 4 for side in sides):
         raise UsageError(
-            "type 4 knows the poses of all views, so there is no rig to find; calibrate each camera by itself"
+            "with type 4 the poses of all views are known, so there is no rig to estimate; calibrate each "
+            "camera"
         )
     # What does not fit together is told before anything is trained.
     pair_points(left, right, pair_views(left.view_names, right.view_names))

@@ -89,7 +89,7 @@ def evaluate_stereo(
         raise
     except DegenerateGeometryError as error:
         rig = None
-        warnings.append(f"there is no one rig: {error}")
+        warnings.append(f"no rig fits all views: {error}")
     return _Judge((left, right), rig, points, method, warnings).evaluation()
 
 
@@ -133,7 +133,7 @@ class _Judge:
             if error is not None and error.n_behind:
                 self.warnings.append(
                     f"{error.n_behind} of {error.n_points + error.n_behind} points came out behind a camera "
-                    f"and are in no average{' of the rig' if error is through else ''}"
+                    f"and are left out of all averages{' of the rig' if error is through else ''}"
                 )
         return StereoEvaluation(
             self.points[0].unit,
@@ -157,7 +157,7 @@ class _Judge:
             fit = calibrate(points.select(rows), type=3, intrinsics=camera, seed=camera.seed, outliers="keep")
             self.warnings += [f"fitting the poses of new views: {text}" for text in fit.warnings]
             if not fit.converged:
-                self.warnings.append(f"the poses of new views did not settle: {fit.stop_reason}")
+                self.warnings.append(f"the poses of new views did not converge: {fit.stop_reason}")
             fits.append(fit)
         return fits[0], fits[1]
 
@@ -214,5 +214,6 @@ def _refuse_other(camera: Calibration, points: Correspondences) -> None:
         )
     if points.unit != camera.unit:
         raise InputError(
-            f"{points.source} is in {points.unit}, the calibration in {camera.unit}; give both in one unit"
+            f"{points.source} is in {points.unit}, but the calibration in {camera.unit}; give both in one "
+            "unit"
         )

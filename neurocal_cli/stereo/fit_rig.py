@@ -81,9 +81,11 @@ def fit_rig(
 
 def _kept_warning(name: str) -> str:
     return (
-        f"adjusted together with the other one, the {name} camera's lens would fold back inside the image, "
-        "where there are no points; the camera stays as its own views give it: add views that show the "
-        "board in the image's corners"
+        f"after the common bundle adjustment the distortion model of the {name} camera is not monotonic "
+        "(maps "
+        "two directions to one pixel) inside the image, where there are no points; the result of its own "
+        "views "
+        "is kept; add views that show the board in the image's corners"
     )
 
 
@@ -138,15 +140,16 @@ def _contradiction(left_out: dict[tuple[str, str], str], n_pairs: int, outliers:
         parts.append(f"{shown}: {reason}")
     found = f"{len(left_out)} of {n_pairs} pairs of views contradict the rig ({'; '.join(parts)})"
     if outliers == "keep" and 2 * len(left_out) < n_pairs:
-        return f"{found}; remove them, or leave them out by --outliers reject"
-    return f"{found}; check that paired views show one target at one moment, with its points in one order"
+        return f"{found}; remove them, or use --outliers reject"
+    return f"{found}; check that the views of a pair show one target at one moment, in the same order"
 
 
 def _refuse_one_place(rig: Rig) -> None:
     if rig.baseline > _TOLD_APART * rig.std["baseline"]:
         return
     raise CoincidentCamerasError(
-        f"both cameras stand at one place: the baseline is {rig.baseline:.3g} +- {rig.std['baseline']:.2g} "
+        f"both cameras are at the same place: the baseline is {rig.baseline:.3g} +- "
+        f"{rig.std['baseline']:.2g} "
         f"{rig.unit}; give the points (or calibrations) of two different cameras"
     )
 
@@ -160,7 +163,7 @@ def _warnings(rig: Rig) -> tuple[str, ...]:
     centre = -rig.R.T @ rig.t
     if centre[0] < 0 and abs(centre[0]) > abs(centre[1]):
         warnings.append(
-            f"the right camera stands {-centre[0]:.4g} {rig.unit} to the left of the left one; if they "
+            f"the right camera is {-centre[0]:.4g} {rig.unit} to the left of the left one; if they "
             "are swapped, give the left camera first"
         )
     return tuple(warnings)

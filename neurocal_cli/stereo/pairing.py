@@ -85,7 +85,7 @@ def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
     both = tuple((name, keys[1][key]) for key, name in keys[0].items() if key in keys[1])
     if not both:
         raise InputError(
-            f"no view of the left camera has its pair in the right one: left has {_listed(left)}, right has "
+            f"no view of the left camera has a partner in the right one: left has {_listed(left)}, right has "
             f"{_listed(right)}; give views taken together the same name, or names such as left01 and right01"
         )
     paired = set(sum(both, ()))
@@ -106,7 +106,7 @@ def _keys(names: Sequence[str], side: re.Pattern[str]) -> dict[str, str]:
             continue
         if key in keys:
             raise InputError(
-                f"the views {keys[key]!r} and {name!r} are both {key!r} without the camera's side; give "
+                f"the views {keys[key]!r} and {name!r} are both {key!r} without the name of the camera; give "
                 "views taken together by the two cameras the same name"
             )
         keys[key] = name

@@ -12,7 +12,7 @@ from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState, no
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import Array

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.errors import UsageError
 from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
 from neurocal_cli.stereo.rig import Rig
@@ -96,10 +95,7 @@ def _shortest_turn(a: Array, b: Array) -> Array:
 
 def _seen(camera: Calibration, R: Array, pixels: Array) -> Array:
     """Normalised rectified points of pixels, (N, 2); nan where no ray belongs to a pixel."""
-    K = camera.K
-    y = (pixels[:, 1] - K[1, 2]) / K[1, 1]
-    x = (pixels[:, 0] - K[0, 2] - K[0, 1] * y) / K[0, 0]
-    x, y = undistort(camera.distortion_model, camera.distortion, x, y)
+    x, y = camera.camera.normalised_points(*pixels.T)
     rays = np.column_stack([x, y, np.ones_like(x)]) @ R.T
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.report import align, rounded
 from neurocal_cli.stereo.evaluation import StereoEvaluation
@@ -132,7 +132,7 @@ def rig_report(rig: Rig) -> str:
 def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
     """Remarks that name the views which one camera alone saw."""
     return [
-        f"the {side} camera alone saw {', '.join(map(_shown, names[:_NAMED]))}"
+        f"only the {side} camera saw {', '.join(map(_shown, names[:_NAMED]))}"
         + (f" and {len(names) - _NAMED} more views" if len(names) > _NAMED else "")
         for side, names in zip(("left", "right"), alone, strict=True)
         if names
@@ -140,7 +140,7 @@ def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
 
 
 def _headline(rig: Rig) -> str:
-    parts = [f"rig: {_counted(len(rig.pairs), 'view')} of both cameras"]
+    parts = [f"rig: {_counted(len(rig.pairs), 'pair')} of views"]
     for name, camera in (("left", rig.left), ("right", rig.right)):
         parts.append(
             f"{name} {_counted(len(camera.points), 'point')} in {_counted(len(camera.views), 'view')}"
@@ -201,7 +201,9 @@ def _view_lines(rig: Rig) -> list[str]:
     lines = align(
         [["view", "left points", "rms [px]", "right points", "rms [px]"], *(row for _, row in rows)]
     )
-    return lines + [f"the worst {_MOST_VIEWS} of {len(rig.pairs)} pairs"] * (hidden > 0)
+    return lines + [f"the {_MOST_VIEWS} pairs with the largest error, of {len(rig.pairs)} pairs"] * (
+        hidden > 0
+    )
 
 
 def _fit_lines(rig: Rig) -> list[str]:
@@ -211,8 +213,8 @@ def _fit_lines(rig: Rig) -> list[str]:
         if record is not None:
             lines.append(
                 f"{name}: {_counted(record.starts, 'random start')} for {_counted(len(record.V), 'view')}, "
-                f"at least {record.agreed} agreed in each; rms {_figure(camera.rmse_px)} px"
+                f"at least {record.agreed} agreed in each view; rms {_figure(camera.rmse_px)} px"
             )
-    lines.append(f"both: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
-                 f"{_counted(rig.iterations, 'common step')}")  # fmt: skip
+    lines.append(f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
+                 f"{_counted(rig.iterations, 'iteration')}")  # fmt: skip
     return [*lines, rig.stop_reason]

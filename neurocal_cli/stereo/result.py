@@ -18,7 +18,7 @@ from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, POSE, CameraState, residuals
 from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
-from neurocal_cli.camera.distortion_models import Lens
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
@@ -66,7 +66,7 @@ def folding_sides(
         if not estimated.any():
             continue
         A = _intrinsics(given, camera, seen, estimated[:5]).A if estimated[:5].any() else given.K
-        if where_not_monotonic(Lens(camera.lens, camera.k), A, given.points) is not None:
+        if where_not_monotonic(camera.distortion, A, given.points) is not None:
             found.append(side)
     return found
 
@@ -86,7 +86,7 @@ class _RigAssembly:
         if not inverse.smallest > _SINGULAR:
             raise DegenerateGeometryError(
                 "the points do not determine the rig and both cameras (the normal matrix is singular); "
-                "spread them in depth, or give more of the cameras (--no-skew, --left-intrinsics, "
+                "spread them in depth, or give known parameters (--no-skew, --left-intrinsics, "
                 "--right-intrinsics)"
             )
         n_equations = sum(seen.n_equations for seen in problem.sightings)
@@ -188,6 +188,7 @@ class _RigAssembly:
             converged=reason == StopReason.CONVERGED.value,
             stop_reason=reason,
             network=_network(given.network, intrinsics, views, rmse, self.adjusted.iterations),
+            judgement=None,
             **changes,
         )
 
@@ -204,13 +205,12 @@ class _RigAssembly:
         )
         names = list(std)
         free = [k for k, name in enumerate(names) if name not in given.fixed]
-        lens = Lens(camera.lens, camera.k)
         before: tuple[str, ...] = ()
         chosen = bool(given.lens_choice)
         if given.std.keys() >= std.keys():
-            alone = Lens(camera.lens, given.distortion)
+            alone = Distortion(camera.lens, given.distortion)
             before = parameter_warnings(given.intrinsics, alone, given.std, chosen)
-        now = parameter_warnings(intrinsics, lens, std, chosen)
+        now = parameter_warnings(intrinsics, camera.distortion, std, chosen)
         return {
             "intrinsics": intrinsics,
             "std": std,

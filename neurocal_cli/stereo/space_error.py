@@ -114,8 +114,8 @@ def space_error(
     fine = np.isfinite(errors).all(axis=1)
     if not fine.any():
         raise DegenerateGeometryError(
-            "every point comes out behind a camera; check which file is the left camera's and which the "
-            "right one's"
+            "every triangulated point is behind a camera; check which file is of the left camera and which "
+            "of the right one"
         )
     e, depth = errors[fine], seen[fine, 2]
     squares = (e**2).sum(axis=1)

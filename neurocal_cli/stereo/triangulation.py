@@ -15,11 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.problem import KnownCamera
+from neurocal_cli.calibration import Calibration, camera_of
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.image_camera import ImageCamera
 from neurocal_cli.stereo.two_view_points import PointBatch
 
 __all__ = ["METHODS", "Triangulated", "epipolar_limit", "triangulate"]
@@ -65,8 +65,8 @@ def epipolar_limit(sigma: float) -> float:
 
 
 def triangulate(
-    left: KnownCamera,
-    right: KnownCamera,
+    left: Camera | Calibration,
+    right: Camera | Calibration,
     pose: Pose | Sequence[Pose],
     left_pixels: Array,
     right_pixels: Array,
@@ -79,8 +79,7 @@ def triangulate(
 
     Parameters
     ----------
-    left, right : cameras with lenses
-        A `Calibration` each, or what `read_intrinsics` returns.
+    left, right : Camera or Calibration
     pose : Pose, or a sequence of them
         The rig, ``X_right = R X_left + t``, or several.
     left_pixels, right_pixels : (N, 2) arrays [px]
@@ -105,7 +104,7 @@ def triangulate(
     n = len(pixels[0])
     if len(pixels[1]) != n:
         raise InputError(f"{n} left pixels but {len(pixels[1])} right ones; give one of each for every point")
-    cameras = ImageCamera.of(left), ImageCamera.of(right)
+    cameras = camera_of(left), camera_of(right)
     rigs = _Rigs.of([pose] if isinstance(pose, Pose) else pose, which, n)
     points, epipolar, behind = np.empty((n, 3)), np.empty(n), np.empty(n, dtype=bool)
     covariance = np.empty((n, 6)) if method == "optimal" else None
@@ -140,7 +139,7 @@ class _Rigs:
     @classmethod
     def of(cls, poses: Sequence[Pose], which: NDArray[np.intp] | None, n: int) -> _Rigs:
         if len(poses) != 1 and (which is None or len(which) != n):
-            raise InputError(f"with several rigs, tell which one belongs to each of the {n} points")
+            raise InputError(f"with several rigs, give the number of the rig of each of the {n} points")
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
         return cls(R, t, None if len(poses) == 1 else which)
 

@@ -1,16 +1,19 @@
 """Some thousand points at a time in two images: the point of least squares, and simpler ones.
 
 The point of least squares is sought as (x, y, 1) / w, by Gauss and Newton. Its left image depends on x and
-y alone and its right one hardly bends with w, at any distance up to infinity, so two or three steps do.
+y alone and its right one is nearly linear in w, at any distance up to infinity, so two or three steps do.
 """
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.projection import image_points_with_jacobian, nearly_rays
 from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.image_camera import ImageCamera
 
 __all__ = ["PointBatch"]
 
@@ -24,7 +27,7 @@ class PointBatch:
 
     Parameters
     ----------
-    cameras : two of ImageCamera
+    cameras : two of Camera
     rig : (3, 4, n) or (3, 4, 1) array
         [R | t] of each point, or of all.
     left, right : (2, n) arrays [px]
@@ -33,7 +36,7 @@ class PointBatch:
 
     def __init__(
         self,
-        cameras: tuple[ImageCamera, ImageCamera],
+        cameras: tuple[Camera, Camera],
         rig: Array,
         left: Array,
         right: Array,
@@ -46,7 +49,14 @@ class PointBatch:
         self.R, self.t = [row[:3] for row in entries], [row[3] for row in entries]
 
     def _rays(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        return self.cameras[0].straight(self.pixels[0]), self.cameras[1].straight(self.pixels[1])
+        (left, right), (seen_left, seen_right) = self.cameras, self.pixels
+        return left.normalised_points(*seen_left), right.normalised_points(*seen_right)
+
+    def _image(self, side: int, x: Array, y: Array) -> tuple[Array, Array, tuple[Any, Any, Any, Any]]:
+        """Pixels of normalised points in one image, and du/dx, du/dy, dv/dx, dv/dy."""
+        camera = self.cameras[side]
+        image = image_points_with_jacobian(camera.entries, camera.model, camera.distortion.coefficients, x, y)
+        return image.u, image.v, image.by_point
 
     def _turned(self, x: Array, y: Array) -> list[Array]:
         """R (x, y, 1): the left ray's direction in the right camera's frame."""
@@ -54,8 +64,11 @@ class PointBatch:
 
     def optimal(self) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """Points of least squares (n, 3), covariances (n, 6), epipolar errors and which are behind."""
-        x, y = (np.array(values) for values in self.cameras[0].nearly_straight(self.pixels[0]))
-        w = self._nearest_w(x, y, *self.cameras[1].nearly_straight(self.pixels[1]))
+        (x, y), right = (
+            nearly_rays(camera.entries, camera.distortion, *pixels)
+            for camera, pixels in zip(self.cameras, self.pixels, strict=True)
+        )
+        w = self._nearest_w(x, y, *right)
         left_out = ~np.isfinite(x + w)
         x[left_out], y[left_out], w[left_out] = 0.0, 0.0, 1.0  # so that they do no harm
         N, cost = self._normal(x, y, w)
@@ -111,9 +124,8 @@ class PointBatch:
 
     def _normal(self, x: Array, y: Array, w: Array) -> tuple[list[Array], Array]:
         """Normal equations: xx, xy, xw, yy, yw, ww, then the right-hand sides x, y, w; and the cost."""
-        u, v, J = self.cameras[0].seen(x, y)
+        u, v, (ux, uy, vx, vy) = self._image(0, x, y)
         du, dv = self.pixels[0][0] - u, self.pixels[0][1] - v
-        ux, uy, vx, vy = J
         if self.whitening is not None:
             p, q, r = self.whitening[0]
             du, ux, uy = p * du + q * dv, p * ux + q * vx, p * uy + q * vy
@@ -142,7 +154,7 @@ class PointBatch:
         h0, h1, h2 = (h + t * w for h, t in zip(self._turned(x, y), self.t, strict=True))
         q = 1.0 / h2
         x_r, y_r = h0 * q, h1 * q
-        u, v, (ux, uy, vx, vy) = self.cameras[1].seen(x_r, y_r)
+        u, v, (ux, uy, vx, vy) = self._image(1, x_r, y_r)
         by_u, by_v = [], []
         for n in range(3):
             down = self.t[2] if n == 2 else self.R[2][n]

@@ -6,7 +6,7 @@ Everything follows from the calibration and its points, so a file can be judged 
 * the precision of the points themselves: what every view leaves when it has a camera of its own, a
   free network (`outlier_views.free_networks`); a common camera that leaves more contradicts the data;
 * how far two halves of the data disagree, in units of their reported uncertainty;
-* whether residuals of neighbours are alike (`residual_correlation`);
+* whether residuals of neighbours are correlated (`residual_correlation`);
 * how much of the image and how many directions the points cover (`coverage`);
 * how far projected pixels would move with other noise (`projection_uncertainty`).
 """
@@ -14,19 +14,19 @@ Everything follows from the calibration and its points, so a file can be judged 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.cross_validation import disagreement, held_out
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
-from neurocal_cli.bundle_adjustment.problem import Known
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
-from neurocal_cli.bundle_adjustment.units import Seen, normalised
+from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.projection_uncertainty import (
@@ -37,14 +37,14 @@ from neurocal_cli.verdict.projection_uncertainty import (
 from neurocal_cli.verdict.repeated_views import repeated_views, scaled_views
 from neurocal_cli.verdict.rules import Verdict, reach_verdict
 
-__all__ = ["judge", "judged"]
+__all__ = ["assess", "gather_evidence"]
 
 _STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
 
-def judge(calibration: Calibration) -> Evidence:
+def gather_evidence(calibration: Calibration) -> Evidence:
     """Measure how good a calibration is.
 
     Parameters
@@ -55,11 +55,11 @@ def judge(calibration: Calibration) -> Evidence:
     return _AtMinimum(calibration).evidence()
 
 
-def judged(calibration: Calibration) -> Verdict | None:
+def assess(calibration: Calibration) -> Verdict | None:
     """Good, usable or poor, with the reasons; None for a calibration that holds no points of its own."""
     if not calibration.views or set(calibration.points.view_names) != set(calibration.views):
         return None
-    return reach_verdict(calibration, judge(calibration))
+    return reach_verdict(calibration, gather_evidence(calibration))
 
 
 class _AtMinimum:
@@ -68,17 +68,18 @@ class _AtMinimum:
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.points = calibration, calibration.points
         views = [calibration.views[name] for name in self.points.view_names]
-        self.seen = Seen(
-            calibration.K,
-            Lens(calibration.distortion_model, calibration.distortion),
+        self.camera = calibration.camera
+        self.given = CameraState(
+            np.array([self.camera.entries]),
             np.stack([view.pose.R for view in views]),
             np.stack([view.pose.t for view in views]),
+            self.camera.distortion.model,
+            self.camera.distortion.coefficients,
         )
         self.views = self._arranged()
-        self.known = _known(calibration)
-        self.free = self.known.free_camera
+        self.free = _free(calibration)
         self.free_poses = not all(view.fixed for view in views)
-        state = normalised(self.seen, self.views)
+        state = normalised(self.given, self.views)
         adjusted = adjust(self.views.batches, state, self.free, self.free_poses, _STEPS)
         self.state, self.normal = adjusted.state, adjusted.normal
         self.cost = float(self.normal[:, -1, -1].sum())
@@ -88,7 +89,7 @@ class _AtMinimum:
     def _arranged(self) -> Views:
         if self.points.covariance is None:
             return arrange(self.points)
-        predicted, _ = self.seen.predict(self.points.world, self.points.view_index)
+        predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
         return weighed(self.points, self.points.pixels - predicted)
 
     def evidence(self) -> Evidence:
@@ -142,22 +143,18 @@ class _AtMinimum:
         if self.points.image_size is None:
             return None
         view = self.points.view_index
-        depth = (self.seen.R[view, 2] * self.points.world).sum(axis=1) + self.seen.t[view, 2]
+        depth = (self.given.R[view, 2] * self.points.world).sum(axis=1) + self.given.t[view, 2]
         depths = np.append(np.quantile(depth, [0.0, 0.5, 1.0]), _DISTANT * depth.max())
         return projection_uncertainty(
-            self.views, self.state, self.seen, self.normal, self.free, self.free_poses,
+            self.views, self.state, self.camera, self.normal, self.free, self.free_poses,
             self.cost / self.spare, image_grid(self.points.image_size), depths,
         )  # fmt: skip
 
 
-def _known(calibration: Calibration) -> Known:
-    """What was estimated: the rest is fixed."""
+def _free(calibration: Calibration) -> NDArray[np.bool_]:
+    """(5 + K,) which of A's entries and of the distortion coefficients were estimated from these points."""
     fixed = set(calibration.fixed)
+    coefficients = coefficient_names(calibration.distortion_model)
     if calibration.straight_lines is not None:
-        fixed |= set(coefficient_names(calibration.distortion_model))
-    free = np.array([name not in fixed for name in _ORDER])
-    lens = Lens(calibration.distortion_model, calibration.distortion)
-    free_lens = calibration.distortion_model != "none"
-    return Known(
-        calibration.type, calibration.K[ENTRIES], free, None, frozenset(fixed), None, lens, free_lens
-    )
+        fixed |= set(coefficients)
+    return np.array([name not in fixed for name in (*_ORDER, *coefficients)])

@@ -19,11 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.cross_validation import inverse
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, POSE, CameraState, camera_columns
-from neurocal_cli.bundle_adjustment.units import Seen
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion_models import bend
-from neurocal_cli.camera.monotonic import undistort
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.geometry import Array, cross_matrix
 
 __all__ = ["ProjectionUncertainty", "image_grid", "projection_uncertainty"]
@@ -38,7 +36,7 @@ class ProjectionUncertainty:
     Attributes
     ----------
     pixels : (G, 2) array [px]
-        Places in the image; those that the lens cannot see are nan below.
+        Places in the image; those that the camera cannot see are nan below.
     depths : (D,) array
         Distances along the optical axis [world unit].
     std : (D, G) array [px]
@@ -61,7 +59,7 @@ def image_grid(size: tuple[int, int]) -> Array:
 def projection_uncertainty(
     views: Views,
     state: CameraState,
-    seen: Seen,
+    camera: Camera,
     normal: Array,
     free: NDArray[np.bool_],
     free_poses: bool,
@@ -75,8 +73,8 @@ def projection_uncertainty(
     ----------
     views, state, normal
         At the minimum, normalised.
-    seen : Seen
-        The same in pixels and world units.
+    camera : Camera
+        The same in pixels.
     free : (5 + K,) bool array
     free_poses : bool
     variance : float
@@ -85,8 +83,8 @@ def projection_uncertainty(
     depths : (D,) array
     """
     shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
-    gain, motion, camera = _covariances(views, state, normal, shared, free_poses)
-    by_camera, by_point, rays = _derivatives(seen, pixels, views.pixel_scale)
+    gain, motion, own = _covariances(views, state, normal, shared, free_poses)
+    by_camera, by_point, rays = _derivatives(camera, pixels, views.pixel_scale)
     by_camera = by_camera[:, :, np.flatnonzero(free)]
     std = np.empty((len(depths), len(pixels)))
     for k, depth in enumerate(depths):
@@ -94,7 +92,7 @@ def projection_uncertainty(
         moved = np.concatenate([-cross_matrix(p), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2)
         by_motion = by_point / depth @ moved  # (G, 2, 6)
         J = by_camera + by_motion @ gain
-        covariance = J @ camera @ np.swapaxes(J, 1, 2) + by_motion @ motion @ np.swapaxes(by_motion, 1, 2)
+        covariance = J @ own @ np.swapaxes(J, 1, 2) + by_motion @ motion @ np.swapaxes(by_motion, 1, 2)
         std[k] = np.sqrt(variance * np.trace(covariance, axis1=1, axis2=2))
     return ProjectionUncertainty(pixels, depths, std)
 
@@ -119,20 +117,8 @@ def _covariances(
     return gain, motion, inverse(S)
 
 
-def _derivatives(seen: Seen, pixels: Array, scale: float) -> tuple[Array, Array, Array]:
+def _derivatives(camera: Camera, pixels: Array, scale: float) -> tuple[Array, Array, Array]:
     """Of the pixels (G, 2) by the normalised camera (5 + K) and by points at depth 1; rays (G, 3)."""
-    a, s, b, u0, v0 = seen.A[ENTRIES]
-    y = (pixels[:, 1] - v0) / b
-    x = (pixels[:, 0] - u0 - s * y) / a
-    x, y = undistort(seen.lens.model, seen.lens.coefficients, x, y) if seen.lens.bends else (x, y)
-    (bx, by), (xx, xy, yx, yy), by_k = bend(seen.lens.model, seen.lens.coefficients, x, y)
-    by_camera = np.zeros((len(pixels), 2, 5 + len(by_k)))
-    by_camera[:, 0, 0], by_camera[:, 0, 1], by_camera[:, 0, 3] = scale * bx, scale * by, scale
-    by_camera[:, 1, 2], by_camera[:, 1, 4] = scale * by, scale
-    for k, (dx, dy) in enumerate(by_k):
-        by_camera[:, 0, 5 + k], by_camera[:, 1, 5 + k] = a * dx + s * dy, b * dy
-    by_image = np.stack([np.stack([xx, xy], -1), np.stack([yx, yy], -1)], 1)  # bent by straight
-    by_straight = np.array([[a, s], [0.0, b]]) @ by_image
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    by_ray = np.stack([np.stack([one, zero, -x], -1), np.stack([zero, one, -y], -1)], 1)
-    return by_camera, by_straight @ by_ray, np.column_stack([x, y, one])
+    rays = np.column_stack([*camera.normalised_points(*pixels.T), np.ones(len(pixels))])
+    by_camera, by_point = camera.project_jacobian(rays)
+    return by_camera * np.array([scale] * 5 + [1.0] * (by_camera.shape[2] - 5)), by_point, rays

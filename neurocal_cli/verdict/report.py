@@ -16,8 +16,8 @@ def verdict_lines(verdict: Verdict) -> list[str]:
     facts = _facts(verdict)
     if facts:
         lines.append(f"  {', '.join(facts)}")
-    lines += [f"  - {reason}" for reason in verdict.reasons]
-    lines += [f"  > {advice}" for advice in verdict.advice]
+    lines += [f"  reason: {reason}" for reason in verdict.reasons]
+    lines += [f"  advice: {advice}" for advice in verdict.advice]
     return lines
 
 
@@ -35,9 +35,9 @@ def verdict_json(verdict: Verdict) -> dict[str, Any]:
 def _facts(verdict: Verdict) -> list[str]:
     m = verdict.measures
     texts = (
-        ("held_out_px", "{:.3g} px on data left out"),
-        ("precision_px", "the points' own precision {:.3g} px"),
-        ("projection_px", "pixels predicted to {:.2g} px at worst"),
+        ("held_out_px", "cross-validation error {:.3g} px"),
+        ("precision_px", "noise floor {:.3g} px"),
+        ("projection_px", "std of predicted pixels {:.2g} px at most"),
     )
     facts = [text.format(m[name]) for name, text in texts if math.isfinite(m.get(name, math.nan))]
     coverage = m.get("coverage", math.nan)

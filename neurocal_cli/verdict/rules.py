@@ -25,8 +25,8 @@ class _Limit:
         return int(value > self.good) + int(value > self.poor)
 
 
-# The limits part good scenes, which must be good, from some 50 kinds of wrong data, which must not:
-# `test_wrong_inputs` repeats that on made data, `test_judgement` on photographs.
+# Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and tests/test_verdict.py, in
+# which real and simulated good data are; the errors, angles and shares are what a user would call large.
 _ERROR = _Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
 _CONTRADICTION = _Limit(1.6, 2.3)
 _HELD_OUT = _Limit(1.3, 2.0)  # over the rms error
@@ -73,7 +73,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[_Finding]:
     if not calibration.converged:
-        yield 2, f"training did not converge: {calibration.stop_reason}", "give more --starts"
+        yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
     yield from _errors(calibration, evidence)
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
@@ -84,35 +84,40 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
     points = calibration.points
     spread = float(np.sqrt(points.pixels.var(axis=0).sum()))
     size = points.image_size or np.ptp(points.pixels, axis=0)
-    pairing = "check that each pixel belongs to its point, and that the target is as its points say"
+    pairing = "check that each pixel belongs to its point, and that X,Y,Z are those of the true target"
     yield (
         _ERROR.grade(e.rmse_px / float(np.hypot(*size))),
-        f"an rms error of {e.rmse_px:.3g} px is large",
+        f"the rms reprojection error of {e.rmse_px:.3g} px is large",
         pairing,
     )
     if e.rmse_px > 1e-4 * spread:
         yield (
             _CONTRADICTION.grade(e.contradiction),
-            f"views with a camera each would leave {e.precision_px:.3g} px, the common camera leaves "
-            f"{e.contradiction:.2g} times that",
-            "check that all views are of one camera at one zoom and focus, that the target is flat and its "
-            "squares are square, and what is given",
+            f"the error is {e.contradiction:.2g} times the noise floor, which is {e.precision_px:.3g} px "
+            "(the "
+            "error of a separate camera for each view)",
+            "check that all views are of one camera at one zoom and focus, that the target has the true "
+            "shape, "
+            "and that given parameters are right",
         )
     if e.rmse_px > 1e-6 * spread:
         yield (
             _HELD_OUT.grade(e.held_out_px / e.rmse_px),
-            f"the error on data left out is {e.held_out_px:.3g} px, that on all {e.rmse_px:.3g} px",
-            "give more points and views",
+            f"the cross-validation error is {e.held_out_px:.3g} px, but the error on all data "
+            f"{e.rmse_px:.3g} px",
+            "add points and views",
         )
         yield (
             _DISAGREEMENT.grade(e.disagreement),
-            f"two halves of the data disagree: {np.sqrt(e.disagreement):.1f} times the standard deviations",
-            "the true errors are as many times larger; look for a wrong view or a board that is not flat",
+            f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} standard "
+            "deviations",
+            "expect errors larger than the standard deviations; look for a wrong view or a board that is not "
+            "flat",
         )
         yield (
             _CORRELATION.grade(e.correlation) if e.rmse_px > 1e-4 * spread else 0,
-            f"neighbouring points err alike (correlation {e.correlation:.2f}): the lens or the target is not "
-            "as modelled",
+            f"the residuals of neighbouring points are correlated ({e.correlation:.2f}), so the distortion "
+            "model or the target does not fit",
             "try another --distortion, or measure the target",
         )
 
@@ -123,21 +128,25 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
     share = len(rejected) / total
     yield (
         max(_REJECTED.grade(share), int(bool(rejected.views))),
-        f"{len(rejected)} of {total} points contradict the others and were left out",
-        "look at the points and views that are named",
+        f"{len(rejected)} of {total} points are outliers and were left out",
+        "look at the points and views that are listed as outliers",
     )
     if e.repeated:
-        yield 1, f"{_names(e.repeated)}: rows given before, fewer data than it seems", "give each view once"
+        yield 1, f"{_names(e.repeated)}: the rows are those of another view", "give each view once"
     if e.scaled:
         yield (
             1,
-            f"{_names(e.scaled)}: points at other distances than in most views",
+            f"{_names(e.scaled)}: the distances between the points differ from those in most views",
             "check the unit of X,Y,Z and the size of the squares",
         )
     if e.mirrored:
-        yield 1, f"{_names(e.mirrored)}: the target is mirrored", "check the order of their points"
+        yield (
+            1,
+            f"{_names(e.mirrored)}: the target is mirrored",
+            "check the order of the points in these views",
+        )
     if e.coverage.outside:
-        yield 2, f"{e.coverage.outside} points lie outside the image", "correct image_size, or the points"
+        yield 2, f"{e.coverage.outside} points lie outside the image", "correct image_size or the points"
 
 
 def _coverage(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
@@ -145,33 +154,37 @@ def _coverage(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
         return
     cover = e.coverage
     if np.isfinite(cover.image):
-        where = f", most of all {cover.empty}" if cover.empty else ""
+        where = f", above all {cover.empty}" if cover.empty else ""
         yield (
             _UNCOVERED.grade(1 - cover.image),
-            f"points cover {100 * cover.image:.0f} % of the image",
+            f"the points cover {100 * cover.image:.0f} % of the image",
             f"add views with the target elsewhere in the image{where}",
         )
     if calibration.type in (1, 2) and len(calibration.views) > 1:
         yield (
             _FLAT.grade(-cover.tilt),
-            f"the boards differ by {cover.tilt:.0f} degrees of tilt at most",
-            "add views with the board tilted by 30 to 45 degrees, to several sides",
+            f"the tilts of the boards differ by {cover.tilt:.0f} degrees at most",
+            "add views with the board tilted by 30 to 45 degrees in different directions",
         )
 
 
 def _parameters(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
     A, std, fixed = calibration.intrinsics, calibration.std, calibration.fixed
-    more = "add views that fill the image, near and tilted"
+    more = "add views in which the target is near, tilted and fills the image"
     if "alpha_u" not in fixed:
         share = max(std["alpha_u"] / A.alpha_u, std["alpha_v"] / A.alpha_v)
-        yield _ALPHA.grade(share), f"the focal length is known to {100 * share:.2g} %", more
+        yield _ALPHA.grade(share), f"the std of the focal length is {100 * share:.2g} % of its value", more
     if "u0" not in fixed:
         centre = max(std["u0"], std["v0"])
-        yield _CENTRE.grade(centre / A.alpha_u), f"the image centre is known to {centre:.2g} px", more
+        yield _CENTRE.grade(centre / A.alpha_u), f"the std of the image centre is {centre:.2g} px", more
     if e.projection is not None and calibration.type != 3:
         worst = float(np.nanmax(e.projection.std[1]))
         diagonal = float(np.hypot(*(calibration.image_size or (np.nan, np.nan))))
-        yield _PROJECTION.grade(worst / diagonal), f"pixels are predicted to {worst:.2g} px at worst", more
+        yield (
+            _PROJECTION.grade(worst / diagonal),
+            f"the std of predicted pixels is up to {worst:.2g} px",
+            more,
+        )
     if calibration.type == 3:
         return
     ratio = A.alpha_u / A.alpha_v
@@ -179,14 +192,14 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
     if abs(ratio - 1) > _OBLONG + told:
         yield (
             1,
-            f"the pixels are not square, alpha_u / alpha_v = {ratio:.3f}",
-            "right for a few cameras; else check the size of the squares along X and Y",
+            f"the pixels are not square: alpha_u / alpha_v = {ratio:.3f}",
+            "few cameras have such pixels; otherwise check the size of the squares along X and Y",
         )
     if "theta" not in fixed and abs(A.theta - np.pi / 2) > _SKEW + _TOLD * std["theta"]:
         yield (
             1,
-            f"the image axes are not at right angles, theta = {np.degrees(A.theta):.1f} degrees",
-            "hardly any camera is so: check the target, or give --no-skew",
+            f"the image axes are not perpendicular: theta = {np.degrees(A.theta):.1f} degrees",
+            "hardly any camera has such axes; check the target, or give --no-skew",
         )
     yield from _off_centre(calibration)
 
@@ -201,7 +214,7 @@ def _off_centre(calibration: Calibration) -> Iterator[_Finding]:
         yield (
             1,
             f"the image centre ({A.u0:.0f}, {A.v0:.0f}) is far from the middle of the image",
-            "right for a cropped image; else check image_size and the order of u and v",
+            "a cropped image has such a centre; otherwise check image_size and the order of u and v",
         )
 
 

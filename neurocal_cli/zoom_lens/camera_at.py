@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, ViewResult
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.points import Correspondences
@@ -65,7 +65,7 @@ def camera_at(
         trainer=lens.training,
         seed=lens.seed,
         converged=lens.converged,
-        stop_reason=f"given by a lens at {describe(lens.controls, np.asarray(setting, dtype=float))}",
+        stop_reason=f"from a zoom lens at {describe(lens.controls, np.asarray(setting, dtype=float))}",
         rmse_px=float("nan"),
         max_px=float("nan"),
         distortion_model=lens.model,

@@ -36,7 +36,7 @@ def choose_model(lens: LensPoints, options: Options, reject: bool, report: Progr
             continue
         if not _explains_more(start, best):
             continue
-        report(f"trying distortion {model}", 0.5)
+        report(f"trying distortion model {model}", 0.5)
         best_px = _held_out(best, options) if best_px is None else best_px
         error_px = _held_out(start, options)
         if error_px < _WORTH * best_px:

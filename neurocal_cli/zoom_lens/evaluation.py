@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import Lens, coefficient_names, distort
-from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.pinhole import Intrinsics, entries_of
+from neurocal_cli.camera.projection import image_points
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.geometry import Array
 from neurocal_cli.methods import calibrate
@@ -61,15 +63,6 @@ class LensEvaluation:
     warnings: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """A camera with a lens, for fitting a pose."""
-
-    intrinsics: Intrinsics
-    distortion_model: str
-    distortion: Array
-
-
 def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
     """Reprojection error at the settings of points.
 
@@ -91,7 +84,9 @@ def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
     setting = points.point_setting
     behind = int(np.isnan(squares).sum())
     if behind:
-        warnings.append(f"{behind} of {len(squares)} points lie behind the camera and are in no average")
+        warnings.append(
+            f"{behind} of {len(squares)} points lie behind the camera and are left out of all averages"
+        )
     rivals = {}
     for name, rival in rivals_of(lens).items():
         rivals[name] = _rival_error(lens, points, *rival(x), constants)
@@ -112,14 +107,13 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
     if missing:
         raise InputError(
             f"{source}: there is no column {missing[0]}, which this lens was calibrated over; name the "
-            "setting of "
-            "each point"
+            "setting of each point"
         )
     here, there = points.points.image_size, lens.image_size
     if here is not None and there is not None and here != there:
         raise InputError(
             f"{source}: the points' image_size {here[0]} x {here[1]} differs from the lens's "
-            f"{there[0]} x {there[1]}"
+            f"{there[0]} x {there[1]}; give points of images of the lens's size"
         )
     columns = dict(zip(points.controls, points.settings[points.point_setting].T, strict=True))
     # Every point counts the same, as in any reprojection error.
@@ -132,7 +126,7 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
         warnings.append(
             f"{int(outside.sum())} of {len(outside)} settings lie outside the calibrated range, the "
             f"first at {first}: "
-            "what the networks say there is a guess"
+            "the networks extrapolate there"
         )
     return matched, warnings
 
@@ -144,10 +138,9 @@ def _poses(lens: ZoomLens, points: LensPoints, local: Array, theta: float) -> Co
     number = {name: k for k, name in enumerate(points.points.view_names)}
     n_k = len(coefficient_names(lens.model))
     for s, values in enumerate(local):
-        camera = _Known(
+        camera = Camera(
             Intrinsics(values[0], values[1], values[2], values[3], theta),
-            lens.model,
-            Lens(lens.model, values[len(values) - n_k :]).coefficients,
+            Distortion(lens.model, values[len(values) - n_k :]),
         )
         part = points.points.select(points.point_setting == s)
         try:
@@ -170,12 +163,9 @@ def _squares(lens: ZoomLens, points: LensPoints, local: Array, constants: Consta
         camera = np.einsum("nij,nj->ni", constants.R[view], world) + constants.t[view]
     depth = np.where(camera[:, 2] > 0, camera[:, 2], np.nan)
     image_x, image_y = camera[:, 0] / depth, camera[:, 1] / depth
-    if lens.model != "none":
-        n_k = len(coefficient_names(lens.model))
-        image_x, image_y = distort(lens.model, p[:, p.shape[1] - n_k :].T, image_x, image_y)
-    sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
-    u = p[:, 0] * (image_x - cosine / sine * image_y) + p[:, 2]
-    v = p[:, 1] / sine * image_y + p[:, 3]
+    k = p[:, p.shape[1] - len(coefficient_names(lens.model)) :].T
+    entries = entries_of(p[:, 0], p[:, 1], p[:, 2], p[:, 3], constants.theta)
+    u, v = image_points(entries, lens.model, k, image_x, image_y)
     return np.asarray((u - pixels[:, 0]) ** 2 + (v - pixels[:, 1]) ** 2)
 
 

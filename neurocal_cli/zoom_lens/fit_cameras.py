@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
@@ -85,13 +85,13 @@ class LensCameras:
         settings = np.column_stack([np.asarray(columns[name], dtype=float) for name in controls])
         local = np.column_stack([np.asarray(columns[name], dtype=float) for name in names])
         if not (np.isfinite(settings).all() and np.isfinite(local).all()):
-            raise InputError(f"{source}: the settings and parameters must be finite numbers")
+            raise InputError(f"{source}: the settings and parameters must be finite numbers; correct them")
         if not (local[:, :2] > 0).all():
             row = int(np.argmin((local[:, :2] > 0).all(axis=1)))
             raise InputError(f"{source}, row {row + 1}: alpha_u and alpha_v must be positive")
         moves = np.ptp(settings, axis=0) > 0
         if not moves.any():
-            raise InputError(f"{source}: all cameras are at one setting; a lens needs several")
+            raise InputError(f"{source}: all cameras are at one setting; give cameras at several settings")
         controls = tuple(name for name, moving in zip(controls, moves, strict=True) if moving)
         order = np.lexsort(settings[:, moves].T[::-1])
         moving_settings = settings[order][:, moves]

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.camera.distortion_models import MODELS
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.errors import UsageError
 from neurocal_cli.zoom_lens.committee import Budget
 from neurocal_cli.zoom_lens.distortion_selection import choose_model

@@ -73,9 +73,8 @@ def check_settings(count: int, controls: int, source: str) -> None:
     least = controls + 2
     if count < least:
         raise InputError(
-            f"{source}: there are {count} settings, too few to follow {controls} "
-            f"control{'s' * (controls > 1)}; "
-            f"give at least {least}, and better 5 of each"
+            f"{source}: {count} settings are too few for {controls} control{'s' * (controls > 1)}; give at "
+            f"least {least} settings, better 5 values of each control"
         )
 
 
@@ -88,9 +87,8 @@ def begin(lens: LensPoints, model: str, options: Options, reject: bool, report: 
         tables = common_tables(data, static.local, first_constants(static, lens, options.still), report)
         if not tables.normal.sensible or not np.isfinite(tables.normal.cost).all():
             raise DegenerateGeometryError(
-                f"{lens.points.source}: no constants were found that all settings share; did the "
-                "camera or the "
-                "target move? Then give each setting several views of the board, --camera moving"
+                f"{lens.points.source}: no common pose fits all settings; if the camera or the target "
+                "moved, give several views of the board at each setting, and --camera moving"
             )
         bad = bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if reject else None
         if bad is None or len(rejected) >= max(1, lens.n_settings // 5):

@@ -33,7 +33,7 @@ def bad_pixels(rms: Array) -> BadSetting | None:
     if rms[worst] <= _PIXELS * typical:
         return None
     return BadSetting(
-        worst, f"its pixels fit only to {rms[worst]:.3g} px, those of the others to {typical:.3g} px"
+        worst, f"its reprojection error is {rms[worst]:.3g} px, that of the others {typical:.3g} px"
     )
 
 
@@ -65,6 +65,4 @@ def stands_out(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str | 
     pixels = float(np.sqrt(max(error @ H @ error, 0.0) / max(tables.normal.H[s, 2, 2], 1.0)))
     if sigmas < _SIGMAS or pixels < _VISIBLE * np.sqrt(2 * lens.variance):
         return None
-    return (
-        f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations away from what the other settings tell"
-    )
+    return f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations off what the other settings predict"

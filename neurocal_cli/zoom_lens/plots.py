@@ -195,6 +195,6 @@ def _draw_rivals(axes: Axes, evaluation: LensEvaluation) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
-    _style(axes, "The same points, other models")
+    _style(axes, "The same points, baseline models")
     axes.set_xlabel("rms [px]")
     axes.tick_params(axis="y", labelsize=7)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.report import align, rounded
 from neurocal_cli.zoom_lens.evaluation import LensEvaluation
@@ -25,28 +25,33 @@ def lens_report(lens: ZoomLens) -> str:
     """Summary of a lens: what it was learnt from, its networks, how well it fits."""
     kind = "known cameras" if lens.known else "camera still" if lens.still else "camera moving"
     points = "" if lens.known else f", {int(lens.counts.sum())} points"
-    head = f"lens: {len(lens.settings)} settings of {' and '.join(lens.controls)}{points}, {kind}"
+    head = f"zoom lens: {len(lens.settings)} settings of {' and '.join(lens.controls)}{points}, {kind}"
     if lens.model != "none":
-        head += f", distortion {lens.model}"
+        head += f", distortion model {lens.model}"
     blocks = [head, "\n".join(align(_network_rows(lens)))]
     tail = []
     if lens.known:
         scatter = [net.scatter for net in lens.members[0].nets.nets]
-        tail.append(f"scatter of the cameras about the networks: {_scatter_text(lens, scatter)}")
+        tail.append(f"scatter of the cameras around the networks: {_scatter_text(lens, scatter)}")
     else:
         tail.append(
-            f"error: rms {lens.rmse_px:.3f} px; noise explains {np.sqrt(2 * lens.variance):.3f} px; "
-            f"each setting left out in turn: {lens.left_out_px:.3f} px"
+            f"reprojection error: rms {lens.rmse_px:.3f} px; noise floor {np.sqrt(2 * lens.variance):.3f} "
+            "px; "
+            f"cross-validation error, each setting left out in turn: {lens.left_out_px:.3f} px"
         )
     tail.append(
-        f"committee of {len(lens.members)}, alpha on a {_scale_text(lens)} scale, trained {_training(lens)}"
+        f"networks: committee of {len(lens.members)}, alpha on a {_scale_text(lens)} scale, {_training(lens)}"
     )
-    tail.append("converged" if lens.converged else "training was stopped before it settled")
+    tail.append("converged" if lens.converged else "not converged: training stopped before the error settled")
     return "\n\n".join([*blocks, "\n".join(tail)])
 
 
 def _training(lens: ZoomLens) -> str:
-    return {"joint": "all together", "alternating": "in turns"}.get(lens.training, lens.training)
+    return {
+        "joint": "trained jointly",
+        "alternating": "trained alternately",
+        "one at a time": "trained one at a time",
+    }.get(lens.training, lens.training)
 
 
 def _scale_text(lens: ZoomLens) -> str:
@@ -67,7 +72,7 @@ def _scatter_text(lens: ZoomLens, scatter: list[float]) -> str:
 
 def _network_rows(lens: ZoomLens) -> list[list[str]]:
     prediction = lens.predict(lens.settings)
-    rows = [["network", "hidden units", "lowest", "highest", "typical std"]]
+    rows = [["network", "hidden units", "minimum", "maximum", "median std"]]
     for j, name in enumerate(lens.names):
         topologies = sorted(
             {(m.nets.nets[j].topology.own, m.nets.nets[j].topology.hidden) for m in lens.members}
@@ -108,7 +113,7 @@ def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...]) -> 
         f"{_pixels(evaluation.rmse_px)} px, "
         f"maximum {_pixels(evaluation.max_px)} px"
     )
-    title = "the worst settings:" if len(evaluation.settings) > len(shown) else "settings:"
+    title = "settings with the largest error:" if len(evaluation.settings) > len(shown) else "settings:"
     return "\n\n".join(
         [head, "\n".join(align(_rival_rows(evaluation))), "\n".join([title, *align(settings)])]
     )

@@ -83,16 +83,17 @@ def _warnings(lens: ZoomLens, start: Start, tables_rms: float) -> tuple[str, ...
     if alone:
         first = next(iter(start.static.reasons.values()))
         warnings.append(
-            f"{alone} of {len(start.static.good)} settings cannot be calibrated by themselves and rest on "
-            f"the others: {first}"
+            f"{alone} of {len(start.static.good)} settings cannot be calibrated by themselves and depend "
+            f"on the others: {first}"
         )
     for rejected in lens.rejected:
         where = describe(lens.controls, np.array(rejected.setting))
         warnings.append(f"the setting {where} is left out: {rejected.reason}")
     if lens.rmse_px > _POOR_FIT * tables_rms:
         warnings.append(
-            f"the networks follow the settings only to {lens.rmse_px:.3g} px, tables of them fit to "
-            f"{tables_rms:.3g} "
-            "px: the lens does not return to the same place, or changes faster than the settings tell"
+            f"the error of the networks is {lens.rmse_px:.3g} px, that of separate settings {tables_rms:.3g} "
+            "px: "
+            "the lens does not return to the same position, or changes too much between the settings; give "
+            "more settings"
         )
     return tuple(warnings)

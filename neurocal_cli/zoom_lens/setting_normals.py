@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.bundle_adjustment.views import Views, arrange
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
 from neurocal_cli.zoom_lens.settings import LensPoints
 

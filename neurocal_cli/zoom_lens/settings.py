@@ -66,7 +66,7 @@ class LensPoints:
         if not finite.all():
             row = int(np.argmin(finite))
             raise InputError(
-                f"{points.place(row)}: the setting must be of finite numbers; correct or remove the row"
+                f"{points.place(row)}: the setting must be finite numbers; correct or remove the row"
             )
         first = np.unique(points.view_index, return_index=True)[1]
         differs = (values != values[first][points.view_index]).any(axis=1)
@@ -103,7 +103,7 @@ class LensPoints:
             raise InputError(
                 f"{self.points.source}: all points are at one setting, "
                 f"{describe(self.controls, self.settings[0])}; "
-                "a lens needs several, and `neurocal calibrate` takes one"
+                "give points at several settings, or use `neurocal calibrate`"
             )
         controls = tuple(name for name, moving in zip(self.controls, moves, strict=True) if moving)
         return LensPoints(self.points, controls, self.settings[:, moves], self.view_setting)

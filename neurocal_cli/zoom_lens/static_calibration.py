@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion_models import coefficient_names
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.geometry import Array
 from neurocal_cli.methods import calibrate

@@ -42,7 +42,9 @@ def train_all(start: Start, options: Options, budget: Budget, report: Progress) 
         joints.append(train(start.data, x, nets, start.tables.constants, start.variance, scatter, tell))
     joints = [joint for joint in joints if np.isfinite(joint.evidence)]
     if not joints:
-        raise DegenerateGeometryError(f"{start.lens.points.source}: no network could follow the lens")
+        raise DegenerateGeometryError(
+            f"{start.lens.points.source}: no network fits the settings; give more settings"
+        )
     joints.sort(key=lambda joint: -joint.evidence)
     return joints
 

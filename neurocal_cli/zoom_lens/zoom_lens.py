@@ -197,15 +197,15 @@ class ZoomLens:
                 raise UsageError(f"this lens {verb} {name}; it was calibrated over {has}")
         setting = np.array([values[name] for name in self.controls], dtype=float)
         if not np.isfinite(setting).all():
-            raise InputError("the setting must be of finite numbers")
+            raise InputError("the setting must be finite numbers; correct it")
         outside = [
             f"{name} {value:.10g} is outside the calibrated range, {low:.10g} to {high:.10g}"
             for name, value, low, high in zip(self.controls, setting, self.low, self.high, strict=True)
             if not low <= value <= high
         ]
         if outside and not extrapolate:
-            raise InputError(f"{'; '.join(outside)}; choose a setting inside, or ask for --extrapolate")
-        return setting, [f"{text}: what the networks say there is a guess" for text in outside]
+            raise InputError(f"{'; '.join(outside)}; choose a setting inside it, or give --extrapolate")
+        return setting, [f"{text}: the networks extrapolate there" for text in outside]
 
     def predict(self, settings: Array) -> Prediction:
         """Parameters at settings (n, D), with covariances.
@@ -225,7 +225,8 @@ class ZoomLens:
                 )
             )
             raise InputError(
-                f"the networks know no camera at {describe(self.controls, np.atleast_2d(settings)[bad])}; "
+                "the networks give no valid camera at "
+                f"{describe(self.controls, np.atleast_2d(settings)[bad])}; "
                 "choose a setting in the calibrated range"
             )
         constants, offsets = _mean_constants([member.constants for member in self.members], self.still)

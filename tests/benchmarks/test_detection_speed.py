@@ -3,16 +3,12 @@
 Run with ``pytest tests/benchmarks/test_detection_speed.py -n 0 --benchmark-enable``.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from rendered import picture
+from support.real_data import RealFiles
+from support.rendered import picture
 
 from neurocal_cli.board import Board
 from neurocal_cli.detection.batch import keep_memory
@@ -22,7 +18,6 @@ from neurocal_cli.detection.measuring import measure
 
 cv2 = pytest.importorskip("cv2")
 CONDITIONS = ["base", "2 Mpx", "5 Mpx", "clutter only"]
-PHOTOS = Path(__file__).resolve().parents[3] / "shared" / "data" / "opencv_stereo"
 # One board in view; three of them, of which one is asked for.
 PHOTOGRAPHS = ["right01.jpg", "left02.jpg"]
 
@@ -66,31 +61,33 @@ def test_opencv_sector_based(benchmark: BenchmarkFixture, condition: str) -> Non
     assert bool(found) == (condition != "clutter only")
 
 
-def photograph(name: str) -> NDArray[np.uint8]:
+def photograph(real_files: RealFiles, name: str) -> NDArray[np.uint8]:
     cv2.setNumThreads(1)
     keep_memory()
-    image = cv2.imread(str(PHOTOS / name), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        pytest.skip("no photographs here")
-    return np.asarray(image, dtype=np.uint8)
+    (path,) = real_files(f"opencv_stereo/{name}")
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
 
 
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
-def test_neurocal_on_photographs(benchmark: BenchmarkFixture, name: str) -> None:
-    image, board = photograph(name), Board.single(9, 6, 25.0)
+def test_neurocal_on_photographs(benchmark: BenchmarkFixture, real_files: RealFiles, name: str) -> None:
+    image, board = photograph(real_files, name), Board.single(9, 6, 25.0)
     benchmark.group = f"photograph {name}, {image.size / 1e6:.1f} Mpx"
     assert len(benchmark(lambda: detect_points(image, board)).ids) == 93
 
 
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
-def test_opencv_classic_and_subpix_on_photographs(benchmark: BenchmarkFixture, name: str) -> None:
-    image = photograph(name)
+def test_opencv_classic_and_subpix_on_photographs(
+    benchmark: BenchmarkFixture, real_files: RealFiles, name: str
+) -> None:
+    image = photograph(real_files, name)
     benchmark.group = f"photograph {name}, {image.size / 1e6:.1f} Mpx"
     assert benchmark(lambda: classic(image))
 
 
 @pytest.mark.parametrize("name", PHOTOGRAPHS)
-def test_opencv_sector_based_on_photographs(benchmark: BenchmarkFixture, name: str) -> None:
-    image = photograph(name)
+def test_opencv_sector_based_on_photographs(
+    benchmark: BenchmarkFixture, real_files: RealFiles, name: str
+) -> None:
+    image = photograph(real_files, name)
     benchmark.group = f"photograph {name}, {image.size / 1e6:.1f} Mpx"
     benchmark(lambda: cv2.findChessboardCornersSB(image, (9, 6)))  # it misses some

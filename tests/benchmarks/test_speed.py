@@ -10,13 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from bent import through
-from scenes import random_flat_set, table_1
+from support.distorted import through
+from support.plain_projection import project
+from support.scenes import random_flat_set, table_1
 
 from neurocal_cli import Correspondences, calibrate, read_points, write_points
-from neurocal_cli.camera.pinhole import project
 
 VIEWS = [13, 100, 1000]
 GIVEN = ["--distortion", "plumb_bob", "--outliers", "keep"]

@@ -3,15 +3,10 @@
 Run with ``pytest tests/benchmarks/test_stereo_speed.py -n 0 --benchmark-enable --benchmark-group-by=group``.
 """
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from rigs import RigScene, random_rig
+from support.rigs import RigScene, random_rig
 
 from neurocal_cli import Correspondences, calibrate_stereo, triangulate
 

@@ -92,7 +92,7 @@ def identify(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> 
         told apart.
     """
     if not grids:
-        raise NoBoardError("no board found; show it whole, sharp and evenly lit")
+        raise NoBoardError("no board detected; show the whole board, sharp and evenly lit")
     chosen = _candidates(board, grids, grey)
     whole = [candidate for candidate in chosen if candidate.whole]
     try:
@@ -159,7 +159,8 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
             alike.sort(key=lambda c: -_square(c.grid))
         if len(alike) > room and _square(alike[room - 1].grid) < _NEARER * _square(alike[room].grid):
             raise NoBoardError(
-                f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices found; show only one of them"
+                f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices are detected; show only one of "
+                "them"
             )
         kept += alike[:room]
     return sorted(kept, key=lambda c: -int(c.grid.seen.sum()))
@@ -201,16 +202,18 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Way]:
         ways = [_scored(board, chosen[:count], placements, front) for placements in longer]
         ways = sorted((way for way in ways if np.isfinite(way.rms)), key=lambda way: way.rms)
         if not ways:
-            raise NoBoardError("the grids found do not lie as on the board; check the board's planes")
+            raise NoBoardError(
+                "the detected grids do not match the planes of the board; check the board file"
+            )
         if not candidate.whole and count > 2 and ways[0].rms > _CLEARLY * max(before, _NOISE):
-            raise NoBoardError("a grid does not lie as any plane of the board; hide what is not the board")
+            raise NoBoardError("a detected grid matches no plane of the board; hide other patterns")
         before = ways[0].rms
         # What is bad with two planes may become the best with three, but not what is hopeless.
         limit = (_CLEARLY if count == len(chosen) else _CLEARLY**2) * max(ways[0].rms, _NOISE)
         ways = [way for way in ways if way.rms <= limit][: None if count == len(chosen) else _KEPT]
     if len(chosen) > 1 and ways[0].rms > _MISFIT * min(_square(c.grid) for c in chosen):
         raise NoBoardError(
-            f"the planes miss their places on the board by {ways[0].rms:.3g} px; check its origins and axes"
+            f"the planes are {ways[0].rms:.3g} px off their places on the board; check its origins and axes"
         )
     return ways
 

@@ -12,9 +12,9 @@ from neurocal_cli.errors import NeurocalError
 __all__ = ["LOOKS_THE_SAME", "NoBoardError", "another_size", "several_ways"]
 
 LOOKS_THE_SAME = (
-    "the board looks the same after a turn, colours included, so which corner is the first one depends on "
-    "how it lies in the image; for points that are the same in all images use a board with one even and "
-    "one odd side"
+    "the board looks the same after a turn, so its first corner depends on its orientation in the image; to "
+    "get the same point ids in all images, use a board with an even number of inner vertices on one side and "
+    "an odd number on the other"
 )
 
 
@@ -31,11 +31,9 @@ def another_size(board: Board, grid: Grid, ends: Sequence[End]) -> str:
         if (shape[0] < shape[1]) != (plane.cols < plane.rows):  # named as the user names them
             shape = shape[1], shape[0]
         if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends:
-            return f"the pattern goes on beyond {wanted} inner vertices; give the size of the whole board"
+            return f"the pattern continues beyond {wanted} inner vertices; give the size of the whole board"
     have = "board has" if len(board.planes) == 1 else "planes of the board have"
-    return (
-        f"found {_size(shape)} inner vertices, the {have} {wanted}; give the size of the board in the image"
-    )
+    return f"detected {_size(shape)} inner vertices, but the {have} {wanted}; give the size of this board"
 
 
 def several_ways(board: Board, grids: Sequence[Grid], rms: float) -> str:
@@ -44,16 +42,18 @@ def several_ways(board: Board, grids: Sequence[Grid], rms: float) -> str:
     part = next((grid for grid in grids if sorted(grid.shape) not in sizes), None)
     if part is not None:
         return (
-            f"found {_size(part.shape)} of {_sizes(board)} inner vertices, and nothing tells which; show the "
-            "whole board, or its outer border on more sides"
+            f"detected {_size(part.shape)} of {_sizes(board)} inner vertices, but it is ambiguous which "
+            "ones; "
+            "show the whole board, or its outer border on more sides"
         )
     if len(grids) < len(board.planes):
         return (
-            f"only {len(grids)} of the {len(board.planes)} planes found, which does not tell how they lie; "
+            f"only {len(grids)} of the {len(board.planes)} planes detected, so their position is ambiguous; "
             "show more of them"
         )
     return (
-        f"the planes fit together in more ways than one, to {rms:.2g} px; check the board's origins and axes "
+        f"the planes fit the board in more than one way, to {rms:.2g} px; check the board's origins and "
+        "axes, "
         "or take the image from nearer"
     )
 

@@ -10,7 +10,6 @@ from neurocal_cli.simulation.rendering.bound import Bound, edge_bound, scene_bou
 from neurocal_cli.simulation.rendering.render import Rendered, noise_free, render
 from neurocal_cli.simulation.rendering.scene import (
     Background,
-    Camera,
     Disc,
     Illumination,
     Occluder,
@@ -25,7 +24,6 @@ from neurocal_cli.simulation.rendering.truth import PlaneTruth, Truth, ground_tr
 __all__ = [
     "Background",
     "Bound",
-    "Camera",
     "Disc",
     "Illumination",
     "Occluder",

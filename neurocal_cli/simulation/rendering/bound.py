@@ -14,7 +14,6 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.light import enough_parts, image_light
-from neurocal_cli.simulation.rendering.rays import Lens
 from neurocal_cli.simulation.rendering.scene import Scene
 from neurocal_cli.simulation.rendering.sensor import noise_variance, response, signal
 
@@ -79,9 +78,9 @@ def scene_bound(scene: Scene) -> tuple[Bound, ...]:
     """
     gradient_u, gradient_v, linear = _gradients(scene)
     weight = 1 / noise_variance(scene.sensor, linear)
-    width, height = scene.camera.size
+    width, height = scene.size
     v, u = np.mgrid[0:height, 0:width].reshape(2, -1).astype(float)
-    rays = Lens(scene.camera).rays(u, v)
+    rays = scene.camera.rays(u, v)
     information = gradient_u.ravel(), gradient_v.ravel(), weight.ravel()
     bounds = []
     for target in scene.targets:
@@ -103,7 +102,7 @@ def _gradients(scene: Scene) -> tuple[Array, Array, Array]:
     the same in both pictures.
     """
     step = 1 / enough_parts(scene)
-    gradients, mean = [], np.zeros(scene.camera.size[::-1])
+    gradients, mean = [], np.zeros(scene.size[::-1])
     for du, dv in ((step, 0.0), (0.0, step)):
         ahead, behind = (
             signal(scene.sensor, image_light(_shifted(scene, sign * du, sign * dv))) for sign in (1, -1)

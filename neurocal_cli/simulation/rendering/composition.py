@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.projection import Rays
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer, occluder_cover
-from neurocal_cli.simulation.rendering.rays import Lens, Rays
 from neurocal_cli.simulation.rendering.scene import Occluder, Scene
 
 __all__ = ["Composition"]
@@ -28,12 +29,12 @@ class Composition:
 
     Parameters
     ----------
-    lens : Lens
+    camera : Camera
     boards : tuple of BoardLayer
     occluders : tuple of Rectangle or Disc
     """
 
-    lens: Lens
+    camera: Camera
     boards: tuple[BoardLayer, ...]
     occluders: tuple[Occluder, ...]
 
@@ -41,7 +42,7 @@ class Composition:
     def of(cls, scene: Scene) -> Composition:
         """Arrange a scene's layers."""
         boards = tuple(BoardLayer.of(scene, target) for target in scene.targets)
-        return cls(Lens(scene.camera), boards, scene.occluders)
+        return cls(scene.camera, boards, scene.occluders)
 
     def light(
         self, rays: Rays, behind: Array, cell: float, slack: float = 0.0
@@ -91,7 +92,7 @@ class Composition:
         edged : (N,) bool array
         rays : Rays
         """
-        rays = self.lens.rays(u, v)
+        rays = self.camera.rays(u, v)
         light, edges = self.light(rays, behind, 1.0, _PIXEL_SLACK)
         return light, edges > 0, rays
 
@@ -131,6 +132,6 @@ class Composition:
         cell_u = np.broadcast_to(u[:, None, None] + offsets, shape).reshape(-1)
         cell_v = np.broadcast_to(v[:, None, None] + offsets[:, None], shape).reshape(-1)
         count = parts * parts
-        rays = self.lens.rays(cell_u, cell_v, (np.repeat(start[0], count), np.repeat(start[1], count)))
+        rays = self.camera.rays(cell_u, cell_v, (np.repeat(start[0], count), np.repeat(start[1], count)))
         light, edges = self.light(rays, np.repeat(behind, count), side / parts)
         return light, edges, rays

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.coverage import half_plane
-from neurocal_cli.simulation.rendering.rays import Rays
 from neurocal_cli.simulation.rendering.scene import Disc, Occluder, Rectangle, Scene, Target
 
 __all__ = ["BoardLayer", "Cover", "occluder_cover"]

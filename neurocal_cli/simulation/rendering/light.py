@@ -35,11 +35,11 @@ def image_light(scene: Scene, parts: int | None = None) -> Array:
     light : (height, width) array
         Linear, 1 being the sensor's full scale at gain 1.
     """
-    width, height = scene.camera.size
+    width, height = scene.size
     blur = Blur(scene.psf, parts or enough_parts(scene))
     pad = blur.radius
     composition = Composition.of(scene)
-    level = background_image(scene.background, scene.camera.size, pad)
+    level = background_image(scene.background, scene.size, pad)
     residual = np.zeros((height + 4 * pad, width + 4 * pad))
     edged = np.zeros(level.shape, dtype=bool)
     for rows in _strips(level.shape):
@@ -104,7 +104,7 @@ def _cell_light(scene: Scene, u: Array, v: Array, parts: int) -> Array:
     offsets = (np.arange(parts) + 0.5) / parts - 0.5
     return illuminated(
         scene.illumination,
-        scene.camera.size,
+        scene.size,
         u[:, None, None] + offsets,
         v[:, None, None] + offsets[:, None],
     )
@@ -115,7 +115,7 @@ def _shaded(
 ) -> tuple[Array, Array | None, Array | None]:
     """Light of the pixels and its slopes within those that have no edges."""
     light = scene.illumination
-    width, height = scene.camera.size
+    width, height = scene.size
     if light.gradient == (0.0, 0.0):
         if light.level != 1:
             level[~edged] *= light.level
@@ -123,7 +123,7 @@ def _shaded(
     v, u = (np.mgrid[0 : level.shape[0], 0 : level.shape[1]] - pad).astype(float)
     slope_u = np.where(edged, 0.0, level * (light.level * light.gradient[0] / width))
     slope_v = np.where(edged, 0.0, level * (light.level * light.gradient[1] / height))
-    shade = illuminated(light, scene.camera.size, u, v)
+    shade = illuminated(light, scene.size, u, v)
     return np.where(edged, level, level * shade), slope_u, slope_v
 
 
@@ -131,7 +131,7 @@ def _vignetting(scene: Scene) -> Array | float:
     strength = scene.illumination.vignetting
     if strength == 0:
         return 1.0
-    width, height = scene.camera.size
+    width, height = scene.size
     u, v = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
     corner = max(0.25 * ((width - 1) ** 2 + (height - 1) ** 2), 1.0)
     return np.asarray(1 - strength * (u**2 + v[:, None] ** 2) / corner)

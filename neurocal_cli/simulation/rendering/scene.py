@@ -12,13 +12,13 @@ from typing import Literal
 import numpy as np
 
 from neurocal_cli.board import Board, Plane
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
 __all__ = [
     "Background",
-    "Camera",
     "Disc",
     "Illumination",
     "Occluder",
@@ -31,34 +31,6 @@ __all__ = [
 
 ClutterKind = Literal["blocks", "lines", "gradients", "discs", "decoys"]
 CLUTTER_KINDS: tuple[ClutterKind, ...] = ("blocks", "lines", "gradients", "discs", "decoys")
-
-
-@dataclass(frozen=True)
-class Camera:
-    """A camera with a lens.
-
-    Parameters
-    ----------
-    intrinsics : Intrinsics
-        Skew included.
-    size : (width, height) [px]
-    distortion : tuple of up to 5 floats
-        k1, k2, p1, p2, k3 in OpenCV's order; acts on normalised coordinates, then A is applied.
-    """
-
-    intrinsics: Intrinsics
-    size: tuple[int, int]
-    distortion: tuple[float, ...] = ()
-
-    def __post_init__(self) -> None:
-        width, height = (int(s) for s in self.size)
-        coefficients = tuple(float(k) for k in self.distortion)
-        if width <= 0 or height <= 0:
-            raise InputError(f"size must be two positive whole numbers, found {self.size}")
-        if len(coefficients) > 5 or not np.isfinite(coefficients).all():
-            raise InputError("distortion takes up to five finite numbers: k1, k2, p1, p2, k3")
-        object.__setattr__(self, "size", (width, height))
-        object.__setattr__(self, "distortion", (*coefficients, *(0.0,) * (5 - len(coefficients))))
 
 
 @dataclass(frozen=True)
@@ -245,6 +217,7 @@ class Scene:
     Parameters
     ----------
     camera : Camera
+        With the size of its images.
     pose : Pose
         World to camera.
     targets : tuple of Target
@@ -273,6 +246,14 @@ class Scene:
     def __post_init__(self) -> None:
         if not 0 <= self.psf <= 50:
             raise InputError(f"psf must lie between 0 and 50 px, found {self.psf:g}")
+        if self.camera.image_size is None:
+            raise InputError("the camera of a scene needs the size of its images")
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the picture [px]."""
+        assert self.camera.image_size is not None  # since __post_init__
+        return self.camera.image_size
 
     @property
     def board(self) -> Board:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from neurocal_cli.board import Plane
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer, occluder_cover
-from neurocal_cli.simulation.rendering.rays import Lens
 from neurocal_cli.simulation.rendering.scene import Scene, Target
 
 __all__ = ["PlaneTruth", "Truth", "ground_truth"]
@@ -159,20 +158,21 @@ class _Sight:
     def __init__(self, scene: Scene, clearance: float) -> None:
         self.scene = scene
         self.clearance = clearance
-        self.lens = Lens(scene.camera)
+        self.camera = scene.camera
         self.layers = [BoardLayer.of(scene, target) for target in scene.targets]
 
     def project(self, index: int, grid: Array) -> tuple[Array, Mask]:
         """Pixels of a target's grid coordinates, NaN where not seen, and which are seen."""
         matrix = self.scene.plane_to_camera(self.scene.targets[index])
-        pixels, seen = self.lens.project(grid @ matrix[:, :2].T + matrix[:, 2])
+        points = grid @ matrix[:, :2].T + matrix[:, 2]
+        pixels, seen = self.camera.project(points)[0], self.camera.sees(points)
         return np.where(seen[..., None], pixels, np.nan), seen
 
     def look(self, index: int, grid: Array) -> tuple[Array, Mask]:
         """Pixels of a target's grid coordinates, and which are visible with clearance."""
         pixels, seen = self.project(index, grid)
         flat = pixels.reshape(-1, 2)
-        width, height = self.scene.camera.size
+        width, height = self.scene.size
         room = np.array([width - 1, height - 1]) - self.clearance
         with np.errstate(invalid="ignore"):
             framed = ((flat >= self.clearance) & (flat <= room)).all(axis=1)
@@ -186,7 +186,7 @@ class _Sight:
         angle = np.arange(12) * (np.pi / 6)
         ring = self.clearance * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         around = pixels[:, None] + np.concatenate([np.zeros((1, 2)), ring])
-        rays = self.lens.rays(around[..., 0].ravel(), around[..., 1].ravel())
+        rays = self.camera.rays(around[..., 0].ravel(), around[..., 1].ravel())
         _, _, w = self.layers[index].grid(rays)
         with np.errstate(divide="ignore"):
             depth = np.where(w > 0, 1 / w, np.inf)

@@ -1,0 +1,223 @@
+"""A camera: its matrix A, its distortion and the size of its images.
+
+Pixels: the centre of the top-left pixel is (0, 0), so that an image of width w covers u from -1/2 to w - 1/2.
+Points are in the camera's own frame, x right, y down, z forward; a `Pose` takes them there from the world.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.monotonic import is_monotonic, undistort
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.camera.projection import (
+    ENTRIES,
+    Rays,
+    image_points,
+    image_points_with_jacobian,
+    normalised_points,
+    project_with_jacobian,
+    rays_of,
+)
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = ["Camera"]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A camera, whatever its pose.
+
+    Parameters
+    ----------
+    intrinsics : Intrinsics
+        alpha_u, alpha_v, u0, v0 [px] and theta; `Intrinsics.from_matrix` reads them off A.
+    distortion : Distortion
+        It acts on normalised image points; then A is applied, skew included.
+    image_size : (width, height), optional [px]
+    name : str
+        What files call it.
+
+    Raises
+    ------
+    InputError
+        An image without pixels.
+
+    Examples
+    --------
+    >>> camera = Camera(Intrinsics(800, 800, 319.5, 239.5), Distortion("k1", [-0.2]), (640, 480))
+    >>> pixels, in_front = camera.project(np.array([[0.1, 0.2, 1.0]]))
+    >>> pixels.round(2)
+    array([[398.7, 397.9]])
+    >>> ray = camera.unproject(pixels)
+    >>> np.round(ray / ray[:, 2:], 9)
+    array([[0.1, 0.2, 1. ]])
+    """
+
+    intrinsics: Intrinsics
+    distortion: Distortion = field(default_factory=Distortion)
+    image_size: tuple[int, int] | None = None
+    name: str = "camera"
+
+    def __post_init__(self) -> None:
+        if self.image_size is not None:
+            width, height = (int(side) for side in self.image_size)
+            if width <= 0 or height <= 0:
+                raise InputError(f"image_size must be two positive whole numbers, found {self.image_size}")
+            object.__setattr__(self, "image_size", (width, height))
+
+    @cached_property
+    def A(self) -> Array:
+        """(3, 3) camera matrix, skew included."""
+        A = self.intrinsics.A
+        A.setflags(write=False)
+        return A
+
+    @cached_property
+    def entries(self) -> tuple[float, float, float, float, float]:
+        """A11, A12, A22, A13, A23 [px] as plain numbers."""
+        a, s, b, u0, v0 = self.A[ENTRIES].tolist()
+        return a, s, b, u0, v0
+
+    @cached_property
+    def model(self) -> str:
+        """The model of its distortion, "none" where that moves no point."""
+        return "none" if self.distortion.is_identity else self.distortion.model
+
+    def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Project points, paper eq. (1).
+
+        Parameters
+        ----------
+        points : (..., 3) array
+            In the camera's frame, in any unit.
+
+        Returns
+        -------
+        pixels : (..., 2) array [px]
+            ``nan`` for points that are not in front of the camera.
+        in_front : (...) bool array
+        """
+        X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
+        in_front = np.asarray(Z > 0)
+        depth = np.where(in_front, Z, np.nan)
+        return np.stack(self.image_points(X / depth, Y / depth), axis=-1), in_front
+
+    def sees(self, points: Array) -> NDArray[np.bool_]:
+        """Whether points (..., 3) are in front of the camera where its distortion is monotonic."""
+        X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray((Z > 0) & is_monotonic(self.distortion, X / Z, Y / Z))
+
+    def project_jacobian(self, points: Array) -> tuple[Array, Array]:
+        """Derivatives of the pixels of points (N, 3).
+
+        Returns
+        -------
+        by_camera : (N, 2, 5 + K) array
+            By A11, A12, A22, A13, A23 and the coefficients of the distortion.
+        by_point : (N, 2, 3) array
+        """
+        points = np.asarray(points, dtype=float)
+        k = self.distortion.coefficients
+        J = np.zeros((8 + len(k), 2, len(points)))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            project_with_jacobian(
+                self.entries, self.distortion.model, k, list(points.T), J[:5], J[5:8], J[8:]
+            )
+        by_camera = np.concatenate([J[:5], J[8:]])
+        return by_camera.transpose(2, 1, 0), J[5:8].transpose(2, 1, 0)
+
+    def unproject(self, pixels: Array) -> Array:
+        """Directions in which pixels see.
+
+        Unit vectors, not points of a plane before the camera: `project` takes them as they are, and only
+        they can tell directions of 90 degrees and more from the axis.
+
+        Parameters
+        ----------
+        pixels : (..., 2) array [px]
+
+        Returns
+        -------
+        rays : (..., 3) array
+            Of unit length, in the camera's frame; ``nan`` where the camera cannot see anything.
+        """
+        x, y = self.normalised_points(*np.moveaxis(np.asarray(pixels, dtype=float), -1, 0))
+        rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+        return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
+
+    def unproject_jacobian(self, pixels: Array) -> tuple[Array, Array]:
+        """Derivatives of the rays of pixels (N, 2).
+
+        Returns
+        -------
+        by_camera : (N, 3, 5 + K) array
+            By A11, A12, A22, A13, A23 and the coefficients of the distortion, at the same pixels.
+        by_pixel : (N, 3, 2) array
+        """
+        rays = self.unproject(pixels)
+        # A ray r of unit length moves across itself alone, and J dr = dm where J is of `project`.
+        by_camera, by_point = self.project_jacobian(rays)
+        along = rays[:, None, :]
+        square = np.concatenate([by_point, along], axis=1)
+        by_pixel = np.full((len(rays), 3, 2), np.nan)
+        seen = np.isfinite(rays[:, 0])
+        by_pixel[seen] = np.linalg.inv(square[seen])[:, :, :2]
+        return -by_pixel @ by_camera, by_pixel
+
+    def rescaled(self, scale: float | tuple[float, float]) -> Camera:
+        """The camera of resized images: ``u' = (u + 1/2) s - 1/2``.
+
+        Parameters
+        ----------
+        scale : float, or one for u and one for v
+            New width by old width, new height by old height. An image size that it leads to is rounded.
+        """
+        factors = np.array(np.broadcast_to(scale, 2), dtype=float)
+        if not (np.isfinite(factors).all() and (factors > 0).all()):
+            raise InputError(f"the scale of an image must be positive, found {scale}")
+        A = self.A.copy()
+        A[:2] *= factors[:, None]
+        A[:2, 2] += 0.5 * (factors - 1)
+        size = self.image_size
+        if size is not None:
+            size = max(1, round(size[0] * factors[0])), max(1, round(size[1] * factors[1]))
+        return replace(self, intrinsics=Intrinsics.from_matrix(A), image_size=size)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The camera of a part of its images.
+
+        Parameters
+        ----------
+        left, top : int [px]
+            The pixel of the image that becomes (0, 0).
+        width, height : int [px]
+            Of the part.
+        """
+        A = self.A.copy()
+        A[:2, 2] -= left, top
+        return replace(self, intrinsics=Intrinsics.from_matrix(A), image_size=(width, height))
+
+    def image_points(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """Pixels u, v of normalised image points x, y."""
+        return image_points(self.entries, self.model, self.distortion.coefficients, x, y)
+
+    def image_jacobian(self, x: Array, y: Array) -> Array:
+        """(N, 2, 2) derivatives of the pixels of normalised image points (N,)."""
+        by = image_points_with_jacobian(self.entries, self.model, self.distortion.coefficients, x, y).by_point
+        return np.stack([np.broadcast_to(d, x.shape) for d in by], axis=-1).reshape(*x.shape, 2, 2)
+
+    def normalised_points(self, u: Array, v: Array) -> tuple[Array, Array]:
+        """Normalised image points x, y of pixels u, v, without the distortion; nan where there are none."""
+        return undistort(self.distortion, *normalised_points(self.entries, u, v))
+
+    def rays(self, u: Array, v: Array, near: tuple[Array, Array] | None = None) -> Rays:
+        """The same with derivatives; see `projection.rays_of`."""
+        return rays_of(self.entries, self.distortion, u, v, near)

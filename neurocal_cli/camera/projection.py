@@ -1,0 +1,210 @@
+"""From the camera's frame to pixels and back, with derivatives: written once, for arrays of any shape.
+
+    (x, y) = (X, Y) / Z,  (x', y') = distort(x, y),  u = A11 x' + A12 y' + A13,  v = A22 y' + A23
+
+Each coordinate is an array of its own: arithmetic on whole, contiguous arrays is what NumPy does fastest.
+A's entries and the coefficients are numbers, or arrays that broadcast against the points, so that one call
+serves a camera for each view as well as one for all. `Camera` wraps this for one camera and (N, 2) or (N, 3)
+arrays; bundle adjustment and triangulation, whose time is spent here, call it themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.distortion import Coefficients, Distortion, distort, distort_with_jacobian
+from neurocal_cli.camera.monotonic import nearly_undistorted, undistort
+from neurocal_cli.geometry import Array
+
+__all__ = [
+    "ENTRIES",
+    "Entries",
+    "ImagePoints",
+    "Rays",
+    "image_points",
+    "image_points_with_jacobian",
+    "nearly_rays",
+    "normalised_points",
+    "project_with_jacobian",
+    "rays_of",
+    "undistorted_pixels",
+]
+
+# Rows and columns of A's free entries, in the order of every vector of intrinsics: A11, A12, A22, A13, A23.
+ENTRIES = (np.array([0, 0, 1, 0, 1]), np.array([0, 1, 1, 2, 2]))
+
+# A11, A12, A22, A13, A23.
+Entries = Sequence[Any] | Array
+
+
+class ImagePoints(NamedTuple):
+    """Pixels of normalised image points, with derivatives.
+
+    Attributes
+    ----------
+    u, v : arrays
+    x, y : arrays
+        Distorted points. They are the derivatives by A's entries: ``du = x dA11 + y dA12 + dA13``,
+        ``dv = y dA22 + dA23``.
+    by_point : four arrays or numbers
+        du/dx, du/dy, dv/dx, dv/dy by the undistorted point.
+    by_coefficient : list of pairs of arrays
+        Derivatives of the distorted point by each coefficient, before A.
+    """
+
+    u: Array
+    v: Array
+    x: Array
+    y: Array
+    by_point: tuple[Any, Any, Any, Any]
+    by_coefficient: list[tuple[Array, Array]]
+
+
+def image_points(entries: Entries, model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
+    """Pixels (u, v) of normalised image points."""
+    a, s, b, u0, v0 = entries
+    if model != "none":
+        x, y = distort(model, k, x, y)
+    return a * x + s * y + u0, b * y + v0
+
+
+def image_points_with_jacobian(
+    entries: Entries, model: str, k: Coefficients, x: Array, y: Array
+) -> ImagePoints:
+    """Pixels of normalised image points, with derivatives."""
+    a, s, b, u0, v0 = entries
+    if model == "none":
+        return ImagePoints(a * x + s * y + u0, b * y + v0, x, y, (a, s, 0.0, b), [])
+    (x, y), (xx, xy, yx, yy), by_k = distort_with_jacobian(model, k, x, y)
+    if _is_zero(s):
+        by_point = a * xx, a * xy, b * yx, b * yy
+    else:
+        by_point = a * xx + s * yx, a * xy + s * yy, b * yx, b * yy
+    return ImagePoints(a * x + s * y + u0, b * y + v0, x, y, by_point, by_k)
+
+
+def project_with_jacobian(
+    entries: Entries, model: str, k: Coefficients, points: Sequence[Array],
+    by_entries: Array, by_point: Array, by_coefficient: Array,
+) -> tuple[Array, Array, NDArray[np.bool_]]:  # fmt: skip
+    """Project points in the camera's frame, and fill in the derivatives.
+
+    Parameters
+    ----------
+    entries, model, k
+        The camera.
+    points : X, Y, Z, (..., n) arrays
+    by_entries : (..., 5, 2, n) array
+        Filled with the derivatives of (u, v) by A11, A12, A22, A13, A23, but for those that are always
+        zero, which must be zero already.
+    by_point : (..., 3, 2, n) array
+        Filled with those by X, Y, Z.
+    by_coefficient : (..., K, 2, n) array
+        Filled with those by the coefficients.
+
+    Returns
+    -------
+    u, v : (..., n) arrays
+    valid : (..., n) bool array
+        Points in front of the camera, where the distortion is monotonic.
+    """
+    X, Y, Z = points
+    a, s, b, _, _ = entries
+    q = 1.0 / Z
+    x, y = X * q, Y * q
+    image = image_points_with_jacobian(entries, model, k, x, y)
+    ux, uy, vx, vy = image.by_point
+    valid = Z > 0
+    if model != "none":
+        valid &= ux * vy > uy * vx
+    by_entries[..., 0, 0, :], by_entries[..., 1, 0, :], by_entries[..., 2, 1, :] = image.x, image.y, image.y
+    by_entries[..., 3, 0, :] = by_entries[..., 4, 1, :] = 1.0
+    by_X, by_Y, by_Z = (by_point[..., n, :, :] for n in range(3))
+    np.multiply(ux, q, out=by_X[..., 0, :])
+    np.multiply(vy, q, out=by_Y[..., 1, :])
+    if model == "none" and _is_zero(s):
+        by_X[..., 1, :] = by_Y[..., 0, :] = 0.0
+        np.multiply(-x, by_X[..., 0, :], out=by_Z[..., 0, :])
+        np.multiply(-y, by_Y[..., 1, :], out=by_Z[..., 1, :])
+    else:
+        np.multiply(vx, q, out=by_X[..., 1, :])
+        np.multiply(uy, q, out=by_Y[..., 0, :])
+        np.multiply(-x[..., None, :], by_X, out=by_Z)
+        by_Z -= y[..., None, :] * by_Y
+    for column, (dx, dy) in enumerate(image.by_coefficient):
+        np.multiply(a, dx, out=by_coefficient[..., column, 0, :])
+        np.multiply(b, dy, out=by_coefficient[..., column, 1, :])
+        if not _is_zero(s):
+            by_coefficient[..., column, 0, :] += s * dy
+    return image.u, image.v, valid
+
+
+def _is_zero(s: Any) -> bool:
+    """Whether there is no skew, as in most cameras; it saves a share of the time."""
+    return np.ndim(s) == 0 and s == 0.0
+
+
+def normalised_points(entries: Entries, u: Array, v: Array) -> tuple[Array, Array]:
+    """Normalised image points of pixels, still distorted."""
+    a, s, b, u0, v0 = entries
+    y = (v - v0) / b
+    return (u - u0 - s * y) / a, y
+
+
+class Rays(NamedTuple):
+    """Rays (x, y, 1) of pixels, in the camera's frame.
+
+    Attributes
+    ----------
+    u, v : arrays [px]
+    x, y : arrays
+        Undistorted normalised points; nan where the camera sees nothing.
+    xu, xv, yu, yv : arrays [1/px]
+        Derivatives of x and y by u and v.
+    """
+
+    u: Array
+    v: Array
+    x: Array
+    y: Array
+    xu: Array
+    xv: Array
+    yu: Array
+    yv: Array
+
+
+def rays_of(
+    entries: Entries, distortion: Distortion, u: Array, v: Array, near: tuple[Array, Array] | None = None
+) -> Rays:
+    """Rays of pixels, with derivatives; the inverse of `image_points`.
+
+    Parameters
+    ----------
+    entries : A11, A12, A22, A13, A23
+    distortion : Distortion
+    u, v : arrays of one shape [px]
+    near : (x, y), optional
+        Undistorted points of pixels nearby, to start from: quicker.
+    """
+    x, y = undistort(distortion, *normalised_points(entries, u, v), near)
+    model = "none" if distortion.is_identity else distortion.model
+    ux, uy, vx, vy = image_points_with_jacobian(entries, model, distortion.coefficients, x, y).by_point
+    scale = 1 / (ux * vy - uy * vx)
+    xu, xv, yu, yv = (np.broadcast_to(d * scale, x.shape) for d in (vy, -uy, -vx, ux))
+    return Rays(u, v, x, y, xu, xv, yu, yv)
+
+
+def nearly_rays(entries: Entries, distortion: Distortion, u: Array, v: Array) -> tuple[Array, Array]:
+    """Undistorted normalised points of pixels to a thousandth or so: where to start from."""
+    return nearly_undistorted(distortion, *normalised_points(entries, u, v))
+
+
+def undistorted_pixels(distortion: Distortion, A: Array, pixels: Array) -> Array:
+    """Pixels (N, 2) as the same camera without distortion would see them; nan where it cannot see any."""
+    entries = A[ENTRIES].tolist()
+    x, y = undistort(distortion, *normalised_points(entries, pixels[:, 0], pixels[:, 1]))
+    return np.column_stack(image_points(entries, "none", (), x, y))

@@ -1,0 +1,105 @@
+"""How a calibration is computed: what trains the networks, from how many starts, and what is tried."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from neurocal_cli.training import Task, Trained, Trainer
+from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
+from neurocal_cli.training.starts import Agreement
+
+if TYPE_CHECKING:
+    from neurocal_cli.training.backprop import BackpropOptions
+
+__all__ = ["Options", "Progress", "options_for"]
+
+# Called with the name of a stage and the share of it that is done.
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How networks are trained, and how the distortion is found.
+
+    Attributes
+    ----------
+    trainer : Trainer
+        Takes random starts to their minimum.
+    agreement : Agreement
+        When two starts count as one result.
+    start_points : (int, int)
+        Points of each view that the starts see, for flat and for solid targets.
+    finish : Trainer or None
+        Takes the best start on to more points; None when the starts saw them.
+    finish_points : int
+        Most points of each view that a network sees.
+    starts : int
+        Most random starts for each network.
+    constrained : callable or None
+        Trains on E_tot, eq. (14), with some weights fixed, given the task and the constant a; None
+        where bundle adjustment alone imposes the constraints.
+    distortion : str
+        "auto": choose the model; "plumb-line": find it from straight lines first; else as the problem says.
+    seed : int
+        Of the random weights.
+    progress : callable
+    """
+
+    trainer: Trainer
+    agreement: Agreement
+    start_points: tuple[int, int]
+    finish: Trainer | None
+    finish_points: int
+    starts: int
+    constrained: Callable[[Task, float], Trained] | None = None
+    distortion: str = ""
+    seed: int = 0
+    progress: Progress = lambda stage, share: None
+
+
+def options_for(
+    trainer: str,
+    starts: int,
+    seed: int,
+    *,
+    distortion: str = "",
+    backprop: BackpropOptions | None = None,
+    progress: Progress | None = None,
+) -> Options:
+    """Options of a trainer: "lm", Levenberg-Marquardt, or "backprop", the paper's learning rule.
+
+    Starts see a few points of each view, as many as make their minimum that of all points; the best
+    goes on to at most 1024 of each view, beyond which nothing changes but the time
+    (tests/test_convergence.py).
+    """
+    report = progress or (lambda stage, share: None)
+    if trainer == "lm":
+        begin = LMOptions(tolerance=1e-4)
+        finish = LMOptions(stiffness=(0.0,), tolerance=1e-2, damping=1e-8)
+        return Options(
+            trainer=lambda task: train_lm(task, begin),
+            agreement=Agreement(),
+            start_points=(16, 40),
+            finish=lambda task: train_lm(task, finish),
+            finish_points=1024,
+            starts=starts,
+            distortion=distortion,
+            seed=seed,
+            progress=report,
+        )
+    from neurocal_cli.training.backprop import BackpropOptions, train_backprop
+
+    rates = backprop or BackpropOptions()
+
+    def train(task: Task) -> Trained:
+        return train_backprop(task, rates, lambda share: report("training the networks", share))
+
+    def constrained(task: Task, a: float) -> Trained:
+        # Lower rates than from random weights, and every gamma where it belongs: it starts trained.
+        gentle = replace(rates, rate_weights=0.4 * rates.rate_weights, beta=10.0, a=a, resting_gamma=True)
+        return train_backprop(task, gentle, lambda share: report("training with orthogonality", share))
+
+    agreement = Agreement(0.02, 1e-4)
+    return Options(train, agreement, (1024, 1024), None, 1024, starts, constrained, distortion, seed, report)

@@ -1,0 +1,182 @@
+"""From a normalised solution to a calibration in pixels and world units, with its covariance."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
+from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
+from neurocal_cli.bundle_adjustment.outlier_views import seen_from_behind
+from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
+    parameter_covariance,
+    parameter_warnings,
+    pose_std,
+)
+from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
+from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
+from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.bundle_adjustment.units import translations
+from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
+from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.geometry import Array
+
+__all__ = ["calibration_of"]
+
+_NAMED = 5  # wrong points that the warning names
+
+
+def calibration_of(
+    solution: Solution, rejected: Rejected, *, method: str, trainer: str, seed: int, name: str
+) -> Calibration:
+    """Put a solution into the user's units.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The points leave the answer open.
+    """
+    problem, adjusted, record = solution.problem, solution.adjusted, solution.record
+    views, state = problem.views, adjusted.state
+    cov = covariance(
+        adjusted.normal, problem.free_camera, problem.free_poses, views.n_equations, solution.shared
+    )
+    refuse_undetermined(problem, state, cov)
+    A = problem.matrix(state.entries[0])
+    intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
+    if problem.type != 3 and not problem.free[1]:
+        intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
+    block, std = _camera_covariance(problem, intrinsics, cov)
+    squared = (point_residuals(views, state) ** 2).sum(axis=1) * views.pixel_scale**2  # (N,), by view
+    rmse = float(np.sqrt(squared.mean()))
+    free = [n for n, parameter in enumerate(std) if parameter not in problem.fixed]
+    reason = StopReason.CONVERGED
+    if not adjusted.converged:
+        reason = StopReason.MAX_ITERATIONS
+    elif not record.certain:
+        reason = StopReason.NO_AGREEMENT
+    chosen = solution.model_errors is not None
+    return Calibration(
+        intrinsics=intrinsics,
+        std=std,
+        fixed=problem.fixed,
+        views=_view_results(solution, cov, squared),
+        points=problem.points,
+        type=problem.type,
+        method=method,
+        trainer=trainer,
+        seed=seed,
+        converged=reason is StopReason.CONVERGED,
+        stop_reason=reason.value,
+        rmse_px=rmse,
+        max_px=float(np.sqrt(squared.max())),
+        covariance=block[np.ix_(free, free)],
+        covariance_names=tuple(np.array(list(std))[free].tolist()),
+        distortion_model=problem.lens.model,
+        distortion=state.k,
+        network=_network_record(solution, rmse),
+        straight_lines=solution.straight_lines,
+        camera_name=name,
+        rejected=rejected,
+        lens_choice=solution.model_errors or {},
+        warnings=(
+            *parameter_warnings(intrinsics, state.distortion, std, chosen),
+            *_corner_warning(problem),
+            *_mirrored_warning(seen_from_behind(views, state)),
+            *_rejection_warnings(rejected, len(problem.points)),
+        ),
+    )
+
+
+def _camera_covariance(
+    problem: Problem, intrinsics: Intrinsics, cov: Covariance
+) -> tuple[Array, dict[str, float]]:
+    """Covariance of the intrinsic parameters and the distortion coefficients, and their std; 0 if given."""
+    free = np.flatnonzero(problem.free_camera)
+    entries = np.zeros((len(problem.free_camera),) * 2)
+    entries[np.ix_(free, free)] = cov.entries
+    return parameter_covariance(
+        intrinsics, problem.lens.model, entries, problem.views.pixel_scale, problem.fixed
+    )
+
+
+def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[str, ViewResult]:
+    """Poses in world units with their std, and the reprojection error of each view, unweighted."""
+    problem, state = solution.problem, solution.state
+    views, R = problem.views, state.R
+    centre = (R @ views.centre[..., None])[..., 0]
+    t = translations(views, state)
+    if problem.poses is not None:
+        R = np.stack([problem.poses[name].R for name in views.names])
+        t = np.stack([problem.poses[name].t for name in views.names])
+    std = pose_std(R, centre, views.scale, cov.poses)
+    rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
+    R.setflags(write=False)
+    t.setflags(write=False)
+    rows = zip(R, t, std.tolist(), views.counts.tolist(), rms.tolist(), strict=True)
+    return {
+        name: ViewResult(
+            Pose.exact(R_k, t_k), dict(zip(POSE_NAMES, sigma, strict=True)), n, r, not problem.free_poses
+        )
+        for name, (R_k, t_k, sigma, n, r) in zip(views.names, rows, strict=True)
+    }
+
+
+def _network_record(solution: Solution, rmse: float) -> NetworkRecord:
+    views, record, state = solution.problem.views, solution.record, solution.state
+    px, n = views.pixel_scale, len(views.index)
+    return NetworkRecord(
+        W=intrinsic_matrix(state.entries[0]),
+        V={name: np.column_stack([state.R[k], state.t[k]]) for k, name in enumerate(views.names)},
+        S1=views.S1,
+        S2={name: views.S2(k) for k, name in enumerate(views.names)},
+        starts=record.starts,
+        agreed=int(record.agreed.min()),
+        iterations=record.iterations,
+        refine_iterations=solution.adjusted.iterations,
+        loss=float(np.sqrt(record.squares / n)) * px,
+        rmse_before=float(np.sqrt(record.before / n)) * px,
+        rmse_after=rmse,
+        curve=tuple((record.curve * px).tolist()),
+    )
+
+
+def _corner_warning(problem: Problem) -> tuple[str, ...]:
+    """Where no point is, a distortion is anyone's guess."""
+    if problem.restraint is None:
+        return ()
+    return (
+        f"the distortion model {problem.lens.model} that fits the points best is not monotonic (maps two "
+        "directions to one pixel) in the image's corners, where there are no points; the best monotonic fit "
+        "is used, which is a guess in the corners; add views that show the board there",
+    )
+
+
+def _mirrored_warning(views: list[str]) -> tuple[str, ...]:
+    """A flat target that is mirrored gives the right camera, but a wrong pose."""
+    if not views:
+        return ()
+    names = ", ".join(map(repr, views[:_NAMED])) + (
+        f" and {len(views) - _NAMED} more" * (len(views) > _NAMED)
+    )
+    return (
+        f"the target appears mirrored in {names}, so the poses of these views are wrong; check the order of "
+        "their points",
+    )
+
+
+def _rejection_warnings(rejected: Rejected, kept: int) -> tuple[str, ...]:
+    """Name wrong views, and the first of the wrong points by their line and id."""
+    lines = [f"view {name!r} is left out: {reason}" for name, reason in rejected.views.items()]
+    points = rejected.points
+    if points is None:
+        return tuple(lines)
+    single = np.flatnonzero([points.view_names[v] not in rejected.views for v in points.view_index])
+    if single.size:
+        places = []
+        for row in single[:_NAMED]:
+            label = "" if points.point is None else f" ({points.point[row]})"
+            places.append(f"{points.place(int(row))}{label}")
+        more = f" and {single.size - _NAMED} more, listed in the calibration" if single.size > _NAMED else ""
+        share = f"{single.size} of {kept + len(rejected)} points"
+        lines.append(f"{share} are outliers and are left out: {', '.join(places)}{more}")
+    return tuple(lines)

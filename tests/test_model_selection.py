@@ -1,0 +1,125 @@
+"""`auto` takes the simplest lens that the data supports."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.distorted import BENT, SIGMA, bent_set, new_views, within_reach
+from support.scenes import Scene, random_solid, table_1
+
+from neurocal_cli import Calibration, calibrate
+from neurocal_cli.camera.distortion import MODELS
+from neurocal_cli.errors import DegenerateGeometryError
+
+
+def chosen(scene: Scene, seed: int, **more: object) -> Calibration:
+    points = scene.points(SIGMA, np.random.default_rng([seed, 1]))
+    return calibrate(points, skew=False, **more)
+
+
+def judged(model: str, seed: int) -> tuple[bool, bool, bool, bool]:
+    """Whether the choice is the truth, has two coefficients too many at most, predicts as well as any.
+
+    What it predicts are views that neither the fits nor the choice have seen: as far from the axis as the
+    points reach, and anywhere in the image.
+    """
+    scene, k = bent_set(model, seed)
+    found, anywhere = chosen(scene, seed), new_views(scene, model, k, seed)
+    near = within_reach(anywhere, scene, found.points)
+    told = len(MODELS[found.distortion_model]) - sum(f"k{n}" in found.fixed for n in range(1, 5))
+    errors = [[near.error(found), anywhere.error(found)]]
+    for other in found.lens_choice:
+        with suppress(DegenerateGeometryError):
+            rival = chosen(scene, seed, distortion=other, outliers="keep")
+            errors.append([near.error(rival), anywhere.error(rival)])
+    well, everywhere = (errors[0] < 1.01 * np.min(errors, axis=0)).tolist()
+    return found.distortion_model == model, told <= len(MODELS[model]) + 2, well, everywhere
+
+
+@pytest.mark.parametrize("model", BENT)
+def test_the_choice_predicts_new_views_as_well_as_any_model(model: str) -> None:
+    results = [judged(model, 7000 + seed) for seed in range(2)]
+    assert any(right for right, *_ in results)
+    assert all(few and well and everywhere for _, few, well, everywhere in results)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", BENT)
+def test_the_choice_is_right_for_200_lenses(model: str) -> None:
+    right, few, well, everywhere = np.mean([judged(model, seed) for seed in range(200)], axis=0)
+    assert few == 1.0
+    # Whether k3 is there cannot be told where points stay near the axis, but new views may go far out.
+    assert right >= (0.85 if model == "plumb_bob" else 0.95)
+    assert well >= 0.975
+    assert everywhere >= {"plumb_bob": 0.925, "fisheye": 0.96}.get(model, 0.975)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_lens_is_found_where_there_is_none_in_one_view(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    scene = random_solid(rng, 1, False)
+    while len(scene.world) < 40:
+        scene = random_solid(rng, 1, False)
+    assert chosen(scene, seed).distortion_model == "none"
+
+
+def test_a_strong_lens_whose_boards_leave_a_pinhole_open_is_chosen() -> None:
+    # Small boards far away: each one's own network follows them no better than the pinhole.
+    scene, _ = bent_set("k1k2", 20007)
+    assert chosen(scene, 20007).distortion_model == "k1k2"
+
+
+@pytest.mark.parametrize("seed", [20091, 20096])
+def test_a_model_that_lost_its_way_is_fitted_from_a_better_one(seed: int) -> None:
+    # From the pinhole only the rational lens arrives.
+    assert {"k1", "k1k2", "k1k2p1p2", "plumb_bob"} <= set(
+        chosen(bent_set("k1k2p1p2", seed)[0], seed).lens_choice
+    )
+    assert judged("k1k2p1p2", seed)[1]
+
+
+def test_what_a_fisheye_leaves_out_the_others_have_when_a_point_is_set_aside() -> None:
+    scene, _ = bent_set("fisheye", 1)
+    points = scene.points(SIGMA, np.random.default_rng([1, 1]))
+    pixels = points.pixels.copy()
+    pixels[5] += 30.0
+    clean = calibrate(points.select(np.arange(len(points)) != 5), skew=False)
+    found = calibrate(replace(points, pixels=pixels), skew=False)
+    assert found.n_rejected == 1
+    assert found.distortion_model == "fisheye"
+    assert "k4" in found.fixed
+    assert found.lens_choice == pytest.approx(clean.lens_choice, rel=1e-3)
+
+
+def test_the_alternatives_are_told() -> None:
+    scene, _ = bent_set("k1k2", 3)
+    choice = chosen(scene, 3).lens_choice
+    assert {"none", "k1", "k1k2", "k1k2p1p2", "plumb_bob"} <= set(choice)
+    assert choice["none"] > 2 * choice["k1k2"]
+
+
+def test_too_few_points_for_a_lens_leave_none() -> None:
+    scene = table_1()
+    few = scene.points(0.1, np.random.default_rng(0)).select(np.arange(0, 440, 55))
+    assert calibrate(few, skew=False).distortion_model == "none"
+
+
+def test_a_given_lens_is_not_chosen_again() -> None:
+    scene, k = bent_set("k1k2", 5)
+    points = scene.points(SIGMA, np.random.default_rng(0))
+    camera = calibrate(points, distortion="k1k2", skew=False)
+    found = calibrate(points, type=3, intrinsics=camera)
+    assert found.distortion_model == "k1k2"
+    assert np.array_equal(found.distortion, camera.distortion)
+    assert not found.lens_choice
+    assert k != camera.distortion.tolist()
+
+
+@pytest.mark.parametrize("type", [2, 4])
+def test_a_lens_is_chosen_whatever_else_is_given(type: int) -> None:
+    scene, _ = bent_set("k1k2", 11)
+    given = dict(scene.given(type))
+    assert chosen(scene, 11, **given).distortion_model == "k1k2"

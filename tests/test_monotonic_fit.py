@@ -1,0 +1,139 @@
+"""Lenses that would fold back in corners that no point reaches are fitted so that they do not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.distorted import SIGMA, bent_set, new_views, through
+from support.plain_projection import project
+
+from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.camera.distortion import Distortion, distort_with_jacobian
+from neurocal_cli.camera.monotonic import radial_slope
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.distortion.monotonic_fit import MonotonicFit, where_not_monotonic
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.stereo.fit_rig import fit_rig
+
+LENSES = {
+    "k1": [-0.2],
+    "k1k2": [-0.3, 0.1],
+    "k1k2p1p2": [-0.3, 0.1, 0.001, -0.002],
+    "plumb_bob": [-0.3, 0.1, 0.001, -0.002, 0.03],
+    "rational": [0.3, 0.1, 0.001, -0.002, 0.02, 0.5, 0.1, 0.03],
+    "fisheye": [0.02, -0.01, 0.003, -0.001],
+}
+# The best fit of each folds back in a corner, the true lens does not.
+FOLDING = [("k1k2", 38), ("k1k2", 74), ("k1k2", 130), ("k1k2p1p2", 74), ("k1k2p1p2", 130)]
+
+
+def noisy(model: str, seed: int, draw: int = 1) -> Correspondences:
+    scene, _ = bent_set(model, seed)
+    return scene.points(SIGMA, np.random.default_rng([seed, draw]))
+
+
+def free_fit(points: Correspondences, model: str) -> Calibration:
+    """Where the image ends is not known, so nothing folds back before."""
+    return calibrate(replace(points, image_size=None), distortion=model, skew=False)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_slope_and_its_derivatives_are_those_of_differences(model: str) -> None:
+    k, r, h = np.array(LENSES[model]), np.linspace(0.05, 1.2, 9), 1e-6
+    slope, by_k = radial_slope(model, k, r)
+    without = np.where(np.isin(np.arange(len(k)), (2, 3)) & (model != "fisheye"), 0.0, k)
+    radius = np.tan(r) if model == "fisheye" else r
+    _, (along, *_), _ = distort_with_jacobian(model, without, radius, np.zeros_like(r))
+    assert slope == pytest.approx(along * (1 + radius**2 if model == "fisheye" else 1.0), rel=1e-12)
+    for n in range(len(k)):
+        step = h * (np.arange(len(k)) == n)
+        difference = (radial_slope(model, k + step, r)[0] - radial_slope(model, k - step, r)[0]) / (2 * h)
+        assert by_k[:, n] == pytest.approx(difference, abs=1e-7)
+
+
+def test_a_lens_with_all_the_slope_that_is_asked_for_is_free() -> None:
+    restraint = MonotonicFit(np.linspace(0.1, 0.5, 5), 100.0, 0.1)
+    state = CameraState(np.ones((1, 5)), np.eye(3)[None], np.zeros((1, 3)), "k1", np.array([-0.2]))
+    by_camera, missing = restraint(state)
+    assert not by_camera.any()
+    assert not missing.any()
+    by_camera, missing = restraint(replace(state, k=np.array([-2.0])))
+    assert missing.any()
+    assert (by_camera[missing > 0, 5] > 0).all()  # more k1, more slope
+
+
+@pytest.mark.parametrize(("model", "seed"), FOLDING)
+@pytest.mark.parametrize("asked", ["auto", "the model"])
+def test_a_fold_where_no_point_is_goes_and_new_views_are_predicted_better(
+    model: str, seed: int, asked: str
+) -> None:
+    points = noisy(model, seed)
+    found = calibrate(points, distortion="auto" if asked == "auto" else model, skew=False)
+    free = free_fit(points, model)
+    assert found.distortion_model == model
+    assert where_not_monotonic(Distortion(model, free.distortion), free.K, points) == "image"
+    assert where_not_monotonic(Distortion(model, found.distortion), found.K, points) is None
+    assert found.converged
+    assert free.rmse_px < found.rmse_px < 1.01 * free.rmse_px
+    scene, k = bent_set(model, seed)
+    new = new_views(scene, model, k, seed)
+    assert new.error(found) < 0.98 * new.error(free)
+    assert any("corners" in text for text in found.warnings)
+
+
+@pytest.mark.parametrize(("model", "seed"), [("k1k2", 3), ("plumb_bob", 3), ("fisheye", 1)])
+def test_a_lens_that_does_not_fold_is_the_same_to_the_last_bit(model: str, seed: int) -> None:
+    points = noisy(model, seed)
+    found, free = calibrate(points, distortion=model, skew=False), free_fit(points, model)
+    assert np.array_equal(found.distortion, free.distortion)
+    assert np.array_equal(found.K, free.K)
+    assert not any("corners" in text for text in found.warnings)
+
+
+def test_points_that_deny_every_lens_without_a_fold_are_refused() -> None:
+    # A true k1k2 and plenty of points: k1 alone follows them only with a fold.
+    points = noisy("k1k2", 130)
+    with pytest.raises(DegenerateGeometryError, match=r"k1 is not monotonic .* inside the image"):
+        calibrate(points, distortion="k1", skew=False)
+
+
+def test_a_fisheye_need_not_see_the_corners() -> None:
+    # A picture of 200 degrees across its diagonal: the corners lie beyond 90 degrees.
+    A, lens = (
+        np.array([[180.0, 0, 319.5], [0, 180.0, 239.5], [0, 0, 1]]),
+        Distortion("fisheye", [0.02, 0.0, 0.0, 0.0]),
+    )
+    points = Correspondences(np.zeros((1, 3)), np.array([[330.0, 250.0]]), image_size=(640, 480))
+    assert where_not_monotonic(lens, A, points) is None
+    assert where_not_monotonic(Distortion("fisheye", [-0.2, 0.0, 0.0, 0.0]), A, points) == "image"
+
+
+def test_standard_deviations_are_not_too_small() -> None:
+    scene, k = bent_set("k1k2", 130)
+    errors = []
+    for draw in range(60):
+        found = calibrate(noisy("k1k2", 130, draw), distortion="k1k2", skew=False, outliers="keep")
+        truth = {"alpha_u": scene.intrinsics.alpha_u, "k1": k[0], "k2": k[1]}
+        value = {"alpha_u": found.intrinsics.alpha_u, "k1": found.distortion[0], "k2": found.distortion[1]}
+        errors.append([(value[name] - truth[name]) / found.std[name] for name in truth])
+    assert (np.sqrt(np.mean(np.square(errors), axis=0)) < 1.2).all()
+
+
+def test_a_rig_keeps_a_camera_that_it_would_fold() -> None:
+    scene, k = bent_set("k1k2", 38)
+    view = np.array(scene.view)
+    poses = {name: Pose(pose.R, pose.t - [60.0, 0, 0]) for name, pose in scene.poses.items()}
+    pixels = np.concatenate(
+        [project(scene.intrinsics.A, poses[v], scene.world[view == v])[0] for v in scene.poses]
+    )
+    other = through(replace(scene, pixels=pixels, poses=poses), "k1k2", k)
+    right = other.points(SIGMA, np.random.default_rng([38, 5]))
+    left = noisy("k1k2", 38)
+    cameras = [calibrate(points, distortion="k1k2", skew=False) for points in (left, right)]
+    rig = fit_rig(cameras[0], cameras[1], refine_cameras=True)
+    assert np.array_equal(rig.left.distortion, cameras[0].distortion)
+    assert any("the distortion model of the left camera is not monotonic" in text for text in rig.warnings)
+    assert rig.baseline == pytest.approx(60.0, abs=4 * rig.std["baseline"])

@@ -1,0 +1,128 @@
+"""Wrong points and wrong views are set aside and named; good data stay as they are."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.outliers import MISMATCHES, farthest, good, mismatched, with_outliers
+from support.scenes import pinhole, random_flat_set, table_1
+
+from neurocal_cli import calibrate
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.io.calibration_yaml import format_calibration
+
+
+def reject(points, **more):
+    return calibrate(points, **{"distortion": "none", "skew": False, "outliers": "reject", **more})
+
+
+def outliers_change_nothing(seed: int, distortion: str = "none") -> None:
+    scene, points, clean = good(1000 + seed, flat=bool(seed % 2))
+    bad, rows = with_outliers(scene, points, 0.2, np.random.default_rng(seed))
+    found = reject(bad, distortion=distortion)
+    assert farthest(found, clean) < 3
+    assert not found.rejected.views
+    # A wrong pixel may be right by chance; no right one may be called wrong.
+    assert len(rows) - 3 <= found.n_rejected <= len(rows)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_fifth_of_wrong_pixels_changes_nothing(seed: int) -> None:
+    outliers_change_nothing(seed)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("distortion", ["none", "auto"])
+def test_a_fifth_of_wrong_pixels_changes_nothing_in_many_scenes(distortion: str) -> None:
+    for seed in range(200):
+        outliers_change_nothing(seed, distortion)
+
+
+def a_wrong_view_changes_nothing(seed: int, kind: str, distortion: str = "none") -> None:
+    scene, points, clean = good(5000 + seed, flat=True, n_views=10)
+    rng = np.random.default_rng(seed)
+    view = int(rng.integers(10))
+    found = reject(mismatched(scene, points, view, kind, rng), distortion=distortion)
+    assert set(found.rejected.views) <= {points.view_names[view]}
+    assert farthest(found, clean, but=points.view_names[view]) < 3
+
+
+@pytest.mark.parametrize("kind", MISMATCHES)
+def test_a_wrong_view_of_ten_changes_nothing(kind: str) -> None:
+    a_wrong_view_changes_nothing(MISMATCHES.index(kind), kind)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("distortion", ["none", "auto"])
+def test_a_wrong_view_of_ten_changes_nothing_in_many_scenes(distortion: str) -> None:
+    for seed in range(105):
+        a_wrong_view_changes_nothing(seed, MISMATCHES[seed % len(MISMATCHES)], distortion)
+
+
+@pytest.mark.parametrize("flat", [True, False])
+def test_good_data_are_calibrated_to_the_last_bit_as_if_nothing_were_looked_for(flat: bool) -> None:
+    for seed in range(6):
+        _, points, _ = good(300 + seed, flat)
+        assert format_calibration(reject(points)) == format_calibration(pinhole(points, skew=False))
+
+
+@pytest.mark.parametrize("type", [1, 2, 3, 4])
+def test_each_problem_type_leaves_wrong_points_out(type: int) -> None:
+    scene = table_1()
+    points = scene.points(0.2, np.random.default_rng(3))
+    bad, rows = with_outliers(scene, points, 0.2, np.random.default_rng(4))
+    found = calibrate(bad, **scene.given(type))
+    assert found.rejected.points is not None
+    assert set(map(tuple, found.rejected.points.pixels)) <= set(map(tuple, bad.pixels[rows]))
+    assert found.n_rejected > 0.95 * len(rows)
+    assert found.rmse_px < 0.35
+
+
+def test_what_is_left_out_is_named_by_line_and_id_and_kept() -> None:
+    scene = table_1()
+    points = scene.points(0.2, np.random.default_rng(3))
+    pixels = points.pixels.copy()
+    pixels[[17, 200]] += [[40.0, 0.0], [0.0, -25.0]]
+    labels = np.array([f"p{k}" for k in range(len(points))])
+    points = replace(points, pixels=pixels, point=labels, lines=np.arange(5, 5 + len(points)), source="p.csv")
+    found = calibrate(points)
+    (warning,) = [text for text in found.warnings if "left out" in text]
+    assert "2 of 440 points" in warning
+    assert "p.csv:22 (p17)" in warning
+    assert "p.csv:205 (p200)" in warning
+    assert found.rejected.points.point.tolist() == ["p17", "p200"]
+    assert found.rejected.error_px == pytest.approx([40, 25], abs=1)
+    assert len(found.points) == 438
+
+
+def test_a_view_left_out_is_named_with_the_reason() -> None:
+    scene, points, _ = good(77, flat=True, n_views=8)
+    shuffled = mismatched(scene, points, 2, "shuffled", np.random.default_rng(0))
+    found = reject(shuffled)
+    assert found.rejected.views == {"view0002": "its pixels do not match its points"}
+    assert any("view 'view0002' is left out" in text for text in found.warnings)
+    assert "view0002" not in found.views
+    mirrored = mismatched(scene, points, 2, "mirrored", np.random.default_rng(0))
+    kept = reject(mirrored)  # its homography is as good as any, only the pose is wrong
+    assert kept.n_rejected == 0
+    assert any("mirrored in 'view0002'" in text for text in kept.warnings)
+
+
+def test_points_of_which_most_are_wrong_are_refused() -> None:
+    scene = table_1()
+    bad, _ = with_outliers(scene, scene.points(0.2, np.random.default_rng(1)), 0.7, np.random.default_rng(2))
+    words = r"are outliers|no camera fits|do not match"
+    with pytest.raises(DegenerateGeometryError, match=words):
+        calibrate(bad, distortion="none")
+
+
+def test_points_of_little_noise_do_not_make_others_wrong() -> None:
+    """A view three times as blurred as the others is no reason to leave its points out."""
+    rng = np.random.default_rng(9)
+    scene = random_flat_set(rng, 8, False)
+    points = scene.points()
+    sigma = np.where(points.view_index == 3, 0.6, 0.2)[:, None]
+    points = replace(points, pixels=points.pixels + sigma * rng.normal(size=points.pixels.shape))
+    assert reject(points).n_rejected == 0

@@ -1,0 +1,111 @@
+"""The evidence that a verdict rests on, and the verdict on real data."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.distorted import bent_set
+from support.scenes import Scene, pinhole, random_flat_set, table_1
+from support.wrong_inputs import flat
+
+from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
+from neurocal_cli.verdict.assessment import assess, gather_evidence
+
+
+def moved_pixels(true: Calibration, other: Calibration, pixels: np.ndarray, depth: float) -> np.ndarray:
+    """Where another calibration sees what the first one sees at these pixels and a depth."""
+    points = true.camera.unproject(pixels)
+    points *= depth / points[:, 2:]
+    back = []
+    for name, view in true.views.items():
+        world = (points - view.pose.t) @ view.pose.R
+        pose = other.views[name].pose
+        back.append(world @ pose.R.T + pose.t)
+    seen, _ = other.camera.project(np.mean(back, axis=0))
+    return seen - pixels
+
+
+@pytest.mark.parametrize("lens", ["none", "k1k2"])
+def test_the_projection_uncertainty_is_that_of_200_calibrations(lens: str) -> None:
+    scene, _ = bent_set(lens, 12)
+    truth = calibrate(scene.points(), distortion=lens, skew=False, outliers="keep")
+    told = gather_evidence(
+        calibrate(noisy(scene, 0), distortion=lens, skew=False, outliers="keep")
+    ).projection
+    assert told is not None
+    squared = np.zeros((len(told.depths), len(told.pixels)))
+    for trial in range(200):
+        other = calibrate(noisy(scene, trial), distortion=lens, skew=False, outliers="keep")
+        for k, depth in enumerate(told.depths):
+            squared[k] += (moved_pixels(truth, other, told.pixels, depth) ** 2).sum(axis=1)
+    std = np.sqrt(squared / 200)
+    # One noise realisation sets the level of what is told: about 3 %; 200 trials tell 5 %.
+    assert told.std.mean(axis=1) == pytest.approx(std.mean(axis=1), rel=0.1)
+    assert told.std == pytest.approx(std, rel=0.25)
+
+
+def noisy(scene: Scene, trial: int):
+    return scene.points(0.2, np.random.default_rng([trial, 5]))
+
+
+def test_halves_of_good_data_agree_as_their_deviations_say() -> None:
+    scene = random_flat_set(np.random.default_rng(4), 8, False)
+    values = [gather_evidence(pinhole(noisy(scene, trial), skew=False)).disagreement for trial in range(60)]
+    assert np.mean(values) == pytest.approx(1.0, abs=0.4)
+
+
+def test_the_error_on_data_left_out_is_that_on_new_data() -> None:
+    """On views of the same camera that it does not know, poses fitted."""
+    from neurocal_cli.evaluation import evaluate_camera
+
+    told, found = [], []
+    for seed in range(30):
+        scene = random_flat_set(np.random.default_rng([seed, 1]), 12, False, cols=8, rows=6)
+        points = noisy(scene, seed)
+        camera = pinhole(points.select(points.view_index < 6), skew=False)
+        told.append(gather_evidence(camera).held_out_px)
+        found.append(evaluate_camera(camera, points.select(points.view_index >= 6)).rmse_px)
+    assert np.mean(told) == pytest.approx(np.mean(found), rel=0.03)
+
+
+def test_a_file_is_judged_as_the_result_was(tmp_path: Path) -> None:
+    found = calibrate(flat(3))
+    write_calibration(found, tmp_path / "camera.yaml")
+    back = read_calibration(tmp_path / "camera.yaml")
+    assert back.verdict == found.verdict
+    assert assess(back).word == found.verdict.word == "good"
+    for name, value in assess(back).measures.items():
+        assert value == pytest.approx(found.verdict.measures[name], rel=1e-6, nan_ok=True)
+    assert format_calibration(back) == format_calibration(found)
+
+
+@pytest.mark.parametrize("type", [1, 2, 3, 4])
+def test_every_problem_type_is_judged(type: int) -> None:
+    scene = table_1()
+    found = calibrate(scene.points(0.1, np.random.default_rng(1)), **scene.given(type))
+    assert assess(found).word == "good", assess(found).reasons
+
+
+def test_few_views_on_one_side_of_the_image_are_told_where_to_add_some() -> None:
+    points = flat(5)
+    corner = (points.pixels > [330, 200]).all(axis=1)
+    verdict = assess(calibrate(points.select(corner), skew=False))
+    assert verdict.word != "good"
+    assert any("left" in advice for advice in verdict.advice)
+
+
+def test_a_calibration_without_an_image_size_is_judged_without_the_image() -> None:
+    found = calibrate(replace(flat(6), image_size=None))
+    evidence = gather_evidence(found)
+    assert evidence.projection is None
+    assert np.isnan(evidence.coverage.image)
+    assert assess(found).word == "good"
+
+
+def test_zhangs_views_are_good_with_their_lens_and_not_without(zhang: Correspondences) -> None:
+    assert assess(calibrate(zhang)).word == "good"
+    assert assess(calibrate(zhang, distortion="none")).word == "usable"
