@@ -14,6 +14,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["find_seeds_2x3", "find_seeds_3x3"]
 
+# Insensitive; tests/test_finding.py.
 _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
 _SECOND = 0.4  # ... and the weight of these differences themselves
 
