@@ -31,9 +31,9 @@ class VertexCheck:
     ----------
     contrast : (N,) array [DN]
         Bright minus dark squares around the vertex; negative when their colours are the other way.
-    even : (N,) array
+    evenness : (N,) array
         Darkest bright minus brightest dark square, over the contrast: 1 for an ideal vertex.
-    like : (N,) bool array
+    is_vertex : (N,) bool array
         Two bright and two dark squares, and an edge between every two.
     """
 
@@ -63,7 +63,7 @@ def check_vertices(level: Level, points: Array, predicted: PredictedVertices, da
     ----------
     level : Level
     points : (N, 2) array [px]
-    at : Expected
+    predicted : PredictedVertices
         The steps of the grid at the points.
     dark : (N,) array of +-1
         +1 where the square towards growing c and r is dark.
