@@ -84,7 +84,7 @@ def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1)
     Parameters
     ----------
     paths : sequence of str
-    task : Task
+    options : DetectionOptions
     jobs : int
         Processes to share the work; the outcomes are the same for any number.
     """

@@ -29,7 +29,7 @@ _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 _NEAR = 1.0  # px, that a saddle may move when derivatives are smoothed more
 _FEWEST = 12  # vertices; fewer are grown from the seed
 _ROUNDS, _WRONG = 3, 0.35  # rounds of removing outliers, and their greatest share
-_MOST_BENT = 0.16  # squares; a larger second difference may be a fold
+_MOST_CURVED = 0.16  # squares; a larger second difference may be a fold
 _WHOLE = 0.5  # least share of an outer line that is linked; beyond the board, links lead astray
 
 
@@ -71,7 +71,7 @@ def lattice_from_links(
         wrong = count - np.count_nonzero(good)
         if wrong == 0:
             # A fold may hide in a gap.
-            return part if largest_second_difference(part) < _MOST_BENT else None
+            return part if largest_second_difference(part) < _MOST_CURVED else None
         if wrong > _WRONG * count:
             break
         # Vertices left out here can be found again when the grid grows.

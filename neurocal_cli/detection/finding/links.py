@@ -21,6 +21,7 @@ __all__ = ["Links", "find_links"]
 
 Index = NDArray[np.intp]
 
+# Insensitive; tests/test_finding.py.
 _WIDEST = 0.26  # rad; between a port and the direction to the neighbour
 _SHARE = 0.45  # the same as a share of the vertex's narrower angle
 _ASIDE = 2.0  # px; distance from the port's line that is always allowed

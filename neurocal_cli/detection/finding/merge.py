@@ -13,7 +13,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["merge_lattices"]
 
-# Insensitive; tests/test_finding.py divides a board into two halves and expects one grid.
+# tests/test_finding.py divides a board into two halves with these limits, and expects one grid.
 _NEAR = 4.0  # squares; of one lattice from the other, to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; farthest from whole numbers, median and worst
 _LEAST = 4  # vertices compared

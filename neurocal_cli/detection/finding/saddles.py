@@ -27,7 +27,7 @@ _AROUND = 2  # px, within which a saddle is the steepest
 _BAND = 50_000  # pixels of a band that fits the processor's cache
 _RADII = (5.0, 3.0)  # px of the rings; the larger one is more accurate
 _RAYS = 32  # of a ring
-_MOST_BENT = np.radians(22)  # greatest angle between the two halves of a line through the vertex
+_MOST_KINK = np.radians(22)  # greatest angle between the two halves of a line through the vertex
 _MOST_DIFFERENT = np.radians(14)  # greatest angle between ports from the two rings
 _LEAST_CURVATURE = 3.0  # standard deviations of the noise, of the weaker principal curvature ...
 _LEAST_RATIO = 0.02  # ... and its ratio to the stronger one, which is 0 along a stripe
@@ -180,10 +180,10 @@ def _ring(profile: Array, noise: float) -> tuple[Array, Array, NDArray[np.bool_]
     # The first sector lies between the first two ports; number these so that it is dark.
     dark = after[::4] < 0
     angle = np.where(dark[:, None], angle, np.concatenate([angle[:, 1:], angle[:, :1] + 2 * np.pi], axis=1))
-    bent = np.abs(angle[:, 2:] - angle[:, :2] - np.pi)
+    kink = np.abs(angle[:, 2:] - angle[:, :2] - np.pi)
     mean = 0.5 * (angle[:, :2] + angle[:, 2:] - np.pi)
     opening = mean[:, 1] - mean[:, 0]
-    sound = (bent[:, 0] < _MOST_BENT) & (bent[:, 1] < _MOST_BENT)
+    sound = (kink[:, 0] < _MOST_KINK) & (kink[:, 1] < _MOST_KINK)
     sound &= (opening > _NARROWEST) & (opening < np.pi - _NARROWEST)
     # Opposite rays must have equal brightness.
     opposite = np.abs(level[: _RAYS // 2] - level[_RAYS // 2 :]).mean(axis=0)

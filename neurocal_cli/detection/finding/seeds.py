@@ -14,6 +14,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["find_seeds_2x3", "find_seeds_3x3"]
 
+# Insensitive; tests/test_finding.py.
 _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
 _SECOND = 0.4  # ... and the weight of these differences themselves
 
@@ -61,8 +62,8 @@ def find_seeds_2x3(saddles: Saddles, links: Links) -> tuple[Index, Index]:
     block = np.stack([np.stack([left, middle, right], -1), np.stack([other, down, corner], -1)], axis=1)
     grid = saddles.points[block]
     c = 0.5 * (grid[:, 0, 2] - grid[:, 0, 0])
-    bent = np.abs(grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]).max(axis=(1, 2))
-    irregularity = bent / np.maximum(np.hypot(*c.T), 1e-6)
+    second = np.abs(grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]).max(axis=(1, 2))
+    irregularity = second / np.maximum(np.hypot(*c.T), 1e-6)
     order = np.argsort(irregularity, kind="stable")
     return block[order], (p[order] + 1) % 2
 
@@ -94,8 +95,8 @@ def _irregularity(grid: Array) -> Array:
     along_c = grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]
     along_r = grid[:, 0] + grid[:, 2] - 2 * grid[:, 1]
     worst = np.zeros(len(grid))
-    for bent in (along_c, along_r):
-        for part, weight in ((bent, _SECOND), (np.diff(bent, axis=1), 1.0)):
+    for second in (along_c, along_r):
+        for part, weight in ((second, _SECOND), (np.diff(second, axis=1), 1.0)):
             along = (part[..., 0] * r[:, None, 1] - part[..., 1] * r[:, None, 0]) / area
             across = (c[:, None, 0] * part[..., 1] - c[:, None, 1] * part[..., 0]) / area
             worst = np.maximum(worst, weight * np.maximum(np.abs(along), np.abs(across)).max(axis=1))

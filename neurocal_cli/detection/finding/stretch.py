@@ -15,6 +15,8 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Stretched", "stretch"]
 
+# For boards seen almost from the side, as in tests/test_finding.py. The limits have not been varied on
+# images that reach this step.
 _FACTOR = 2.0  # of the stretch
 _ANISOTROPY = 1.8  # least ratio of the gradients across and along the squares
 _AROUND = 12  # px; beyond the outermost saddles

@@ -74,7 +74,7 @@ class ProfileShape:
     ----------
     tails : (E, 2) array
         a_3 and a_5 of each edge.
-    bend : (RESPONSE_TERMS,) array
+    nonlinearity : (RESPONSE_TERMS,) array
         b_0, b_1, ... of the response, the same for all edges.
     half : (E, 2) array or None [px]
         Half widths of the pixel's box along the edges' normals (see `pixel_box`), for edges so sharp that
@@ -148,12 +148,12 @@ class BatchFit:
         Coordinates first; the last three are at `MEAN`, `CONTRAST`, `BLUR`.
     information : (E, P, P) array
         Fisher information of the pixels, without the prior.
-    prior : Prior
+    prior : LevelPrior
     chi2, count : (E,) arrays
         Weighted sum of squared residuals, and number of pixels.
     step : (E,) array
         The last step, in standard deviations.
-    linear : Linear
+    linear : Linearised
         The model at the values.
     """
 
@@ -202,7 +202,7 @@ def fit_batch(
         Gives a function of their values.
     start : (E, P) array
         Values to begin with.
-    prior : Prior
+    prior : LevelPrior
     count : (E,) array
         Of the pixels.
     steps, more : int

@@ -65,7 +65,7 @@ class PixelNoise:
 
         Parameters
         ----------
-        fit : Fit
+        fit : BatchFit
         root : (E, N) array [1/DN]
             Square root of the weights of the fits, 0 for unused pixels.
         floor : float [DN^2]
@@ -105,8 +105,8 @@ def profile_shape(
     Parameters
     ----------
     data : EdgeData
-    fit : Fit
-    shape : Shape
+    fit : BatchFit
+    shape : ProfileShape
         The shape used in these fits.
     good : (E,) bool array
         Edges to use.

@@ -185,9 +185,9 @@ def fit_edges(
     data : EdgeData
     start : (E, 5) array
         Offset [px], tilt [px over the half length], and the values of `BatchFit`.
-    prior : Prior
+    prior : LevelPrior
     half_length : (E,) array [px]
-    shape : Shape
+    shape : ProfileShape
     steps, more : int
         As in `fit_batch`.
     """

@@ -43,7 +43,7 @@ def is_reliable(fit: BatchFit, departure: Array, beyond: Array) -> NDArray[np.bo
 
     Parameters
     ----------
-    fit : Fit
+    fit : BatchFit
     departure : (E,) array
         Distance from the map, in standard deviations.
     beyond : (E,) array

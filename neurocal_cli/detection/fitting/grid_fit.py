@@ -92,8 +92,8 @@ class GridImage:
     ----------
     image : (H, W) array [DN]
     grid : Grid
-    edges : Edges
-    anchors : Rows
+    edges : GridEdges
+    anchors : Observations
         The found vertices.
     floor : float [DN^2]
         Least variance of the pixels, by rounding.
@@ -133,12 +133,12 @@ class GridFit:
     Attributes
     ----------
     lines : Lines
-    fit : Fit
+    fit : BatchFit
     data : EdgeData
     map : MapFit
     shading : Shading
-    shape : Shape
-    noise : Noise
+    shape : ProfileShape
+    noise : PixelNoise
     good : (E,) bool array
         Edges that passed the quality tests.
     """

@@ -43,8 +43,8 @@ class InitialFit:
     ----------
     data : EdgeData
         The pixels used.
-    fit : Fit
-    shape : Shape
+    fit : BatchFit
+    shape : ProfileShape
     """
 
     data: EdgeData

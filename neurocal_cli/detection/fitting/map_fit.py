@@ -95,7 +95,7 @@ class MapFit:
     ----------
     map : SmoothMap
     shift : (K,) array [px]
-        Unknowns of `Rows.shift`.
+        Unknowns of `Observations.shift`.
     shift_variance : (K,) array [px^2]
     residual : (N,) array [px]
         Value minus map and shift.
@@ -129,7 +129,7 @@ def fit_map(start: SmoothMap, observations: Observations, shift: Array, steps: i
     ----------
     start : SmoothMap
         Its model is kept.
-    rows : Rows
+    observations : Observations
     shift : (K,) array [px]
         Start of the shifts.
     steps : int

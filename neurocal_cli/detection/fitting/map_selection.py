@@ -45,7 +45,7 @@ def select_map(
     ----------
     start : SmoothMap
         Of any model.
-    rows : Rows
+    observations : Observations
     shift : (K,) array [px]
     enough : float
         Chi2 per observation at which no richer model is tried.

@@ -185,9 +185,9 @@ def fit_vertices(
     data : VertexData
     start : (V, 7) array
         Offset and tilt of the first and of the second line, and the values of `BatchFit`.
-    prior : Prior
+    prior : LevelPrior
     half_length : pair of (V,) arrays [px]
-    shape : Shape
+    shape : ProfileShape
         With the tails (V, 2) of the vertices.
     steps : int
     """

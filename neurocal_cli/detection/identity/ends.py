@@ -145,8 +145,8 @@ def _beyond(ends: Array) -> Array:
     line = first + t * (second - first)
     if ends.shape[1] < 3:
         return line
-    bend = ends[:, 2:] - 2 * second + first
-    return line + 0.5 * t * (t - 1) * np.where(np.isnan(bend), 0.0, bend)
+    change = ends[:, 2:] - 2 * second + first
+    return line + 0.5 * t * (t - 1) * np.where(np.isnan(change), 0.0, change)
 
 
 def _between(line: Array, shares: Array) -> Array:
