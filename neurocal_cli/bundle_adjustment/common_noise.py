@@ -36,9 +36,9 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Noise", "common_share", "measured", "noise_of", "with_common_share"]
 
-# Repeated by tests/test_common_noise.py and tests/test_measured_directions.py: with these, true covariances lower the
-# errors of the camera and wrong ones do no harm; boards that are not flat have levels of 4 and more,
-# rendered ones of about 1.
+# Repeated by tests/test_common_noise.py and tests/test_measured_directions.py: with these, true covariances
+# lower the errors of the camera and wrong ones do no harm; boards that are not flat have levels of 4 and
+# more, rendered ones of about 1.
 _MOST_POINTS = 20000  # enough to tell a share to a percent
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _STEPS = 12  # of golden section and of bisection

@@ -20,8 +20,8 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 
 __all__ = ["find_outlier_view", "free_networks", "seen_from_behind"]
 
-# Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones, none
-# blamed) and tests/test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
+# Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones,
+# none blamed) and tests/test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
 _FEWEST = 4  # views, of which the others must outvote one
 _MOVES = 2.5  # standard deviations of any shared parameter that leaving a view out must move
 _OUTLIER = 25.0  # times what noise, and what the others contradict each other by

@@ -26,9 +26,9 @@ from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
 
 __all__ = ["Consensus", "find_consensus"]
 
-# Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets with one
-# wrong view, each within 3 standard deviations of clean data): starts and rounds are what the last scene
-# needed, the limits lie between the clean and the wrong views of these sets.
+# Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
+# with one wrong view, each within 3 standard deviations of clean data): starts and rounds are what the last
+# scene needed, the limits lie between the clean and the wrong views of these sets.
 #
 # Of a flat and of a solid target: points that a start sees, and fewest points that can outvote others.
 _SEEN = {True: 5, False: 7}

@@ -37,8 +37,9 @@ from neurocal_cli.points import Correspondences
 
 __all__ = ["fit_robustly"]
 
-# Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets with one
-# wrong view; clean data are the same to the last bit with and without) and tests/test_wrong_inputs.py.
+# Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
+# with one wrong view; clean data are the same to the last bit with and without) and
+# tests/test_wrong_inputs.py.
 _CHANCE = 0.01  # of calling any point of a good data set wrong
 _FLOOR = 1e-7  # of the image's spread: rounding, not noise
 _ROUGH = 0.005  # an rms error of this share of the image's spread may hide anything

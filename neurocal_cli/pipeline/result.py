@@ -146,8 +146,8 @@ def _corner_warning(problem: Problem) -> tuple[str, ...]:
         return ()
     return (
         f"the distortion model {problem.distortion.model} that fits the points best is not monotonic (maps "
-        "two directions to one pixel) in the image's corners, where there are no points; the best monotonic fit "
-        "is used, which is a guess in the corners; add views that show the board there",
+        "two directions to one pixel) in the image's corners, where there are no points; the best monotonic "
+        "fit is used, which is a guess in the corners; add views that show the board there",
     )
 
 
