@@ -34,7 +34,7 @@ OUTLIERS = ("reject", "keep")
 
 _STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
-_MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor a lens
+_MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor distortion
 
 
 def calibrate(
@@ -73,9 +73,9 @@ def calibrate(
     method : {"neuro"}
     trainer : {"lm", "backprop"}
     distortion : {"auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"}
-        The lens model whose coefficients are estimated with everything else; auto: the simplest that
+        The distortion model whose coefficients are estimated with everything else; auto: the simplest that
         the points support (`lens_choice`); plumb-line, the paper's way: k1, k2, p1 and p2 from the images
-        of straight lines alone, then the pinhole camera. Type 3 takes the lens of the given camera instead.
+        of straight lines alone, then the pinhole camera. Type 3 takes the one of the given camera instead.
     skew : bool
         False: theta is pi/2.
     outliers : {"reject", "keep"}
@@ -104,18 +104,18 @@ def calibrate(
     """
     _check_options(method, trainer, distortion, outliers, starts, seed)
     given = None if intrinsics is None else camera_of(intrinsics)
-    known, lens = (given.intrinsics, given.distortion) if given else (None, Distortion())
+    known, model = (given.intrinsics, given.distortion) if given else (None, Distortion())
     type_3 = isinstance(type, (int, np.integer)) and type == 3
     if not type_3:
-        lens = Distortion() if distortion in _FOUND else Distortion(distortion)
-    elif distortion not in ("auto", "none", lens.model):
+        model = Distortion() if distortion in _FOUND else Distortion(distortion)
+    elif distortion not in ("auto", "none", model.model):
         raise UsageError(
-            f"type 3 uses the distortion of the given camera ({lens.model}), not {distortion}; leave it out"
+            f"type 3 uses the distortion of the given camera ({model.model}), not {distortion}; leave it out"
         )
     way = distortion if distortion in _FOUND and not type_3 else ""
     options = options_for(trainer, starts, seed, distortion=way, backprop=backprop, progress=progress)
     try:
-        problem = problem_for(points, type, image_center, known, extrinsics, skew, lens)
+        problem = problem_for(points, type, image_center, known, extrinsics, skew, model)
         if outliers == "reject":
             solution, rejected = fit_robustly(problem, options)
         else:
@@ -143,7 +143,7 @@ def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics
         Points that do not determine the poses.
     """
     given = camera_of(camera)
-    problem = problem_for(points, 3, intrinsics=given.intrinsics, lens=given.distortion)
+    problem = problem_for(points, 3, intrinsics=given.intrinsics, distortion=given.distortion)
     solution = fit(problem, options_for("lm", _STARTS, seed))
     return calibration_of(solution, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
 

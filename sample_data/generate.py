@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from neurocal_cli.board import Board, Plane
-from neurocal_cli.camera.pinhole import Intrinsics, Pose, project
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.io.lens_points import write_lens_points
 from neurocal_cli.io.points_csv import write_points
 from neurocal_cli.points import Correspondences
@@ -119,8 +120,8 @@ def seen(
     camera: Intrinsics, pose: Pose, world: np.ndarray, size: tuple[int, int], rng: np.random.Generator
 ) -> np.ndarray:
     """Pixels of world points with noise, to a hundred-thousandth of a pixel; all inside the image."""
-    pixels, depth = project(camera.A, pose, world)
-    if depth.min() <= 0 or pixels.min() < 0 or (pixels > np.array(size) - 1).any():
+    pixels, in_front = Camera(camera).project(world @ pose.R.T + pose.t)
+    if not in_front.all() or pixels.min() < 0 or (pixels > np.array(size) - 1).any():
         raise SystemExit("a point is outside the image: choose another pose")
     return np.round(pixels + SIGMA * rng.normal(size=pixels.shape), 5)
 

@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from neurocal_cli.board import Plane
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.io.files import write_whole
 from neurocal_cli.io.images import encode_png
-from neurocal_cli.simulation.rendering import Background, Camera, Scene, Sensor, Target, render
+from neurocal_cli.simulation.rendering import Background, Scene, Sensor, Target, render
 
 HERE = Path(__file__).resolve().parent
-CAMERA = Camera(Intrinsics(510.0, 508.0, 202.5, 147.0), (400, 300))
+CAMERA = Camera(Intrinsics(510.0, 508.0, 202.5, 147.0), image_size=(400, 300))
 BOARD = Target(Plane("", 9, 6, 25.0))
 NOISE = 0.5  # grey values
 

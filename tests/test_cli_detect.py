@@ -123,7 +123,7 @@ def test_what_cannot_be_read_or_shows_no_board_is_a_line_each(folder: Path) -> N
     expected = {
         "c_cut.png": "cut off",
         "d_empty.png": "is empty",
-        "e_text.png": "is no image",
+        "e_text.png": "is not a readable image",
         "f_bomb.png": "60000 x 60000 px",
         "g_tiny.png": "no board detected",
         "h_black.pgm": "no board detected",

@@ -190,7 +190,9 @@ def test_cameras_that_do_not_belong_together_are_refused(folder: Path, tmp_path:
     write_calibration(calibrate(other, skew=False), tmp_path / "b.yaml")
     matches = folder / "matches.csv"
     one_line_error(run("triangulate", folder / "left.yaml", tmp_path / "b.yaml", matches), "has a partner")
-    one_line_error(run("triangulate", folder / "left.yaml", folder / "left.yaml", matches), "at one place")
+    one_line_error(
+        run("triangulate", folder / "left.yaml", folder / "left.yaml", matches), "at the same place"
+    )
     one_line_error(run("triangulate", folder / "right.yaml", folder / "left.yaml", matches), "swapped")
     one_line_error(run("triangulate", folder / "left.yaml", matches), "is the calibration of one camera")
     one_line_error(run("triangulate", matches, matches), "not a rig")

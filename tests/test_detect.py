@@ -15,8 +15,8 @@ from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect
 from neurocal_cli.detection.detect import Detection, detect_points, gather, label
 from neurocal_cli.detection.identity.identify import Identified, Located
+from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.identity.placement import Placement
-from neurocal_cli.detection.identity.words import NoBoardError
 from neurocal_cli.errors import InputError
 from neurocal_cli.simulation.rendering import Rendered, render
 

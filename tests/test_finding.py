@@ -10,14 +10,15 @@ from support.rendered import condition, picture
 
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.finding import levels as find_levels
-from neurocal_cli.detection.finding.fold import bend
+from neurocal_cli.detection.finding.folds import largest_second_difference
+from neurocal_cli.detection.finding.from_links import lattice_from_links
 from neurocal_cli.detection.finding.grids import find_grids
-from neurocal_cli.detection.finding.grow import Lattice
+from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.finding.levels import Level, levels_of
-from neurocal_cli.detection.finding.linked import linked
-from neurocal_cli.detection.finding.refine import settle
+from neurocal_cli.detection.finding.links import find_links
 from neurocal_cli.detection.finding.saddles import find_saddles
-from neurocal_cli.detection.finding.seeds import find_links, find_seeds
+from neurocal_cli.detection.finding.seeds import find_seeds_3x3
+from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import PlaneTruth, Rectangle, render, scene_bound
 
@@ -326,8 +327,8 @@ def linked_first(level: Level) -> Lattice | None:
     """What is linked with the best seed of a level."""
     saddles = find_saddles(level)
     links = find_links(level, saddles)
-    seeds, _ = find_seeds(saddles, links)
-    return linked(level, saddles, links, int(seeds[0, 1, 1]), np.zeros(len(saddles), dtype=bool))
+    seeds = find_seeds_3x3(saddles, links)
+    return lattice_from_links(level, saddles, links, int(seeds[0, 1, 1]), np.zeros(len(saddles), dtype=bool))
 
 
 @pytest.mark.parametrize("name", ["base", "noise 12", "k1 -0.3"])
@@ -348,12 +349,12 @@ def test_links_do_not_lead_over_a_fold(seed: int) -> None:
     level = levels_of(shot.image)[-1]
     saddles = find_saddles(level)
     links = find_links(level, saddles)
-    seeds, _ = find_seeds(saddles, links)
+    seeds = find_seeds_3x3(saddles, links)
     none = np.zeros(len(saddles), dtype=bool)
-    together = [linked(level, saddles, links, int(s), none) for s in np.unique(seeds[:, 1, 1])]
+    together = [lattice_from_links(level, saddles, links, int(s), none) for s in np.unique(seeds[:, 1, 1])]
     assert any(together)
     for lattice in filter(None, together):
-        assert bend(lattice) < 0.16
+        assert largest_second_difference(lattice) < 0.16
         hits = [
             matched(Grid(level.scale * lattice.pixels, lattice.dark), plane, within=3.0)[0].sum()
             for plane in shot.truth.planes
@@ -366,10 +367,10 @@ def test_saddles_settle_where_they_are() -> None:
     shot = picture("base", FIRST)
     image, vertices = levels_of(shot.image)[0].image, shot.truth.planes[0].vertices.reshape(-1, 2)
     start = vertices + np.random.default_rng(1).uniform(-1, 1, vertices.shape)
-    settled = settle(image, start, 1.5)
+    settled = refine_saddles(image, start, 1.5)
     assert np.abs(settled - vertices).max() < 0.1
     # Half-way between pixels, each of the two may lead to the other.
-    again = np.abs(settle(image, settled, 1.5, rounds=1) - settled).max(axis=1)
+    again = np.abs(refine_saddles(image, settled, 1.5, rounds=1) - settled).max(axis=1)
     assert again.max() < 0.2
     assert (again < 1e-9).mean() > 0.8
-    assert np.isnan(settle(image, np.array([[-5.0, 20.0], [np.nan, 3.0]]), 1.5)).all()
+    assert np.isnan(refine_saddles(image, np.array([[-5.0, 20.0], [np.nan, 3.0]]), 1.5)).all()

@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 from support.maps import some_map
 
-from neurocal_cli.detection.fitting import edges as fit_edges
-from neurocal_cli.detection.fitting import vertices as fit_vertices
-from neurocal_cli.detection.fitting.box import PIXEL, box_profile, half_widths
-from neurocal_cli.detection.fitting.edges import EdgeData
-from neurocal_cli.detection.fitting.newton import Shape
-from neurocal_cli.detection.fitting.profile import (
+from neurocal_cli.detection.fitting import edge_fit as fit_edges
+from neurocal_cli.detection.fitting import vertex_fit as fit_vertices
+from neurocal_cli.detection.fitting.batched_newton import ProfileShape
+from neurocal_cli.detection.fitting.edge_fit import EdgeData
+from neurocal_cli.detection.fitting.edge_profile import (
     RESPONSE_TERMS,
     box_kurtosis,
     erf_and_density,
@@ -24,8 +23,9 @@ from neurocal_cli.detection.fitting.profile import (
     response_terms,
     tail_terms,
 )
+from neurocal_cli.detection.fitting.pixel_box import PIXEL, box_profile, half_widths
 from neurocal_cli.detection.fitting.smooth_map import homography_start
-from neurocal_cli.detection.fitting.vertices import VertexData
+from neurocal_cli.detection.fitting.vertex_fit import VertexData
 from neurocal_cli.geometry import Array
 
 STEP = 1e-5
@@ -58,16 +58,16 @@ def test_profile_has_the_slope_it_says() -> None:
 
 
 def test_response_keeps_the_levels_and_has_the_slope_it_says() -> None:
-    bend = np.array([0.2, -0.1, 0.05, 0.02, -0.03, 0.01])
-    assert len(bend) == RESPONSE_TERMS
+    nonlinearity = np.array([0.2, -0.1, 0.05, 0.02, -0.03, 0.01])
+    assert len(nonlinearity) == RESPONSE_TERMS
     x = np.linspace(-1, 1, 51)
-    value, steep = response(x, bend)
+    value, steep = response(x, nonlinearity)
     assert value[0] == -1
     assert value[-1] == 1
-    np.testing.assert_allclose(steep, slope(lambda t: response(t, bend)[0], x), atol=1e-8)
-    terms = np.empty((1, len(bend), x.size))
+    np.testing.assert_allclose(steep, slope(lambda t: response(t, nonlinearity)[0], x), atol=1e-8)
+    terms = np.empty((1, len(nonlinearity), x.size))
     response_terms(x.reshape(1, -1), np.ones((1, x.size)), out=terms)
-    np.testing.assert_allclose(value.reshape(-1), x.reshape(-1) + bend @ terms[0], atol=1e-14)
+    np.testing.assert_allclose(value.reshape(-1), x.reshape(-1) + nonlinearity @ terms[0], atol=1e-14)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.3, np.pi / 4])
@@ -86,7 +86,7 @@ def test_pixel_box_is_in_the_profile(angle: float, psf: float) -> None:
     assert with_box < 0.3 * without
 
 
-def some_edges() -> tuple[EdgeData, Array, Shape, Array]:
+def some_edges() -> tuple[EdgeData, Array, ProfileShape, Array]:
     rng = np.random.default_rng(1)
     E, N = 3, 60
     s, d = rng.uniform(-15, 15, (E, N)), rng.uniform(-3, 3, (E, N))
@@ -103,7 +103,7 @@ def some_edges() -> tuple[EdgeData, Array, Shape, Array]:
             rng.uniform(0.6, 1.2, E),
         ]
     )
-    shape = Shape(np.tile([0.02, -0.005], (E, 1)), np.array([0.1, -0.05, 0.02, 0.01]))
+    shape = ProfileShape(np.tile([0.02, -0.005], (E, 1)), np.array([0.1, -0.05, 0.02, 0.01]))
     return data, values, shape, s / 15
 
 
@@ -145,7 +145,7 @@ def test_edge_model_has_the_derivatives_it_says(sharp: bool) -> None:
         np.testing.assert_allclose(linear.rows[:, 1 + k], (behind - ahead) / (2 * STEP), atol=atol)
 
 
-def some_vertices() -> tuple[VertexData, Array, Shape, tuple[Array, Array]]:
+def some_vertices() -> tuple[VertexData, Array, ProfileShape, tuple[Array, Array]]:
     rng = np.random.default_rng(2)
     V, N = 3, 80
     s1, d1, s2, d2 = rng.uniform(-3, 3, (4, V, N))
@@ -155,7 +155,7 @@ def some_vertices() -> tuple[VertexData, Array, Shape, tuple[Array, Array]]:
     data = VertexData(*arrays, np.zeros(V))  # type: ignore[arg-type]
     places = rng.normal(0, 0.2, (V, 4))
     values = np.column_stack([places, np.full(V, 120.0), np.full(V, 90.0), rng.uniform(0.6, 1.2, V)])
-    shape = Shape(np.tile([0.02, -0.005], (V, 1)), np.array([0.1, -0.05, 0.02, 0.01]))
+    shape = ProfileShape(np.tile([0.02, -0.005], (V, 1)), np.array([0.1, -0.05, 0.02, 0.01]))
     return data, values, shape, (s1 / 3, s2 / 3)
 
 
@@ -190,7 +190,7 @@ def test_blurred_oblique_cross_is_as_modelled(angle: float) -> None:
     one, zero = np.ones_like(d1), np.zeros_like(d1)
     data = VertexData(zero, d1, zero, d2, zero, one, one, np.array([[a @ b]]), one, np.zeros(1))  # type: ignore[arg-type]
     values = np.array([[0, 0, 0, 0, 0, 1, 1.0]])
-    shape = Shape(np.zeros((1, 2)), np.zeros(RESPONSE_TERMS))
+    shape = ProfileShape(np.zeros((1, 2)), np.zeros(RESPONSE_TERMS))
     linear = fit_vertices.linearised(data, (zero, zero), values, shape)  # type: ignore[arg-type]
     np.testing.assert_allclose(linear.x[0], exact, atol=0.006)
 
@@ -213,14 +213,14 @@ def test_map_has_the_derivatives_it_says() -> None:
 def test_map_keeps_what_another_form_shares_with_it() -> None:
     now = some_map(4)
     grid = np.random.default_rng(6).uniform(0, 8, (20, 2))
-    np.testing.assert_allclose(now.shaped(3, 6).at(grid), now.at(grid), atol=1e-10)
-    np.testing.assert_array_equal(now.shaped(3, 6).shaped(3, 4).parameters, now.parameters)
-    plain = now.shaped(0, 0)
+    np.testing.assert_allclose(now.with_model(3, 6).at(grid), now.at(grid), atol=1e-10)
+    np.testing.assert_array_equal(now.with_model(3, 6).with_model(3, 4).parameters, now.parameters)
+    plain = now.with_model(0, 0)
     assert not plain.parameters[8:].any()
 
 
 def test_homography_is_found_by_least_squares() -> None:
-    now = some_map().shaped(0, 0)
+    now = some_map().with_model(0, 0)
     grid = np.random.default_rng(7).uniform(0, 8, (12, 2))
     again = homography_start(now.frame, grid, now.at(grid))
     np.testing.assert_allclose(again.parameters, now.parameters, atol=1e-10)

@@ -9,27 +9,36 @@ import numpy as np
 import pytest
 from support.maps import some_map
 
-from neurocal_cli.detection.fitting.forms import choose_map
-from neurocal_cli.detection.fitting.newton import BLUR, Fit, Linear, Part, Prior, gauss_newton, rows_for
-from neurocal_cli.detection.fitting.noise import BoardBlur
-from neurocal_cli.detection.fitting.robust import Rows, fit_map, median
+from neurocal_cli.detection.fitting.batched_newton import (
+    BLUR,
+    BatchFit,
+    LevelPrior,
+    Linearised,
+    Part,
+    fit_batch,
+    rows_for,
+)
+from neurocal_cli.detection.fitting.common_parameters import BoardBlur
+from neurocal_cli.detection.fitting.map_fit import Observations, fit_map
+from neurocal_cli.detection.fitting.map_selection import select_map
 from neurocal_cli.detection.fitting.shading import Levels, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
-from neurocal_cli.detection.fitting.strips import gather, grid_lines
+from neurocal_cli.detection.fitting.strips import grid_lines, strip_pixels
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
 GRID = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
 
 
 def test_map_is_fitted_through_outliers_with_a_true_covariance() -> None:
-    true = some_map(0).shaped(2, 0)
+    true = some_map(0).with_model(2, 0)
     squares = []
     for seed in range(30):
         rng = np.random.default_rng(seed)
         pixels = true.at(GRID) + rng.normal(0, 0.01, GRID.shape)
         pixels[:4] += rng.normal(0, 5, (4, 2))
-        start = homography_start(true.frame, GRID, true.at(GRID)).shaped(2, 0)
-        fit = fit_map(start, Rows.of_points(GRID, pixels, 0.01), np.zeros(0))
+        start = homography_start(true.frame, GRID, true.at(GRID)).with_model(2, 0)
+        fit = fit_map(start, Observations.of_points(GRID, pixels, 0.01), np.zeros(0))
         assert set(np.flatnonzero(fit.weight == 0)) <= {*range(4), *range(54, 58)}
         direction = np.tile([0.6, 0.8], (len(GRID), 1))
         error = ((fit.map.at(GRID) - true.at(GRID)) * direction).sum(axis=1)
@@ -39,21 +48,21 @@ def test_map_is_fitted_through_outliers_with_a_true_covariance() -> None:
 
 def test_anchors_do_not_decide_what_is_an_outlier() -> None:
     """Edges of an uneven board far outside their own variances, and more anchors that are all in place."""
-    true = some_map(0).shaped(0, 0)
+    true = some_map(0).with_model(0, 0)
     rng = np.random.default_rng(2)
-    edges = Rows.of_points(GRID[:20], true.at(GRID[:20]) + rng.normal(0, 0.1, (20, 2)), 0.003)
-    anchors = Rows.of_points(GRID, true.at(GRID), 2.0)
-    assert edges.and_(anchors).telling.tolist() == [True] * 40 + [False] * 108
-    fit = fit_map(true, edges.and_(anchors), np.zeros(0))
+    edges = Observations.of_points(GRID[:20], true.at(GRID[:20]) + rng.normal(0, 0.1, (20, 2)), 0.003)
+    anchors = Observations.of_points(GRID, true.at(GRID), 2.0)
+    assert edges.joined_with(anchors).informative.tolist() == [True] * 40 + [False] * 108
+    fit = fit_map(true, edges.joined_with(anchors), np.zeros(0))
     assert (fit.weight[:40] > 0).all()
 
 
 def test_form_does_not_follow_the_bumps_of_an_uneven_board() -> None:
-    true = some_map(0).shaped(1, 0)
+    true = some_map(0).with_model(1, 0)
     for seed in range(5):
         pixels = true.at(GRID) + np.random.default_rng(seed).normal(0, 0.1, GRID.shape)
         start = homography_start(true.frame, GRID, pixels)
-        chosen = choose_map(start, Rows.of_points(GRID, pixels, 0.003), np.zeros(0))
+        chosen = select_map(start, Observations.of_points(GRID, pixels, 0.003), np.zeros(0))
         assert chosen.map.degree == 0
         assert chosen.map.radial <= 1
 
@@ -68,11 +77,11 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
     values[:, BLUR] = true * rng.normal(1, 0.01, 60)
     values[7, BLUR] = 3.0  # one is wrong
     information = np.tile(1e6 * np.eye(5), (60, 1, 1))
-    prior = Prior(np.ones((60, 3)), np.zeros((60, 3, 3)))
+    prior = LevelPrior(np.ones((60, 3)), np.zeros((60, 3, 3)))
     nothing = np.zeros((60, 1), dtype=np.float32)
-    linear = Linear(rows_for(60, 5, 1, nothing.dtype), nothing, nothing)
+    linear = Linearised(rows_for(60, 5, 1, nothing.dtype), nothing, nothing)
     ones = np.ones(60)
-    fit = Fit(values, information, prior, ones, ones.astype(np.int64), ones, linear)
+    fit = BatchFit(values, information, prior, ones, ones.astype(np.int64), ones, linear)
     blur = BoardBlur.of(fit, normal, ones.astype(bool))
     np.testing.assert_allclose(blur.along(normal), true, rtol=0.08)
 
@@ -80,31 +89,31 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
 def test_fits_settle_where_their_steps_are_too_long() -> None:
     """An arctangent's Gauss-Newton steps from beyond 1.4 lead farther and farther away."""
 
-    def model_of(part: Part) -> Callable[[Array], Linear]:
-        def model(values: Array) -> Linear:
+    def model_of(part: Part) -> Callable[[Array], Linearised]:
+        def model(values: Array) -> Linearised:
             place = values[:, :1]
             rows = np.zeros((len(values), 5, 1), dtype=np.float32)
             rows[:, 0] = -100 * np.arctan(place)
             rows[:, 1] = 100 / (1 + place**2)
-            return Linear(rows, rows[:, 0], rows[:, 0])
+            return Linearised(rows, rows[:, 0], rows[:, 0])
 
         return model
 
     start = np.array([[0.3, 0, 1, 5.0]] * 19 + [[4.0, 0, 1, 5.0]])
-    prior = Prior(start[:, 1:].copy(), np.tile(np.eye(3) * 1e3, (20, 1, 1)))
-    fit = gauss_newton(model_of, start, prior, np.ones(20, dtype=np.int64), 6)
+    prior = LevelPrior(start[:, 1:].copy(), np.tile(np.eye(3) * 1e3, (20, 1, 1)))
+    fit = fit_batch(model_of, start, prior, np.ones(20, dtype=np.int64), 6)
     np.testing.assert_allclose(fit.values[:, 0], 0, atol=0.01)
     assert fit.step.max() < 0.5
 
 
 def test_shift_of_alternating_edges_is_told_from_the_map() -> None:
-    true = some_map(0).shaped(0, 0)
+    true = some_map(0).with_model(0, 0)
     rng = np.random.default_rng(1)
     angle = rng.uniform(0, 2 * np.pi, 200)
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     grid = rng.uniform(0, [8, 5], (200, 2))
     value = (true.at(grid) * direction).sum(axis=1) + 0.3 + rng.normal(0, 0.003, 200)
-    rows = Rows(grid, direction, value, np.full(200, 0.003**2), np.ones((200, 1)))
+    rows = Observations(grid, direction, value, np.full(200, 0.003**2), np.ones((200, 1)))
     fit = fit_map(true, rows, np.zeros(1))
     assert fit.shift[0] == pytest.approx(0.3, abs=5 * np.sqrt(fit.shift_variance[0]))
     assert np.sqrt(fit.shift_variance[0]) < 0.0005
@@ -112,11 +121,11 @@ def test_shift_of_alternating_edges_is_told_from_the_map() -> None:
 
 @pytest.mark.parametrize(("radial", "degree"), [(0, 0), (1, 0), (3, 0), (3, 4)])
 def test_simplest_form_that_follows_is_chosen(radial: int, degree: int) -> None:
-    true = some_map(degree).shaped(radial, degree)
+    true = some_map(degree).with_model(radial, degree)
     rng = np.random.default_rng(radial + degree)
     pixels = true.at(GRID) + rng.normal(0, 0.003, GRID.shape)
-    chosen = choose_map(
-        homography_start(true.frame, GRID, pixels), Rows.of_points(GRID, pixels, 0.003), np.zeros(0)
+    chosen = select_map(
+        homography_start(true.frame, GRID, pixels), Observations.of_points(GRID, pixels, 0.003), np.zeros(0)
     )
     assert chosen.map.radial == radial
     assert degree <= chosen.map.degree <= degree + (degree > 0)
@@ -135,7 +144,7 @@ def straight(angle: float, size: float = 20.0) -> SmoothMap:
 def test_strips_hold_every_pixel_once(angle: float) -> None:
     image = np.arange(90 * 100, dtype=np.uint16).reshape(90, 100)
     lines = grid_lines(straight(angle), np.array([[0.5, 0.0]]), np.array([False]), np.ones(1))
-    strips = gather(image, lines, np.array([4.0]), np.array([[1.5, 1.5]]))
+    strips = strip_pixels(image, lines, np.array([4.0]), np.array([[1.5, 1.5]]))
     v, u = np.mgrid[0:90, 0:100]
     du, dv = u - lines.middle[0, 0], v - lines.middle[0, 1]
     s = du * lines.tangent[0, 0] + dv * lines.tangent[0, 1]
@@ -148,7 +157,7 @@ def test_strips_hold_every_pixel_once(angle: float) -> None:
 def test_strips_know_what_lies_outside_the_image() -> None:
     image = np.zeros((90, 100), dtype=np.uint8)
     lines = grid_lines(straight(0.0), np.array([[0.5, 2.3]]), np.array([False]), np.ones(1))
-    strips = gather(image, lines, np.array([6.0]), np.zeros((1, 2)))
+    strips = strip_pixels(image, lines, np.array([6.0]), np.zeros((1, 2)))
     assert 0 < strips.beyond[0] < 1
     assert strips.inside.sum() > 0
 
@@ -193,11 +202,11 @@ def test_levels_are_fitted_through_hidden_squares() -> None:
 
 
 def test_rows_may_be_put_together() -> None:
-    rows = Rows.of_points(GRID, GRID, 1.0, 1)
-    both = rows.and_(replace(rows, value=rows.value + 1))
+    rows = Observations.of_points(GRID, GRID, 1.0, 1)
+    both = rows.joined_with(replace(rows, value=rows.value + 1))
     assert len(both.value) == 4 * len(GRID)
 
 
 def test_median_of_an_even_number_is_the_upper_one() -> None:
-    assert median(np.array([4.0, 1.0, 3.0, 2.0])) == 3
-    assert median(np.array([3.0, 1.0, 2.0])) == 2
+    assert upper_median(np.array([4.0, 1.0, 3.0, 2.0])) == 3
+    assert upper_median(np.array([3.0, 1.0, 2.0])) == 2

@@ -18,7 +18,7 @@ FLAT = Path(__file__).resolve().parents[1] / "sample_data" / "flat.csv"
 def test_free_networks_are_at_the_minimum(distortion: str, within: float) -> None:
     found = _AtMinimum(calibrate(read_points(FLAT), skew=False, distortion=distortion, outliers="keep"))
     state, views = found.state, found.views
-    own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.lens, state.k)
+    own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.model, state.k)
     free = np.arange(5 + len(state.k)) < 5
     minimum = adjust(views.batches, own, free, True, 1000).cost.sum()
     assert np.sqrt(free_networks(views, state).sum() / minimum) == pytest.approx(1.0, abs=within)

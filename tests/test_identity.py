@@ -16,11 +16,11 @@ from support.seen_grids import labelled_vertices, seen_grid, seen_grids, true_ve
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.identity.ends import DIRECTIONS, End, board_ends
-from neurocal_cli.detection.identity.fit import fit_camera, motion
 from neurocal_cli.detection.identity.identify import identify
+from neurocal_cli.detection.identity.linear_camera import fit_camera, rigid_motion
+from neurocal_cli.detection.identity.messages import SYMMETRIC_BOARD, NoBoardError
 from neurocal_cli.detection.identity.placement import Placement, placements
 from neurocal_cli.detection.identity.trim import trimmed
-from neurocal_cli.detection.identity.words import LOOKS_THE_SAME, NoBoardError
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import Rectangle, Rendered, Scene, Sides, Target, ground_truth, render
 
@@ -83,9 +83,7 @@ def test_a_part_of_the_board_is_placed_by_the_ends_that_are_seen_or_refused(name
 
 
 def test_a_part_that_could_be_anywhere_is_refused() -> None:
-    with pytest.raises(
-        NoBoardError, match="detected 5 x 4 of 9 x 6 inner vertices, but it is ambiguous which"
-    ):
+    with pytest.raises(NoBoardError, match="detected 5 x 4 of 9 x 6 inner vertices, but it is ambiguous"):
         identify(Board.single(9, 6, 25), [flat_grid(5, 4)], EMPTY)
 
 
@@ -108,7 +106,7 @@ def test_a_piece_of_a_bigger_board_is_refused_though_it_has_the_size() -> None:
     seen = picture("base", 0)
     whole = seen_grid(seen.truth.planes[0], True)
     piece = Grid(whole.pixels[:4, :6], whole.dark)
-    with pytest.raises(NoBoardError, match="the pattern goes on beyond 6 x 4"):
+    with pytest.raises(NoBoardError, match="the pattern continues beyond 6 x 4"):
         identify(Board.single(6, 4, 25), [piece], seen.image)
 
 
@@ -123,7 +121,7 @@ def test_a_board_that_looks_the_same_after_a_turn_is_named_by_the_image_with_a_w
         dark = [0, rows, cols + rows, cols][turn] % 2
         identified = identify(board, [Grid(pixels, dark)], EMPTY)
         found = labelled_vertices(identified)
-        assert identified.warnings == (LOOKS_THE_SAME,)
+        assert identified.warnings == (SYMMETRIC_BOARD,)
         np.testing.assert_array_equal(found["0:0"], [100.0, 80.0])
         np.testing.assert_array_equal(found["1:0"], [130.0, 80.0])
 
@@ -308,8 +306,8 @@ def test_the_linear_camera_tells_a_mirrored_target() -> None:
 def test_a_motion_is_found_and_a_reflection_is_none() -> None:
     points = np.random.default_rng(0).normal(size=(8, 3))
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    moved = motion(points, points @ turn.T + [1.0, 2.0, 3.0])
+    moved = rigid_motion(points, points @ turn.T + [1.0, 2.0, 3.0])
     assert moved is not None
     np.testing.assert_allclose(moved[0], turn, atol=1e-12)
     np.testing.assert_allclose(moved[1], [1.0, 2.0, 3.0], atol=1e-12)
-    assert motion(points, points * [-1, 1, 1]) is None
+    assert rigid_motion(points, points * [-1, 1, 1]) is None

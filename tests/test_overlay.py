@@ -9,7 +9,7 @@ from support.rendered import condition, picture
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured
 from neurocal_cli.detection.detect import Detection, detect_points
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
-from neurocal_cli.detection.residuals import residuals
+from neurocal_cli.detection.plane_residuals import plane_residuals
 from neurocal_cli.geometry import Array
 
 
@@ -62,9 +62,9 @@ def measured_on_a_bent_plane(noise: float) -> tuple[Measured, Array]:
 
 def test_residuals_are_the_noise_and_not_the_lens() -> None:
     measured, _ = measured_on_a_bent_plane(0.0)
-    assert np.abs(residuals(measured)).max() < 0.1
+    assert np.abs(plane_residuals(measured)).max() < 0.1
     measured, error = measured_on_a_bent_plane(0.5)
-    left = residuals(measured)
+    left = plane_residuals(measured)
     assert np.corrcoef(left.ravel(), error.ravel())[0, 1] > 0.9
 
 
@@ -80,4 +80,4 @@ def test_few_points_have_no_residuals() -> None:
         0,
         0.0,
     )
-    assert not residuals(few).any()
+    assert not plane_residuals(few).any()

@@ -108,5 +108,5 @@ def test_ros_files_are_in_metres(rig: Rig) -> None:
     assert P2[0, 3] == pytest.approx(found.P2[0, 3] / 1000)
     assert -P2[0, 3] / P2[0, 0] == pytest.approx(rig.baseline / 1000)
     points = replace(rig.left.points, unit="squares")
-    with pytest.raises(InputError, match="'squares' is none of m, dm, cm, mm"):
+    with pytest.raises(InputError, match="'squares'; use one of m, dm, cm, mm"):
         format_ros_pair(replace(rig, left=replace(rig.left, points=points)))

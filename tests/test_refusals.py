@@ -197,7 +197,7 @@ def mirrored(change: str) -> Correspondences:
     }[change]
 
 
-@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize("skew", [pytest.param(True, marks=pytest.mark.slow), False])
 @pytest.mark.parametrize("type", [1, 2, 3])
 @pytest.mark.parametrize("change", ["left-handed", "X and Y swapped", "u and v swapped", "v upwards"])
 def test_mirrored_data_are_called_mirrored(change: str, type: int, skew: bool) -> None:
@@ -240,7 +240,7 @@ def sane(cal: Calibration) -> None:
 
 
 @pytest.mark.parametrize("type", GIVEN)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in range(1, 4))])
 def test_pixels_of_other_points_or_of_none_are_refused_or_warned_of(type: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     pixels = see([FOLDED], [AHEAD]).pixels

@@ -152,9 +152,7 @@ def test_a_pixel_that_the_lens_cannot_have_seen_is_named() -> None:
     points = Correspondences(
         np.zeros((3, 3)), [[320, 240], [630, 470], [0, 0]], source="p.csv", lines=[2, 3, 4]
     )
-    with pytest.raises(
-        InputError, match=r"^p.csv:3: the distortion maps nothing to the pixel \(630, 470\)"
-    ):
+    with pytest.raises(InputError, match=r"^p.csv:3: the distortion maps nothing to the pixel \(630, 470\)"):
         undistort_points(points, Camera(Intrinsics(300, 300, 320, 240), Distortion("k1", [-0.3])))
 
 
@@ -293,7 +291,7 @@ def test_large_images_are_done_in_parts() -> None:
 
 
 def test_an_image_of_another_size_is_refused() -> None:
-    with pytest.raises(InputError, match=r"has 100 x 50 px, but the camera is for 640 x 480 px"):
+    with pytest.raises(InputError, match=r"has 100 x 50 px, but the camera is for 640 x 480"):
         undistort_image(np.zeros((50, 100), np.uint8), camera("k1"))
     with pytest.raises(InputError, match="interpolation must be one of"):
         undistort_image(smooth(), camera("k1"), interpolation="best")

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import re
-from pathlib import Path
-
 import pytest
 from support.wrong_inputs import FLAT, FOLDED, flat, folded, outcome
+from wrong_inputs_table import words
 
 from neurocal_cli import calibrate
 from neurocal_cli.verdict.assessment import assess
 
-README = (Path(__file__).resolve().parents[1] / "README.md").read_text(encoding="utf-8")
-ROWS = dict(re.findall(r"^\| ([^|]+?) \| (refused|poor|usable) \|", README, flags=re.MULTILINE))
+ROWS = words()
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -38,6 +35,6 @@ def test_no_wrong_input_ends_as_good(name: str) -> None:
     assert ROWS[name] == word
 
 
-def test_the_table_in_the_readme_has_every_wrong_input() -> None:
+def test_the_table_has_every_wrong_input() -> None:
     assert set(ROWS) == {*FLAT, *FOLDED}
     assert len(ROWS) >= 40

@@ -154,7 +154,7 @@ def test_the_camera_at_a_setting_is_judged_like_any_other() -> None:
     evaluation = evaluate_camera(camera, unnamed)
     assert not evaluation.fitted_views
     assert evaluation.rmse_px < 1.15 * FLOOR
-    with pytest.raises(InputError, match="holds no points"):
+    with pytest.raises(InputError, match="has no points"):
         evaluate_camera(camera)
 
 

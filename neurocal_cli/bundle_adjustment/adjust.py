@@ -119,6 +119,8 @@ class _Reprojection:
         # Columns of the camera's parameters, and the places of the free ones among them.
         self.camera = camera_columns(start.k.shape[-1])
         self.free, self.free_pose = np.flatnonzero(free), free_pose
+        self.shared, self.pose = self.camera[self.free], np.arange(POSE.start, POSE.stop)
+        self.columns = np.concatenate([self.shared, self.pose]) if free_pose else self.shared
         self.together = len(start.entries) == 1 and bool(self.free.size) and batches.n_views > 1
         self.normal, _ = self._blocks(start)
 
@@ -185,9 +187,7 @@ class _Reprojection:
 
     def _solve_apart(self, N: Array, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
         """Each group has its own unknowns; those that have ended stay where they are."""
-        pose = np.arange(POSE.start, POSE.stop) if self.free_pose else np.arange(0)
-        columns = np.concatenate([self.camera[self.free], pose])
-        moving = N if len(active) == len(N) else N[active]
+        columns, moving = self.columns, N if len(active) == len(N) else N[active]
         H, g = moving[:, columns[:, None], columns], moving[:, columns, -1]
         step, promised = damped_step(H, g, damping)
         whole = np.zeros((len(N), N.shape[1]))
@@ -197,8 +197,7 @@ class _Reprojection:
 
     def _solve_together(self, damping: float) -> tuple[_Step, Array]:
         """One A, a pose for each view: the poses are eliminated by the Schur complement."""
-        own = np.arange(POSE.start, POSE.stop)
-        step, by_pose, promised = schur_step(self.normal, self.camera[self.free], own, damping)
+        step, by_pose, promised = schur_step(self.normal, self.shared, self.pose, damping)
         by_camera = np.zeros((1, len(self.camera)))
         by_camera[0, self.free] = step
         return (by_camera, by_pose), np.array([promised])

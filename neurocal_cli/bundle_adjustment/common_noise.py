@@ -36,7 +36,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Noise", "common_share", "measured", "noise_of", "with_common_share"]
 
-# Repeated by tests/test_noise.py and tests/test_directions.py: with these, true covariances lower the
+# Repeated by tests/test_common_noise.py and tests/test_measured_directions.py: with these, true covariances lower the
 # errors of the camera and wrong ones do no harm; boards that are not flat have levels of 4 and more,
 # rendered ones of about 1.
 _MOST_POINTS = 20000  # enough to tell a share to a percent

@@ -77,7 +77,7 @@ def held_out(
     normal : (V, 12 + K, 12 + K) array
         From `adjust`.
     free : (5 + K,) bool array
-        Of A's entries and the lens's coefficients.
+        Of A's entries and the distortion coefficients.
     free_poses : bool
 
     Returns

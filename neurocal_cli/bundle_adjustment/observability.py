@@ -142,10 +142,11 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
     if boards:
         _check_tilts(views, (state.R @ views.basis)[:, :, 2], singular)
     more = f", or give known parameters ({ways})" if (ways := _givable(problem)) else ""
-    if singular and problem.free_lens:
+    if singular and problem.free_distortion:
+        model = problem.distortion.model
         raise DegenerateGeometryError(
-            f"the points do not determine all coefficients of the distortion model {problem.lens.model}; "
-            "choose a simpler --distortion, or give points over more of the image"
+            f"the points do not determine all coefficients of the distortion model {model}; choose a "
+            "simpler --distortion, or give points over more of the image"
         )
     if singular:
         raise DegenerateGeometryError(

@@ -20,8 +20,8 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 
 __all__ = ["find_outlier_view", "free_networks", "seen_from_behind"]
 
-# Repeated by tests/test_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones, none
-# blamed) and tests/test_lens_starts.py (1000 clean sets under strong distortion, no view blamed).
+# Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones, none
+# blamed) and tests/test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
 _FEWEST = 4  # views, of which the others must outvote one
 _MOVES = 2.5  # standard deviations of any shared parameter that leaving a view out must move
 _OUTLIER = 25.0  # times what noise, and what the others contradict each other by
@@ -86,7 +86,7 @@ def _contradictions(q: Quadratics, own: Array, conditions: NDArray[np.intp]) -> 
 
 
 def _of(state: CameraState, views: NDArray[np.intp]) -> CameraState:
-    return CameraState(state.entries, state.R[views], state.t[views], state.lens, state.k)
+    return CameraState(state.entries, state.R[views], state.t[views], state.model, state.k)
 
 
 def free_networks(views: Views, state: CameraState, steps: int = _FREE_STEPS) -> Array:
@@ -95,7 +95,7 @@ def free_networks(views: Views, state: CameraState, steps: int = _FREE_STEPS) ->
     Eleven parameters for each view are as free as its product W V: what no camera common to all the
     views can go below, and so the precision of the points themselves.
     """
-    own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.lens, state.k)
+    own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.model, state.k)
     free = np.concatenate([np.ones(5, dtype=bool), np.zeros(len(state.k), dtype=bool)])
     normal = adjust(views.batches, own, free, True, steps).normal
     # The minimum of the quadratic there.

@@ -26,13 +26,13 @@ _TOLD_APART = 2.0  # standard deviations
 def parameter_covariance(
     intrinsics: Intrinsics, model: str, covariance: Array, pixel_scale: float, given: Collection[str]
 ) -> tuple[Array, dict[str, float]]:
-    """Covariance of the intrinsic parameters and the lens's coefficients, and their std.
+    """Covariance of the intrinsic parameters and the distortion coefficients, and their std.
 
     Parameters
     ----------
     intrinsics : Intrinsics
     model : str
-        Of the lens, with K coefficients.
+        Of the distortion, with K coefficients.
     covariance : (5 + K, 5 + K) array
         Of A's entries A11, A12, A22, A13, A23 in normalised pixels and the coefficients; 0 for given ones.
     pixel_scale : float
@@ -76,13 +76,13 @@ def pose_std(R: Array, centre: Array, scale: Array, covariance: Array) -> Array:
 
 
 def parameter_warnings(
-    intrinsics: Intrinsics, lens: Distortion, std: Mapping[str, float], lens_chosen: bool
+    intrinsics: Intrinsics, distortion: Distortion, std: Mapping[str, float], model_chosen: bool
 ) -> tuple[str, ...]:
     """Parameters that exist but are badly determined, and coefficients that the data does not tell from 0.
 
-    A lens model that was chosen for what it predicts may well have one of those.
+    A distortion model that was chosen for what it predicts may well have one of those.
     """
-    return (*_poor(intrinsics, std), *(() if lens_chosen else _noise_coefficients(lens, std)))
+    return (*_poor(intrinsics, std), *(() if model_chosen else _noise_coefficients(distortion, std)))
 
 
 def _poor(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:
@@ -104,9 +104,9 @@ def _poor(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:
     )
 
 
-def _noise_coefficients(lens: Distortion, std: Mapping[str, float]) -> tuple[str, ...]:
+def _noise_coefficients(distortion: Distortion, std: Mapping[str, float]) -> tuple[str, ...]:
     """Warn of coefficients that the data does not tell from 0."""
-    pairs = zip(coefficient_names(lens.model), lens.coefficients, strict=True)
+    pairs = zip(coefficient_names(distortion.model), distortion.coefficients, strict=True)
     noise = [
         f"{name} ({k:.2g} +- {std[name]:.2g})" for name, k in pairs if 0 < abs(k) < _TOLD_APART * std[name]
     ]

@@ -50,9 +50,9 @@ class Problem:
         Names of the given intrinsic parameters, and of distortion coefficients that stay as they are.
     intrinsics : Intrinsics or None
         All of them, for type 3: returned as they are.
-    lens : Distortion
+    distortion : Distortion
         The distortion model to end with; its coefficients where they are given.
-    free_lens : bool
+    free_distortion : bool
         Whether the other coefficients are estimated.
     restraint : callable, optional
         What the distortion has to obey beside the points.
@@ -66,15 +66,16 @@ class Problem:
     poses: Mapping[str, Pose] | None
     fixed: frozenset[str]
     intrinsics: Intrinsics | None
-    lens: Distortion
-    free_lens: bool
+    distortion: Distortion
+    free_distortion: bool
     restraint: Restraint | None = None
 
     @property
     def free_camera(self) -> NDArray[np.bool_]:
         """(5 + K,) which of A's entries and of the distortion coefficients are estimated."""
         coefficients = [
-            self.free_lens and name not in self.fixed for name in coefficient_names(self.lens.model)
+            self.free_distortion and name not in self.fixed
+            for name in coefficient_names(self.distortion.model)
         ]
         return np.concatenate([self.free, np.array(coefficients, dtype=bool)])
 
@@ -122,7 +123,9 @@ class Problem:
         """The same points with another distortion model to be estimated."""
         # Coefficients that stay as they are belong to the model before.
         fixed = self.fixed & set(INTRINSIC_NAMES)
-        return replace(self, lens=Distortion(model), free_lens=model != "none", fixed=fixed, restraint=None)
+        return replace(
+            self, distortion=Distortion(model), free_distortion=model != "none", fixed=fixed, restraint=None
+        )
 
     def with_seen_pixels(self) -> Problem:
         """The same problem with the pixels as they were seen, normalised as before."""
@@ -139,17 +142,17 @@ class Problem:
         """
         done = start.iterations if isinstance(start, Adjusted) else 0
         state = start.state if isinstance(start, Adjusted) else start
-        if self.free_lens and state.lens == "none":
+        if self.free_distortion and state.model == "none":
             pinhole = self._adjusted(state, _PINHOLE_STEPS)
             done += pinhole.iterations
-            model = self.lens.model
-            state = replace(pinhole.state, lens=model, k=pinhole_coefficients(model))
+            model = self.distortion.model
+            state = replace(pinhole.state, model=model, k=pinhole_coefficients(model))
         adjusted = self._adjusted(state, max_iterations)
         return replace(adjusted, iterations=done + adjusted.iterations)
 
     def _adjusted(self, state: CameraState, steps: int) -> Adjusted:
         batches = self.views.batches
-        if state.lens == "none":
+        if state.model == "none":
             return adjust(batches, state, self.free, self.free_poses, steps)
         return adjust(batches, state, self.free_camera, self.free_poses, steps, self.restraint)
 
@@ -168,7 +171,7 @@ def problem_for(
     intrinsics: Intrinsics | None = None,
     extrinsics: Mapping[str, Pose] | None = None,
     skew: bool = True,
-    lens: Distortion | None = None,
+    distortion: Distortion | None = None,
 ) -> Problem:
     """Check what is given against what the problem type needs.
 
@@ -178,7 +181,7 @@ def problem_for(
     type : int
     image_center, intrinsics, extrinsics, skew
         As for `calibrate`.
-    lens : Distortion, optional
+    distortion : Distortion, optional
         The distortion: given with type 3, else the model to be estimated.
 
     Raises
@@ -223,25 +226,27 @@ def problem_for(
         fixed = set(INTRINSIC_NAMES)
     elif type == 4:
         poses = _poses(points, extrinsics)
-    lens = lens or Distortion()
-    free_lens = type != 3 and lens.model != "none"
+    distortion = distortion or Distortion()
+    free_distortion = type != 3 and distortion.model != "none"
     if type == 3:
-        fixed |= set(coefficient_names(lens.model))
-    given = type, entries, free, poses, frozenset(fixed), intrinsics, lens, free_lens
-    return Problem(points, arrange(points if free_lens else _undistorted(points, lens, entries)), *given)
+        fixed |= set(coefficient_names(distortion.model))
+    given = type, entries, free, poses, frozenset(fixed), intrinsics, distortion, free_distortion
+    return Problem(
+        points, arrange(points if free_distortion else _undistorted(points, distortion, entries)), *given
+    )
 
 
 def _arranged(points: Correspondences, problem: Problem) -> Views:
-    if problem.free_lens:
+    if problem.free_distortion:
         return arrange(points)
-    return arrange(_undistorted(points, problem.lens, problem.entries))
+    return arrange(_undistorted(points, problem.distortion, problem.entries))
 
 
-def _undistorted(points: Correspondences, lens: Distortion, entries: Array) -> Correspondences:
+def _undistorted(points: Correspondences, distortion: Distortion, entries: Array) -> Correspondences:
     """Points without a given distortion."""
-    if lens.is_identity:
+    if distortion.is_identity:
         return points
-    pixels = undistorted_pixels(lens, intrinsic_matrix(entries), points.pixels)
+    pixels = undistorted_pixels(distortion, intrinsic_matrix(entries), points.pixels)
     lost = ~np.isfinite(pixels[:, 0])
     if lost.any():
         row = int(np.argmax(lost))

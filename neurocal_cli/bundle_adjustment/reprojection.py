@@ -30,12 +30,12 @@ __all__ = [
 
 POSE = slice(5, 11)  # omega, tau
 _OMEGA, _TAU = slice(5, 8), slice(8, 11)
-_LENS = 11  # first column of the coefficients of the distortion
+_COEFFICIENTS = 11  # first column of the coefficients of the distortion
 
 
 def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
     """Columns of what all views share: the entries of A, then the coefficients."""
-    return np.concatenate([np.arange(5), _LENS + np.arange(n_coefficients)])
+    return np.concatenate([np.arange(5), _COEFFICIENTS + np.arange(n_coefficients)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ class CameraState:
         A11, A12, A22, A13, A23 of the camera that all views share, or of a camera for each.
     R : (V, 3, 3) array
     t : (V, 3) array
-    lens : str
+    model : str
         Distortion model, one of `distortion.MODELS`.
     k : (K,) or (V, K) array
         Its coefficients, the same for all views or each view's own.
@@ -57,13 +57,13 @@ class CameraState:
     entries: Array
     R: Array
     t: Array
-    lens: str = "none"
+    model: str = "none"
     k: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def distortion(self) -> Distortion:
         """The distortion that all views share."""
-        return Distortion(self.lens, self.k)
+        return Distortion(self.model, self.k)
 
     def moved(self, by_camera: Array, by_pose: Array) -> CameraState:
         """The state after a step; by_camera (1 or V, 5 + K), by_pose (V, 6) with omega and tau."""
@@ -91,7 +91,7 @@ def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDA
         Whether all the view's points have positive depth and lie where the distortion is monotonic.
     """
     n_batches, n = len(batches.view), batches.local.shape[2]
-    width = _LENS + len(coefficient_names(state.lens)) + 1
+    width = _COEFFICIENTS + len(coefficient_names(state.model)) + 1
     by_batch = np.empty((n_batches, width, width))
     sensible = np.empty(n_batches, dtype=bool)
     buffer = batches.memory(width)
@@ -112,7 +112,7 @@ def residuals(batches: PointBatches, state: CameraState) -> Array:
         view = batches.view[chunk]
         Xc = state.R[view] @ batches.local[chunk] + state.t[view][:, :, None]
         x, y = Xc[:, 0] / Xc[:, 2], Xc[:, 1] / Xc[:, 2]
-        u, v = image_points(state.entries[0], state.lens, state.coefficients(view), x, y)
+        u, v = image_points(state.entries[0], state.model, state.coefficients(view), x, y)
         out[chunk, 0] = batches.pixels[chunk, 0] - u
         out[chunk, 1] = batches.pixels[chunk, 1] - v
     return out
@@ -139,7 +139,7 @@ def predicted_pixels(
     X, Y, Z = ((state.R[view] @ world[..., None])[..., 0] + state.t[view]).T
     in_front = np.asarray(Z > 0)
     depth = np.where(in_front, Z, np.nan)
-    u, v = image_points(state.entries[0], state.lens, state.k, X / depth, Y / depth)
+    u, v = image_points(state.entries[0], state.model, state.k, X / depth, Y / depth)
     return np.column_stack([u, v]), in_front
 
 
@@ -156,8 +156,8 @@ def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Ar
     Xc = Y + state.t[view][:, :, None]
     by_omega, by_point = out[:, _OMEGA], out[:, _TAU]
     u, v, valid = project_with_jacobian(
-        entries, state.lens, state.coefficients(view), (Xc[:, 0], Xc[:, 1], Xc[:, 2]),
-        out[:, :5], by_point, out[:, _LENS:-1],
+        entries, state.model, state.coefficients(view), (Xc[:, 0], Xc[:, 1], Xc[:, 2]),
+        out[:, :5], by_point, out[:, _COEFFICIENTS:-1],
     )  # fmt: skip
     product = np.empty(by_omega[:, 0].shape)
     for n, (i, j) in enumerate(((1, 2), (2, 0), (0, 1))):

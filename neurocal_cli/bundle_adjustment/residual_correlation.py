@@ -1,6 +1,6 @@
 """Whether residuals are noise: neighbours in an image know nothing of each other.
 
-A lens model that is too simple, a board that is not flat, points that are not where they are said to
+A distortion model that is too simple, a board that is not flat, points that are not where they are said to
 be: all leave residuals that are alike in neighbouring points. Noise does not.
 """
 

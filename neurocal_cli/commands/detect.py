@@ -169,7 +169,7 @@ def _examined(
     jobs: int | None,
 ) -> list[tuple[str, Outcome]]:
     """Outcomes of all images, with the names of their views."""
-    from neurocal_cli.detection.batch import Task, default_jobs, examine_all
+    from neurocal_cli.detection.batch import DetectionOptions, default_jobs, detect_files
     from neurocal_cli.io.image_paths import find_images, view_names
 
     paths = find_images(words)
@@ -177,12 +177,12 @@ def _examined(
     if overlay is not None:
         _check_overlay(overlay, paths)
     strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
-    task = Task(
+    wanted = DetectionOptions(
         board, "vertices" if points == "vertices" else "midpoints", gamma, overlay is not None, strict
     )
     outcomes = []
     with ProgressBar() as progress:
-        for outcome in examine_all(paths, task, jobs or default_jobs(len(paths))):
+        for outcome in detect_files(paths, wanted, jobs or default_jobs(len(paths))):
             outcomes.append(outcome)
             progress(f"{len(outcomes)} of {len(paths)} images", len(outcomes) / len(paths))
     return list(zip(names, outcomes, strict=True))

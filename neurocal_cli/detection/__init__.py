@@ -1,8 +1,25 @@
-"""From images to points: chessboards found, and the mid-points of their square edges measured.
+"""From images to points: find chessboards, and measure the mid-points of their square edges.
 
-Data flows one way: `finding` turns an image into grids of vertices known to a fraction of a pixel,
-`measuring` fits the pixels around every edge or vertex of a grid (`fitting`), `identity` tells which point of
-which board each one is.
+Data flows one way, from an image to mid-points with covariances:
+
+==========================================  ===========================================================
+Step                                        Module
+==========================================  ===========================================================
+image -> levels of a pyramid                `finding.levels`
+-> saddle points of the brightness          `finding.saddles` (`finding.subpixel`)
+-> links along edges -> seeds               `finding.links`, `finding.seeds`
+-> lattices that grow                       `finding.from_links`, `finding.grow` (`finding.lattice`,
+                                            `finding.predict`, `finding.vertex_check`)
+-> grids, one for each plane                `finding.grids` (`finding.folds`, `overlaps`, `merge`, `accept`,
+                                            `stretch`)
+-> identity: the board's coordinates        `identity.identify` (`ends`, `trim`, `placement`,
+                                            `linear_camera`)
+-> edge fits, each to all its pixels        `fitting.grid_fit` (`initial_fit`, `edge_fit`, `edge_profile`,
+                                            `common_parameters`, `fit_quality`)
+-> smooth map from grid to pixels           `fitting.smooth_map`, `fitting.map_fit`, `map_selection`
+-> mid-points or vertices with covariance   `measuring`
+-> labelled points of an image              `detect`; of many images `batch`, drawn by `overlay`
+==========================================  ===========================================================
 """
 
 from __future__ import annotations

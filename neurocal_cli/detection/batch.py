@@ -20,15 +20,15 @@ from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.io.images import Image, encode_png, read_image
 
-__all__ = ["Outcome", "Task", "default_jobs", "examine", "examine_all", "keep_memory"]
+__all__ = ["DetectionOptions", "Outcome", "default_jobs", "detect_file", "detect_files", "keep_memory"]
 
-_WORTH_A_PROCESS = 4  # images; fewer are done before another process has started
+_WORTH_A_PROCESS = 4  # images; fewer take less time than the start of a process
 _KEPT = 31 << 20  # bytes; glibc learns nothing from blocks of 32 MiB and more
 
 
 @dataclass(frozen=True)
-class Task:
-    """What to look for in the images.
+class DetectionOptions:
+    """What to detect, and how.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Task:
     overlay : bool
         Whether to draw what was found.
     strict : bool
-        Let unexpected errors pass instead of making them the problem of one image.
+        Raise unexpected errors instead of reporting them as the problem of one image.
     """
 
     board: Board
@@ -50,7 +50,7 @@ class Task:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """What came of one image file: a detection, or a problem in one line.
+    """Result of one image file: a detection, or a problem in one line.
 
     Attributes
     ----------
@@ -59,9 +59,9 @@ class Outcome:
     problem : str
         Empty if there is a detection.
     notes : tuple of str
-        What was done to the image that a user may not expect.
+        Remarks for the user on the image and its detection.
     overlay : bytes, optional
-        A PNG of what was found; also where that was not the board.
+        A PNG, also of images without the board.
     """
 
     path: str
@@ -72,14 +72,14 @@ class Outcome:
 
 
 def default_jobs(images: int) -> int:
-    """Number of processes that is worth while."""
+    """Number of processes for a number of images."""
     usable = getattr(os, "sched_getaffinity", None)
     cores = len(usable(0)) if usable else os.cpu_count() or 1
     return max(1, min(cores, images // _WORTH_A_PROCESS))
 
 
-def examine_all(paths: Sequence[str], task: Task, jobs: int = 1) -> Iterator[Outcome]:
-    """Examine image files; yields their outcomes in the order of the paths.
+def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1) -> Iterator[Outcome]:
+    """Detect boards in image files; yields outcomes in the order of the paths.
 
     Parameters
     ----------
@@ -92,54 +92,54 @@ def examine_all(paths: Sequence[str], task: Task, jobs: int = 1) -> Iterator[Out
     if jobs <= 1:
         keep_memory()
         for path in paths:
-            yield examine(path, task)
+            yield detect_file(path, options)
         return
     # Started afresh: a fork of a process whose libraries have threads may hang.
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, _begin)
+    pool = ProcessPoolExecutor(jobs, context, _start_worker)
     try:
-        yield from pool.map(examine, paths, [task] * len(paths))
+        yield from pool.map(detect_file, paths, [options] * len(paths))
     except BrokenProcessPool as error:
         raise NeurocalError("a process was stopped, perhaps for lack of memory; use --jobs 1") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def examine(path: str, task: Task) -> Outcome:
-    """Examine one image file; whatever is wrong with it becomes the outcome's problem."""
+def detect_file(path: str, options: DetectionOptions) -> Outcome:
+    """Detect the board in one image file; errors become the outcome's problem."""
     try:
         image = read_image(path)
     except NeurocalError as error:
         return Outcome(path, problem=str(error))
     try:
-        return _detected(path, image, task)
+        return _detected(path, image, options)
     except NeurocalError as error:
         problem = str(error)
     except MemoryError:
         problem = "not enough memory; scale the image down"
     except Exception as error:  # one image must not cost the user all the others
-        if task.strict:
+        if options.strict:
             raise
         problem = f"internal error: {type(error).__name__}: {error}; run with NEUROCAL_DEBUG=1 to see where"
     return Outcome(path, problem=f"{image.source}: {problem}", notes=image.notes)
 
 
-def _detected(path: str, image: Image, task: Task) -> Outcome:
-    grids = find_grids(image.grey, wanted_sizes(task.board))
+def _detected(path: str, image: Image, options: DetectionOptions) -> Outcome:
+    grids = find_grids(image.grey, wanted_sizes(options.board))
     overlay: bytes | None = None
     try:
-        found = detect_points(image.grey, task.board, task.points, task.gamma, grids)
+        found = detect_points(image.grey, options.board, options.points, options.gamma, grids)
     except NeurocalError as error:
-        if task.overlay:
+        if options.overlay:
             overlay = encode_png(draw_failure(image.grey, grids, str(error)))
         return Outcome(path, None, f"{image.source}: {error}", image.notes, overlay)
-    if task.overlay:
+    if options.overlay:
         overlay = encode_png(draw_detection(image.grey, found))
-    return Outcome(path, found, "", (*image.notes, *_remarks(found, task.board)), overlay)
+    return Outcome(path, found, "", (*image.notes, *_remarks(found, options.board)), overlay)
 
 
 def _remarks(found: Detection, board: Board) -> Iterator[str]:
-    """What to note of a detection that is less than it might be; the same words for all images."""
+    """Remarks on an incomplete detection; the same texts for all images."""
     seen = {one.plane.name for one in found.located}
     names = [plane.name for plane in board.planes if plane.name not in seen]
     if names:
@@ -149,17 +149,17 @@ def _remarks(found: Detection, board: Board) -> Iterator[str]:
 
 
 def keep_memory() -> None:
-    """Let the C library keep the memory of one image for the next.
+    """Make the C library keep the memory of one image for the next.
 
-    glibc gives blocks back to the system, which costs a page fault for every 4 KiB of the next image,
-    until it has seen a large block freed once: from then on it keeps twice as much (malloc's dynamic
-    threshold). Other libraries are not moved by it; nothing is ever written into the block.
+    glibc returns large blocks to the system, which costs a page fault for every 4 KiB of the next image,
+    until a large block has been freed once: from then on it keeps twice as much (malloc's dynamic
+    threshold). Other C libraries are not affected. Nothing is written into the block.
     """
     np.empty(_KEPT, dtype=np.uint8)
 
 
-def _begin() -> None:
-    """Make a process one of many: an interrupt is its parent's to handle, and each has one core."""
+def _start_worker() -> None:
+    """Prepare a worker process: its parent handles interrupts, and it uses one core."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     cv2.setNumThreads(1)
     keep_memory()

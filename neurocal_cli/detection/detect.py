@@ -1,4 +1,7 @@
-"""From one image to labelled points, and from several images to what a calibration learns from."""
+"""From one image to labelled points, and from several images to the points of a calibration.
+
+`detect_points` runs all steps on one image: `find_grids`, `identify`, `measure`, and labels.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Located, identify
-from neurocal_cli.detection.identity.words import NoBoardError
+from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
@@ -23,9 +26,9 @@ __all__ = ["Detection", "Labels", "Points", "detect_points", "gather", "label", 
 
 Points = Literal["midpoints", "vertices"]
 
-_FEWEST = 8  # points; fewer tell hardly more than where the board is
-_STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # from a point's index to the other end of its edge, by kind
-_PREFIXES = ("h:", "v:", "")  # of its id, by kind
+_FEWEST = 8  # points; fewer determine hardly more than the pose
+_STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: from a point's index to the other end of its edge
+_PREFIXES = ("h:", "v:", "")  # by kind: of a point's id
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +81,13 @@ class Detection:
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
     across : (N, 2) array or None
-        Direction in which each point was measured by itself: of mid-points across the edge, None for
-        vertices.
+        Unit vector across the edge of each mid-point, the direction in which it has a measurement of its
+        own; None for vertices.
     image_size : (width, height) [px]
     located : tuple of Located
-        The grids that were found on the board.
+        The grids that belong to the board.
     measured : tuple of Measured
-        What was measured on each of them.
+        The points measured on each of them.
     warnings : tuple of str
     """
 
@@ -100,7 +103,7 @@ class Detection:
 
     @property
     def rejected(self) -> int:
-        """Number of points whose fit was not good enough."""
+        """Number of points rejected for their fits."""
         return sum(measured.rejected for measured in self.measured)
 
 
@@ -121,14 +124,14 @@ def detect_points(
     points : {"midpoints", "vertices"}
         Mid-points of the squares' edges, or the inner vertices.
     gamma : float, optional
-        Of the camera, where known: pixels are ``light^(1 / gamma)``.
+        Of the camera, if known: pixels are ``light^(1 / gamma)``.
     grids : list of Grid, optional
-        What `find_grids` found in the image, if that is known already.
+        Result of `find_grids` for the image, if already computed.
 
     Raises
     ------
     NoBoardError
-        The image does not show the board, or not enough of it; with the reason.
+        The image does not show the board, or not enough of it. The message says why.
     """
     found = find_grids(image, wanted_sizes(board)) if grids is None else grids
     identified = identify(board, found, image)
@@ -155,7 +158,7 @@ def detect_points(
 
 
 def wanted_sizes(board: Board) -> list[tuple[int, int]]:
-    """What `find_grids` need not look behind: a board of one plane."""
+    """Size of a board of one plane, for `find_grids`."""
     return [(plane.cols, plane.rows) for plane in board.planes] if len(board.planes) == 1 else []
 
 
@@ -167,12 +170,12 @@ def _check_enough(measured: Iterable[Measured]) -> None:
 
 
 def _directions(measured: Measured) -> Array:
-    """Across each edge, (N, 2); to a millionth, which is more than is known of them."""
+    """(N, 2) unit vectors across the edges, rounded to 1e-6, far below their errors."""
     return np.zeros((0, 2)) if measured.across is None else np.round(measured.across, 6) + 0.0
 
 
 def _sound(measured: Measured) -> Measured:
-    """Without points whose place or covariance is no number to calibrate with."""
+    """Reject points whose coordinates or covariances are not finite or not positive definite."""
     suu, suv, svv = measured.covariance.T
     with np.errstate(invalid="ignore", over="ignore"):
         good = (suu > 0) & (svv > 0) & (suu * svv > suv**2) & np.isfinite(suu * svv)
@@ -186,7 +189,7 @@ def _sound(measured: Measured) -> Measured:
 
 
 def label(located: Located, measured: Measured) -> Labels:
-    """Which points of a plane the measured points of a grid are.
+    """Label the measured points of a grid with the points of its plane.
 
     Parameters
     ----------
@@ -204,7 +207,7 @@ def label(located: Located, measured: Measured) -> Labels:
 
 
 def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Correspondences:
-    """Points of several images of one camera as one set.
+    """Join the points of several images of one camera.
 
     Parameters
     ----------
@@ -215,8 +218,8 @@ def gather(detections: Mapping[str, Detection], unit: str = "mm") -> Corresponde
     Raises
     ------
     InputError
-        No image, or images of different size: one camera has one size, and another camera's points
-        belong in a calibration of their own.
+        No image, or images of different size: one camera has one size, and each camera needs a
+        calibration of its own.
     """
     if not detections:
         raise InputError("there are no images with points; give at least one")

@@ -1,8 +1,8 @@
-"""What is found and what is measured: the vertices of a chessboard, its edges' mid-points.
+"""Results of finding and measuring: the vertices of a chessboard, and the mid-points of its edges.
 
 Grid coordinates are whole numbers (c, r), c along a row of vertices and r along a column, oriented
-like the image: turning from the direction of growing c to that of growing r is turning from u to v.
-Where (0, 0) lies and which side is c is arbitrary here; `identity` settles it.
+like the image: growing c turns to growing r as u turns to v. The origin and the choice of c are arbitrary
+here; `identity` finds those of the board.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ EDGE_H, EDGE_V, VERTEX = 0, 1, 2
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """Vertices of one chessboard, as far as they are seen.
+    """Vertices of one chessboard, as far as they were found.
 
     Attributes
     ----------
     pixels : (rows, cols, 2) array [px]
-        Of vertex (c, r) at ``[r, c]``; nan where it was not found. The first and last row and column
+        Of vertex (c, r) at ``[r, c]``; NaN where it was not found. The first and last row and column
         each hold at least one vertex.
     dark : int
         0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where ``c + r + dark`` is even.
@@ -39,7 +39,7 @@ class Grid:
 
     @property
     def seen(self) -> NDArray[np.bool_]:
-        """(rows, cols) which vertices were found."""
+        """(rows, cols) mask of the vertices that were found."""
         return np.isfinite(self.pixels[..., 0])
 
     @property
@@ -62,14 +62,14 @@ class Measured:
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
     across : (N, 2) array or None
-        Unit vector across each mid-point's edge, in which it was measured by itself; None for vertices.
+        Unit vectors across the edges of mid-points, the direction of their own measurement; None for
+        vertices.
     vertices : (rows, cols, 2) array [px]
-        The grid's vertices after refinement, nan where not seen or not fitted.
+        The grid's vertices after refinement, NaN where not found or not fitted.
     rejected : int
-        Fits that failed the quality gate and are left out.
+        Number of fits that were rejected.
     polarity : float [px]
-        How far the edges were displaced towards the dark side by gamma, ink and blooming before
-        that was taken off.
+        Displacement of the edges towards the dark side by gamma, ink and blooming, which has been removed.
     """
 
     kind: NDArray[np.int64]

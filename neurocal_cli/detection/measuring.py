@@ -1,9 +1,10 @@
-"""Mid-points or vertices of a found grid, measured as well as the pixels' noise allows.
+"""Mid-points or vertices of a grid, measured to the limit that the noise of the pixels sets.
 
-Every edge is fitted with all the pixels around it. A smooth map from grid to pixels through all the
-edges tells the mid-points' coordinates along the edges, and how the edges are bent; across, each
-mid-point has only its own edge's word. What moves all edges towards the dark or the light side shows
-as an alternating shift between edges and map, and is taken off.
+In: an image and a grid with vertices known to half a pixel. Out: `Measured` points with covariances. Every
+edge is fitted to all the pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
+coordinates of the mid-points along their edges, and the curvature of the edges. Across its edge, a mid-point
+is measured by that edge alone. Gamma, ink spread and blooming displace all edges towards the dark or the
+light side: an alternating shift between edges and map, which is estimated and removed.
 """
 
 from __future__ import annotations
@@ -13,21 +14,21 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.board import Board, Fitted, fit_all_vertices, fit_board
-from neurocal_cli.detection.fitting.box import sharp_profile
-from neurocal_cli.detection.fitting.edges import OFFSET, TILT
-from neurocal_cli.detection.fitting.newton import BLUR
-from neurocal_cli.detection.fitting.profile import response
-from neurocal_cli.detection.fitting.robust import median
-from neurocal_cli.detection.fitting.vertices import FIRST, SECOND
+from neurocal_cli.detection.fitting.batched_newton import BLUR
+from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
+from neurocal_cli.detection.fitting.edge_profile import response
+from neurocal_cli.detection.fitting.grid_fit import GridFit, GridImage, fit_grid, fit_grid_vertices
+from neurocal_cli.detection.fitting.pixel_box import sharp_profile
+from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
+from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = ["measure"]
 
 _ROUNDING = 1 / 12  # DN^2
-_EXACT, _TINY = 1e-5, 1e-30  # relative rounding of the fits' own numbers, for images without noise
-_FAR, _PLACES = 3.0, 601  # sigma, and places where the middle level is looked for
+_EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance of images without noise
+_FAR, _PLACES = 3.0, 601  # sigma on both sides of an edge and samples, to find its middle level
 
 
 def measure(
@@ -36,7 +37,7 @@ def measure(
     points: Literal["midpoints", "vertices"] = "midpoints",
     gamma: float | None = None,
 ) -> Measured:
-    """Measure the mid-points of all edges between seen vertices, or the vertices.
+    """Measure the mid-points of all edges between known vertices, or the vertices.
 
     Parameters
     ----------
@@ -46,31 +47,31 @@ def measure(
         Vertices known to about half a pixel.
     points : {"midpoints", "vertices"}
     gamma : float, optional
-        The image is light^(1 / gamma), which is undone first. Without, whatever the response does to
-        the edges is measured.
+        The image is ``light^(1 / gamma)``, which is inverted first. Without it, the effect of the response
+        on the edges is estimated.
 
     Returns
     -------
     measured : Measured
-        With points that failed the quality gate left out.
+        Without the points whose fits were rejected.
     """
     light = image if gamma is None else _linear(image, gamma)
     whole = np.issubdtype(light.dtype, np.integer)
     floor = _ROUNDING if whole else (_EXACT * float(np.abs(light).max())) ** 2 + _TINY
-    board = Board.of(light, grid, floor)
-    if len(board.edges.index) == 0:
+    grid_image = GridImage.of(light, grid, floor)
+    if len(grid_image.edges.index) == 0:
         return _nothing(grid)
-    fitted = fit_board(board)
+    fitted = fit_grid(grid_image)
     vertices = np.full(grid.pixels.shape, np.nan)
     seen = grid.seen
     vertices[seen] = fitted.map.map.at(np.argwhere(seen)[:, ::-1].astype(float))
     if points == "vertices":
-        return _vertices(board, fitted, vertices)
-    pixels, covariance = _midpoints(board, fitted)
+        return _vertices(grid_image, fitted, vertices)
+    pixels, covariance = _midpoints(grid_image, fitted)
     good = fitted.good
     return Measured(
-        kind=np.where(board.edges.vertical, EDGE_V, EDGE_H)[good].astype(np.int64),
-        index=board.edges.index[good],
+        kind=np.where(grid_image.edges.vertical, EDGE_V, EDGE_H)[good].astype(np.int64),
+        index=grid_image.edges.index[good],
         pixels=pixels[good],
         covariance=covariance[good],
         across=fitted.lines.normal[good],
@@ -87,16 +88,16 @@ def _nothing(grid: Grid) -> Measured:
     return Measured(index[:, 0], index, none.reshape(0, 2), none.reshape(0, 3), None, vertices, 0, 0.0)
 
 
-def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
+def _midpoints(grid_image: GridImage, fitted: GridFit) -> tuple[Array, Array]:
     """Pixels (E, 2) and covariances (E, 3): along the edges from the map, across from the edges."""
     lines, fit, mapped = fitted.lines, fitted.fit, fitted.map
-    centre = board.edges.centre
+    centre = grid_image.edges.centre
     s = ((mapped.map.at(centre) - lines.middle) * lines.tangent).sum(axis=1)
     d = fit.values[:, OFFSET] + fit.values[:, TILT] * s / (0.5 * lines.length)
     d += 0.5 * lines.curvature * s * s - mapped.shift[0]
     pixels = lines.middle + s[:, None] * lines.tangent + d[:, None] * lines.normal
     along = mapped.map.variance(centre, lines.tangent) * mapped.excess
-    across = fit.covariance[:, OFFSET, OFFSET] * fit.unsettled * min(mapped.excess, 1.0)
+    across = fit.covariance[:, OFFSET, OFFSET] * fit.variance_growth * min(mapped.excess, 1.0)
     across += mapped.shift_variance[0] + fitted.unevenness
     (tu, tv), (nu, nv) = lines.tangent.T, lines.normal.T
     covariance = np.stack(
@@ -110,30 +111,30 @@ def _midpoints(board: Board, fitted: Fitted) -> tuple[Array, Array]:
     return pixels, covariance
 
 
-def _polarity(fitted: Fitted) -> float:
-    """How far towards the dark side [px] the middle between the levels lies from the undisturbed edge."""
+def _polarity(fitted: GridFit) -> float:
+    """Displacement [px] of the middle between the levels from the true edge, towards the dark side."""
     z = np.linspace(-_FAR, _FAR, _PLACES)[None]
-    sigma = median(fitted.fit.values[:, BLUR])
+    sigma = upper_median(fitted.fit.values[:, BLUR])
     half = None if fitted.shape.half is None else fitted.shape.half[:1]
     edge = sharp_profile(z, np.array([[sigma]]), fitted.shape.tails[:1], half)[0]
-    light = response(edge, fitted.shape.bend)[0][0]
+    light = response(edge, fitted.shape.nonlinearity)[0][0]
     after = max(int(np.argmax(light > 0)), 1)
     share = light[after] / (light[after] - light[after - 1])
     zero = z[0, after] - share * (z[0, 1] - z[0, 0])
     return -float(fitted.map.shift[0]) - float(zero) * sigma
 
 
-def _vertices(board: Board, fitted: Fitted, vertices: Array) -> Measured:
-    fit, (first, second), good = fit_all_vertices(board, fitted)
+def _vertices(grid_image: GridImage, fitted: GridFit, vertices: Array) -> Measured:
+    fit, (first, second), good = fit_grid_vertices(grid_image, fitted)
     # Where the two lines cross: n1 . p = offset1, n2 . p = offset2.
     inverse = np.linalg.inv(np.stack([first.normal, second.normal], axis=1))
     offsets = fit.values[:, [FIRST, SECOND]]
     pixels = first.middle + (inverse @ offsets[:, :, None])[:, :, 0]
-    spread = fit.covariance[:, [[FIRST], [SECOND]], [FIRST, SECOND]] * fit.unsettled[:, None, None]
+    spread = fit.covariance[:, [[FIRST], [SECOND]], [FIRST, SECOND]] * fit.variance_growth[:, None, None]
     spread = inverse @ spread @ inverse.swapaxes(1, 2)
     uneven = fitted.unevenness
     covariance = np.stack([spread[:, 0, 0] + uneven, spread[:, 0, 1], spread[:, 1, 1] + uneven], axis=-1)
-    index = np.argwhere(board.grid.seen)[:, ::-1]
+    index = np.argwhere(grid_image.grid.seen)[:, ::-1]
     vertices[tuple(index[:, ::-1].T)] = np.where(good[:, None], pixels, np.nan)
     return Measured(
         kind=np.full(int(good.sum()), VERTEX, dtype=np.int64),
@@ -148,7 +149,7 @@ def _vertices(board: Board, fitted: Fitted, vertices: Array) -> Measured:
 
 
 def _linear(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:
-    """Light that made an image, in units of the image's own full scale."""
+    """The image linearised, in units of its own full scale."""
     if np.issubdtype(image.dtype, np.integer):
         full = float(np.iinfo(image.dtype).max)  # type: ignore[type-var]
         table = full * (np.arange(full + 1) / full) ** gamma

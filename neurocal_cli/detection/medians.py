@@ -1,4 +1,7 @@
-"""Medians of a few numbers, without the wrappers that cost numpy's own ten times as long as the sorting."""
+"""Medians and quantiles of a few hundred numbers.
+
+NumPy's own functions take about ten times as long for so few, and detection calls them often.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +9,19 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["median", "quantile"]
+__all__ = ["CHI2_MEDIAN", "MAD_TO_SIGMA", "median", "quantile", "upper_median"]
+
+MAD_TO_SIGMA = 1.4826  # standard deviation over the median absolute deviation, of normal numbers
+CHI2_MEDIAN = 0.455  # of chi-squared with one degree of freedom
 
 
 def median(x: Array) -> float:
-    """The median of the known ones among numbers of any shape; nan where none is."""
+    """The median of an array of any shape, without its NaNs; NaN where nothing is left."""
     return quantile(x, 0.5)
 
 
 def quantile(x: Array, share: float) -> float:
-    """The number that a share of the known ones lie below, found linearly; nan where none is known."""
+    """A quantile of an array, without its NaNs, by linear interpolation; NaN where nothing is left."""
     ordered = x.flatten()
     ordered.sort()  # nan comes last
     count = len(ordered) - int(np.count_nonzero(np.isnan(ordered)))
@@ -25,3 +31,12 @@ def quantile(x: Array, share: float) -> float:
     low = int(place)
     high = min(low + 1, count - 1)
     return float(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
+
+
+def upper_median(x: Array) -> float:
+    """The median, of an even count the upper middle value; NaN for an empty array."""
+    flat = x.flatten()
+    if not len(flat):
+        return float("nan")
+    flat.partition(len(flat) // 2)
+    return float(flat[len(flat) // 2])

@@ -1,4 +1,4 @@
-"""Pictures of what was found, to judge at a glance: points, labels, residuals over the dimmed image."""
+"""Pictures of detections: points, labels and residuals, drawn over the dimmed image."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from neurocal_cli.detection.detect import Detection, label
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Located
-from neurocal_cli.detection.residuals import residuals
+from neurocal_cli.detection.plane_residuals import plane_residuals
 from neurocal_cli.geometry import Array
 
 __all__ = ["draw_detection", "draw_failure"]
@@ -55,8 +55,8 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     picture : (height, width, 3) uint8 array
         Red, green, blue.
     """
-    misses = [residuals(measured) for measured in detection.measured]
-    lengths = np.concatenate([np.hypot(*miss.T) for miss in misses])
+    residuals = [plane_residuals(measured) for measured in detection.measured]
+    lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals])
     square = min(_square(one.grid) for one in detection.located)
     scale = _enlargement(lengths, square)
     lines = [
@@ -65,14 +65,14 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
         _legend(detection),
     ]
     canvas = _Canvas(grey, lines)
-    for located, measured, miss in zip(detection.located, detection.measured, misses, strict=True):
-        _draw_points(canvas, measured, label(located, measured).kind, miss * scale)
+    for located, measured, residual in zip(detection.located, detection.measured, residuals, strict=True):
+        _draw_points(canvas, measured, label(located, measured).kind, residual * scale)
         _draw_frame(canvas, located, measured)
     return canvas.picture
 
 
 def draw_failure(grey: NDArray[np.generic], grids: Sequence[Grid], problem: str) -> Picture:
-    """Draw the grids that were found where they were not the board, and say why.
+    """Draw the grids found in an image without the board, with the reason.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ def _draw_points(canvas: _Canvas, measured: Measured, kinds: NDArray[np.int64], 
 
 
 def _draw_frame(canvas: _Canvas, located: Located, measured: Measured) -> None:
-    """Origin, axes and the ids of the corners, at the vertices that were seen."""
+    """Origin, axes and the ids of the outermost vertices found."""
     pixels = np.where(np.isfinite(measured.vertices), measured.vertices, located.grid.pixels)
     rows, columns = np.nonzero(np.isfinite(pixels[..., 0]))
     places = np.rint(located.placement.apply(np.stack([columns, rows], axis=-1))).astype(int)
@@ -171,13 +171,13 @@ class _Canvas:
     def _at(self, pixel: ArrayLike) -> tuple[int, int]:
         """Place in the picture, in units of 1/16 px; the middle of a pixel stays the middle."""
         u, v = (np.asarray(pixel) + 0.5) * self.scale - 0.5
-        limit = 1 << 24  # a wild residual must not overflow
+        limit = 1 << 24  # against overflow by outliers
         u, v = np.clip([u, v + self.top], -limit >> _SHIFT, limit >> _SHIFT)
         return round(float(u) * (1 << _SHIFT)), round(float(v) * (1 << _SHIFT))
 
 
 def _dimmed(grey: NDArray[np.generic]) -> Picture:
-    """Grey values between 20 and 130, in steps of 5: less to store, and nothing to outshine the crosses."""
+    """Grey values between 20 and 130, in steps of 5: a smaller file, darker than the crosses."""
     step = max(1, max(grey.shape) // 500)
     low, high = np.percentile(grey[::step, ::step].astype(float), [1, 99])
     share = np.clip((grey.astype(np.float32) - low) / max(float(high - low), 1.0), 0, 1)

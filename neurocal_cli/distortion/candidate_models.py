@@ -24,7 +24,7 @@ from neurocal_cli.geometry import Array
 __all__ = ["Candidate", "falls_short", "fit_candidates", "supported", "worth"]
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
-# tests/test_lens_starts.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
+# tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
 # the tightest with which all of these end as they do; penalties and tests against 0 are chi-squared levels,
 # as said beside them.
 #
@@ -39,7 +39,7 @@ _BEHIND = 1.5  # times the squared error
 _LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
 _SPARE = 1.3  # equations for each unknown
-_WIDE = 0.5  # radius from which on a lens can be a fisheye's: 27 degrees off the axis
+_WIDE = 0.5  # radius from which on a model can be a fisheye's: 27 degrees off the axis
 _TOLD_APART = 4.0  # squared standard deviations, for each coefficient
 _LARGEST_TERM = 3.0  # of one coefficient at the farthest point; all terms together are about 1
 
@@ -186,8 +186,8 @@ class _Chain:
 
     def _fit(self, problem: Problem, state: CameraState, most: int = 4) -> Candidate | None:
         """None when it did not settle, or too little is left for it without a part of the data."""
-        model = problem.lens.model
-        start = replace(state, lens=model, k=_coefficients(state, model, self.reach, most))
+        model = problem.distortion.model
+        start = replace(state, model=model, k=_coefficients(state, model, self.reach, most))
         steps = _RATIONAL_STEPS if model == "rational" else _STEPS
         adjusted = problem.adjust(start, steps)
         if not adjusted.converged and model != "none":
@@ -202,11 +202,11 @@ class _Chain:
         else:
             lost = held_out_points(views, state, free, problem.free_poses, held)
         if not np.isfinite(lost).all():
-            if state.lens != "none":
+            if state.model != "none":
                 return None
             lost = np.full_like(lost, np.inf)
         cov = covariance(adjusted.normal, free, problem.free_poses, views.n_equations)
-        noise = _noise(problem.lens.model, state, self.reach, cov.entries)
+        noise = _noise(problem.distortion.model, state, self.reach, cov.entries)
         A = problem.matrix(state.entries[0])
         bad = where_not_monotonic(state.distortion, A, problem.points)
         return Candidate(problem, adjusted, lost, noise, bad, _determined(problem, state, cov))
@@ -228,8 +228,8 @@ def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate |
 def worth(views: Views, fitted: Collection[Candidate]) -> float:
     """What the number of residuals is worth, when neighbours are alike.
 
-    In the fit that is closest: what a lens that is too simple leaves is alike in neighbours, too, but tells
-    of the lens.
+    In the fit that is closest: what a model that is too simple leaves is correlated in neighbours, too, but
+    tells of the model.
     """
     if not fitted:
         return 1.0
@@ -271,29 +271,29 @@ def _terms(model: str, reach: float) -> Array:
 
 
 def _reach(views: Views, state: CameraState) -> float:
-    """Radius of the farthest point in normalised image coordinates, before the lens bends it."""
+    """Radius of the farthest point in normalised image coordinates, before distortion."""
     seen = (state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]
     return float((np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]).max())
 
 
 def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -> Array:
-    """Those of another model that bend nearly as this state's lens does, of a fisheye the first `most`."""
+    """Those of another model that distort nearly as this state does, of a fisheye the first `most`."""
     names = coefficient_names(model)
-    old = dict(zip(coefficient_names(state.lens), state.k.tolist(), strict=True))
-    fisheye, rational = model == "fisheye", state.lens == "rational" and model != "rational"
+    old = dict(zip(coefficient_names(state.model), state.k.tolist(), strict=True))
+    fisheye, rational = model == "fisheye", state.model == "rational" and model != "rational"
     if not fisheye and not rational:
         # Those of a fisheye mean something else.
-        return np.array([old.get(name, 0.0) if state.lens != "fisheye" else 0.0 for name in names])
-    # As far out as the points reach, by least squares: q (1 + k1 q^2 + k2 q^4 + ...) is the bent radius of
-    # the straight one r, where q is r or a fisheye's angle.
+        return np.array([old.get(name, 0.0) if state.model != "fisheye" else 0.0 for name in names])
+    # As far out as the points reach, by least squares: q (1 + k1 q^2 + k2 q^4 + ...) is the distorted
+    # radius of the undistorted one r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
     radial = [0.0 if name in ("p1", "p2") else k for name, k in old.items()]
-    bent = distort(state.lens, radial, r, np.zeros_like(r))[0]
+    distorted = distort(state.model, radial, r, np.zeros_like(r))[0]
     q = np.arctan(r) if fisheye else r
     of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][:most]
     powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)
-    if not np.isfinite(bent).all():  # beyond a pole
+    if not np.isfinite(distorted).all():  # beyond a pole
         return pinhole_coefficients(model)
-    found = np.linalg.lstsq(powers, bent - q, rcond=1e-6)[0]
+    found = np.linalg.lstsq(powers, distorted - q, rcond=1e-6)[0]
     new = {name: old[name] for name in ("p1", "p2") if rational} | dict(zip(of_radius, found, strict=True))
     return np.array([new.get(name, 0.0) for name in names])

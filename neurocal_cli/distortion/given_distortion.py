@@ -27,23 +27,23 @@ def check_distortion(solution: Solution) -> Solution:
         A distortion that is not monotonic inside the points, or inside the image whatever one does.
     """
     problem = solution.problem
-    lens = problem.lens
-    if lens.model == "none":
+    distortion = problem.distortion
+    if distortion.model == "none":
         return solution
-    if not problem.free_lens:
+    if not problem.free_distortion:
         problem = problem.with_seen_pixels()
-        start = replace(solution.state, lens=lens.model, k=lens.coefficients)
+        start = replace(solution.state, model=distortion.model, k=distortion.coefficients)
         adjusted = problem.adjust(replace(solution.adjusted, state=start))
         solution = replace(solution, problem=problem, adjusted=adjusted)
     state = solution.state
     where = where_not_monotonic(state.distortion, problem.matrix(state.entries[0]), problem.points)
     if where is None:
         return solution
-    if where == "image" and problem.free_lens and solution.shared is None:
+    if where == "image" and problem.free_distortion and solution.shared is None:
         found = fit_monotonic(problem, solution.adjusted)
         if found is not None:
             return replace(solution, problem=found[0], adjusted=found[1])
     raise DegenerateGeometryError(
-        f"the distortion model {lens.model} is not monotonic (maps two directions to one pixel) inside the "
-        f"{where}; choose another --distortion, or give points nearer to the image's corners"
+        f"the distortion model {distortion.model} is not monotonic (maps two directions to one pixel) inside "
+        f"the {where}; choose another --distortion, or give points nearer to the image's corners"
     )

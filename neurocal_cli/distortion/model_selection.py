@@ -108,12 +108,12 @@ def _views_can_spare_any(solution: Solution) -> bool:
     problem, adjusted = solution.problem, solution.adjusted
     if problem.views.n_views == 1 or not problem.free_camera.any():
         return False
-    free = problem.free_camera if adjusted.state.lens == problem.lens.model else problem.free
+    free = problem.free_camera if adjusted.state.model == problem.distortion.model else problem.free
     return bool(np.isfinite(held_out_views(adjusted.normal, free, problem.free_poses)).all())
 
 
 def _is_enough(pinhole: Candidate, views: Views, fitted: dict[str, Candidate]) -> bool:
-    """Whether neither a lens nor a camera for each view explains far more."""
+    """Whether neither a distortion nor a camera for each view explains far more."""
     lowest = min(candidate.cost for candidate in fitted.values())
     return pinhole.cost <= _FAR_BELOW * lowest + 1e-20 and not falls_short(views, [pinhole])
 

@@ -36,7 +36,7 @@ __all__ = ["MonotonicFit", "fit_monotonic", "normal_part", "where_not_monotonic"
 
 # Repeated by tests/test_monotonic_fit.py and, for the tie, tests/test_model_selection.py: lenses that are
 # not monotonic in unseen corners predict new views 5 to 16 % better with these.
-_BORDER = 17  # points along each side of the image at which the lens is checked
+_BORDER = 17  # points along each side of the image at which it is checked
 _FARTHEST = 100  # points looked at
 _SLACK = 0.005  # of a slope, that costs as much as one standard deviation of a residual
 _NODES = 48
@@ -74,7 +74,7 @@ class MonotonicFit:
     @_quietly
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
         """Derivatives (m, 5 + K) and what the slopes lack (m,)."""
-        slope, by_k = radial_slope(state.lens, state.k, self.radii)
+        slope, by_k = radial_slope(state.model, state.k, self.radii)
         lacking = np.maximum(self.least - slope, 0.0)
         rows = np.zeros((len(slope), 5 + len(state.k)))
         rows[:, 5:] = by_k * (lacking > 0)[:, None]
@@ -88,38 +88,40 @@ def normal_part(restraint: Restraint, state: CameraState, free: NDArray[np.bool_
     return rows.T @ rows, rows.T @ missing
 
 
-def where_not_monotonic(lens: Distortion, A: Array, points: Correspondences) -> str | None:
-    """Where a lens folds back: within the points, within the rest of the image, or nowhere.
+def where_not_monotonic(distortion: Distortion, A: Array, points: Correspondences) -> str | None:
+    """Where a distortion is not monotonic: within the points, within the rest of the image, or nowhere.
 
     The image is looked at where its size is known: at its corners, which nothing is farther out than,
-    and along its border where tangential terms may fold it elsewhere first. What a fisheye cannot see
-    because it lies beyond 90 degrees is no fold.
+    and along its border where tangential terms may turn it back elsewhere first. What a fisheye cannot
+    see because it lies beyond 90 degrees does not count.
     """
-    if lens.model == "none":
+    if distortion.model == "none":
         return None
     # The farthest points say it all.
     away = np.hypot(points.pixels[:, 0] - A[0, 2], points.pixels[:, 1] - A[1, 2])
     farthest = points.pixels[np.argsort(-away, kind="stable")[:_FARTHEST]]
     border = np.zeros((0, 2))
-    if points.image_size is not None and not (lens.model == "fisheye" and np.isinf(monotonic_radius(lens))):
-        border = _border(points.image_size, lens)
-    if _sees(lens, A, np.concatenate([farthest, border])):
+    if points.image_size is not None and not (
+        distortion.model == "fisheye" and np.isinf(monotonic_radius(distortion))
+    ):
+        border = _border(points.image_size, distortion)
+    if _sees(distortion, A, np.concatenate([farthest, border])):
         return None
-    return "image" if len(border) and _sees(lens, A, farthest) else "points"
+    return "image" if len(border) and _sees(distortion, A, farthest) else "points"
 
 
-def _border(image_size: tuple[int, int], lens: Distortion) -> Array:
+def _border(image_size: tuple[int, int], distortion: Distortion) -> Array:
     """Pixels along the image's border, or its corners; (N, 2)."""
-    tangential = "p1" in coefficient_names(lens.model)
+    tangential = "p1" in coefficient_names(distortion.model)
     along = np.linspace(0, 1, _BORDER if tangential else 2)
     ends = np.zeros_like(along)
     sides = ((along, ends), (along, ends + 1), (ends, along), (ends + 1, along))
     return np.concatenate([np.column_stack(side) for side in sides]) * (np.array(image_size) - 1)
 
 
-def _sees(lens: Distortion, A: Array, pixels: Array) -> bool:
-    """Whether all the pixels lie where the lens has not folded back."""
-    return bool(np.isfinite(undistorted_pixels(lens, A, pixels)).all())
+def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:
+    """Whether all the pixels lie where the distortion is monotonic."""
+    return bool(np.isfinite(undistorted_pixels(distortion, A, pixels)).all())
 
 
 @_quietly
@@ -158,7 +160,7 @@ def _with_slope(
     adjusted, last = found, min(_turn(found.state), corner)
     last += max(corner - _distorted(found.state, last), 0.0) / guess
     for _ in range(_ROUNDS):
-        if found.state.lens == "fisheye":
+        if found.state.model == "fisheye":
             last = min(last, np.pi / 2)
         restraint = MonotonicFit(np.linspace(0, last, _NODES + 1)[1:], weight, least)
         restrained = replace(problem, restraint=restraint)
@@ -184,16 +186,16 @@ def _settled(problem: Problem, adjusted: Adjusted) -> tuple[Problem, Adjusted] |
 def _turn(state: CameraState) -> float:
     """Undistorted radius, or a fisheye's angle, up to which the distortion is monotonic."""
     r = monotonic_radius(state.distortion)
-    return float(np.arctan(r)) if state.lens == "fisheye" else r
+    return float(np.arctan(r)) if state.model == "fisheye" else r
 
 
 def _distorted(state: CameraState, last: float) -> float:
     """Distorted radius of an undistorted one, or of a fisheye's angle."""
-    if state.lens == "fisheye":
+    if state.model == "fisheye":
         return float(last * (1 + state.k @ last ** np.array([2.0, 4.0, 6.0, 8.0])))
     k = state.k.copy()
     k[2:4] = 0.0
-    return float(distort(state.lens, k, np.array([last]), np.zeros(1))[0][0])
+    return float(distort(state.model, k, np.array([last]), np.zeros(1))[0][0])
 
 
 def _farthest(problem: Problem, state: CameraState) -> float:

@@ -18,7 +18,7 @@ from neurocal_cli.distortion.candidate_models import fit_candidates
 
 __all__ = ["with_more_starts"]
 
-# Repeated by tests/test_lens_starts.py (slow: 200 lenses of each of five models): every local minimum there
+# Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
 # showed more.
 _CORRELATED = 0.15  # correlation of neighbours' residuals
 
@@ -34,13 +34,13 @@ def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[Came
         Other states to begin with.
     """
     problem, best = solution.problem, solution.adjusted
-    if not problem.free_lens:
+    if not problem.free_distortion:
         return solution
     views = problem.views
     if best.converged and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
         return solution
     for start in (best.state, *more_starts()):
-        found = fit_candidates(problem, start, by_views=False).get(problem.lens.model)
+        found = fit_candidates(problem, start, by_views=False).get(problem.distortion.model)
         if found is None or not found.adjusted.cost.sum() < best.cost.sum():
             continue
         adjusted = problem.adjust(found.adjusted)

@@ -50,7 +50,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.points import Correspondences
 
-__all__ = ["MODEL", "lens_and_camera"]
+__all__ = ["MODEL", "distortion_and_camera"]
 
 MODEL = "k1k2p1p2"
 
@@ -62,7 +62,7 @@ _K = len(coefficient_names(MODEL))
 _BY_K = CAMERA + np.arange(_K)  # columns of the lines' derivatives
 
 
-def lens_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondences) -> Solution:
+def distortion_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondences) -> Solution:
     """Make distortion and camera agree, from the result of the corrected points.
 
     Parameters
@@ -93,8 +93,10 @@ def lens_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondence
         whitening[rows] = rounded(weighed, views.across)
     lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
     start = solution.adjusted.state
-    start = replace(start, lens=MODEL, k=_same_lens(start.entries[0], seen.pixels, views.pixels))
-    problem = replace(problem, points=points, views=seen, lens=Distortion(MODEL, start.k), free_lens=True)
+    start = replace(start, model=MODEL, k=_same_lens(start.entries[0], seen.pixels, views.pixels))
+    problem = replace(
+        problem, points=points, views=seen, distortion=Distortion(MODEL, start.k), free_distortion=True
+    )
     together = _Together(problem, bent_lines(lines, start.entries[0], Distortion(MODEL, start.k)))
     adjusted = together.solved(start)
     done = solution.adjusted.iterations + adjusted.iterations

@@ -26,7 +26,7 @@ from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
 
 __all__ = ["Consensus", "find_consensus"]
 
-# Repeated by tests/test_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets with one
+# Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets with one
 # wrong view, each within 3 standard deviations of clean data): starts and rounds are what the last scene
 # needed, the limits lie between the clean and the wrong views of these sets.
 #

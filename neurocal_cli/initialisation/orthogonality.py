@@ -198,11 +198,19 @@ def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
     with np.errstate(all="ignore"):
         while descent.active.size:
             descent.step()
-            ended = np.ones(len(p), dtype=bool)
-            ended[descent.active] = False
-            if (np.abs(starts.loss - starts.loss.min()) <= _tie(starts.loss.min()))[ended].sum() >= _ENOUGH:
+            if (
+                len(descent.active) <= len(p) - _ENOUGH
+                and _same_lowest(starts.loss, descent.active) >= _ENOUGH
+            ):
                 break
     return starts.p, np.where(np.isfinite(starts.loss), starts.loss, np.inf)
+
+
+def _same_lowest(loss: Array, active: NDArray[np.intp]) -> int:
+    """How many starts have ended at the lowest loss of all (B,)."""
+    same = np.abs(loss - loss.min()) <= _tie(loss.min())
+    same[active] = False
+    return int(same.sum())
 
 
 def _tie(loss: float) -> float:

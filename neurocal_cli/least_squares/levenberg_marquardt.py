@@ -82,11 +82,9 @@ class DescentOptions:
         Initial lambda.
     shrink : float
         Smallest factor of lambda after an accepted step.
-    grow, accelerate : float
-        nu after an accepted step, and the factor of nu after each rejected one.
     by_ratio : bool
-        Whether the factor after an accepted step follows rho, or is `shrink` always. The latter, with
-        `accelerate` 1, is the rule of Marquardt's paper: bold, for many random starts of which some may fail.
+        Whether that factor follows rho, or is the smallest after every accepted step, as Marquardt had it:
+        bold, for many random starts of which some may fail.
     least_damping, largest_damping : float
         lambda does not fall below the one; where it exceeds the other no step of any length helps.
     tolerance : float
@@ -104,8 +102,6 @@ class DescentOptions:
 
     damping: float = 1e-4
     shrink: float = 0.01
-    grow: float = 2.0
-    accelerate: float = 2.0
     by_ratio: bool = True
     least_damping: float = 1e-14
     largest_damping: float = 1e10
@@ -150,13 +146,10 @@ class Outcome:
         Steps that were tried.
     stop : (G,) int array
         Values of `Stop`.
-    damping : (G,) array
-        lambda at the end.
     """
 
     iterations: NDArray[np.int64]
     stop: NDArray[np.int8]
-    damping: Array
 
     @property
     def settled(self) -> NDArray[np.bool_]:
@@ -213,11 +206,12 @@ class LevenbergMarquardt:
         self.problem, self.options, self.cost = problem, options, problem.cost.copy()
         G = len(self.cost)
         self.active = np.arange(G)
-        self.damping, self.growth = np.full(G, options.damping), np.full(G, options.grow)
+        self.damping, self.growth = np.full(G, options.damping), np.full(G, 2.0)
         self.floor = np.zeros(G) + floor
         self.limit = np.full(G, options.max_iterations) if limit is None else limit
+        self.soonest = int(self.limit.min(initial=options.max_iterations))  # that any group may end there
         self.iteration = 0
-        self.outcome = Outcome(np.zeros(G, dtype=np.int64), np.zeros(G, dtype=np.int8), np.zeros(G))
+        self.outcome = Outcome(np.zeros(G, dtype=np.int64), np.zeros(G, dtype=np.int8))
         exact, out = self.cost <= self.floor, self.limit <= 0
         if exact.any() or out.any():
             self._retire(exact | out, np.where(exact, Stop.EXACT, Stop.LIMIT).astype(np.int8))
@@ -243,30 +237,39 @@ class LevenbergMarquardt:
             excess = np.minimum(2 * (gained / promised) - 1, 2.0)
             shrink = np.maximum(shrink, 1 - excess * excess * excess)
         self.damping = np.maximum(self.damping * np.where(better, shrink, self.growth), options.least_damping)
-        self.growth = np.where(better, options.grow, options.accelerate * self.growth)
+        self.growth = np.where(better, 2.0, 2 * self.growth)
         self.cost = np.where(better, after, before)
-        gain = promised if options.by_promise else gained
-        converged = better & (gain < options.tolerance * before + options.negligible)
-        flat = sensible & ~better & (np.abs(promised) < options.flat * before)
-        exact = self.cost <= self.floor
-        settled = converged | flat | exact
-        stuck = ~better & (self.damping > options.largest_damping)
-        done = settled | stuck | (self.limit <= self.iteration)
+        converged = (promised if options.by_promise else gained) < self._last_gain(before)
+        flat = sensible & (np.abs(promised) < options.flat * before)
+        settled, exact = np.where(better, converged, flat), self.cost <= self.floor
+        stuck = (self.damping > options.largest_damping) & ~better
+        done = settled | exact | stuck
+        if self.iteration >= self.soonest:
+            done |= self.limit <= self.iteration
         if done.any():
             stop = np.zeros(len(done), dtype=np.int8)
-            stop[stuck], stop[flat] = Stop.STUCK, Stop.FLAT
-            stop[converged], stop[exact] = Stop.CONVERGED, Stop.EXACT
+            stop[stuck], stop[settled & ~better] = Stop.STUCK, Stop.FLAT
+            stop[settled & better], stop[exact] = Stop.CONVERGED, Stop.EXACT
             self._retire(done, stop)
 
+    def _last_gain(self, cost: Array) -> Array:
+        """What an accepted step must gain to be followed by another."""
+        share = self.options.tolerance * cost
+        return share + self.options.negligible if self.options.negligible else share
+
     def renew(self) -> None:
-        """Take up the costs of a problem that has changed by itself; all groups must be active."""
+        """Take up the costs of a problem that has changed by itself; all groups must be active.
+
+        Where the old one had come to its end, damping begins anew.
+        """
         self.cost = self.problem.cost.copy()
+        self.damping = np.minimum(self.damping, self.options.damping)
+        self.growth = np.full(len(self.cost), 2.0)
 
     def _retire(self, done: NDArray[np.bool_], stop: NDArray[np.int8]) -> None:
         """Leave the groups that have stopped alone from now on."""
         ended, going = self.active[done], ~done
         self.outcome.iterations[ended], self.outcome.stop[ended] = self.iteration, stop[done]
-        self.outcome.damping[ended] = self.damping[done]
         self.active, self.cost, self.floor = self.active[going], self.cost[going], self.floor[going]
         self.damping, self.growth = self.damping[going], self.growth[going]
         self.limit = self.limit[going]

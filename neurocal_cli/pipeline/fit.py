@@ -26,7 +26,7 @@ from neurocal_cli.points import Correspondences
 
 __all__ = ["fit", "fit_again"]
 
-# Repeated by tests/test_lens_starts.py (slow: 200 lenses of each of five models, no local minimum).
+# Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
 _FIRST_MODEL = "k1k2"  # where no pinhole can be found, the distortion must be strong
 _FAR_WORSE = 4.0  # times the mean squared error of most views
 
@@ -121,14 +121,14 @@ def _plumb_line_first(problem: Problem, options: Options) -> Solution:
     """The distortion from straight lines, then the pinhole camera, then both together."""
     # A hundredth of a second that other models are spared.
     from neurocal_cli.distortion.plumb_line import fit_plumb_line
-    from neurocal_cli.distortion.plumb_line_camera import lens_and_camera
+    from neurocal_cli.distortion.plumb_line_camera import distortion_and_camera
 
     points = problem.points
     plumb = fit_plumb_line(points, problem.given_centre)
     pinhole = problem.with_points(plumb.corrected(points))
     check_points(pinhole)
     corrected = reweighted(solve(pinhole, options))
-    solution = lens_and_camera(corrected, plumb, points)
+    solution = distortion_and_camera(corrected, plumb, points)
     return replace(check_distortion(solution), straight_lines=plumb.record)
 
 
@@ -139,7 +139,7 @@ def _turned(solution: Solution) -> Solution:
     """
     adjusted, problem = solution.adjusted, solution.problem
     error = adjusted.cost / problem.views.counts
-    if adjusted.state.lens == "none" or error.max() <= _FAR_WORSE * np.median(error):
+    if adjusted.state.model == "none" or error.max() <= _FAR_WORSE * np.median(error):
         return solution
     turned = try_mirrored(problem, adjusted)
     return solution if turned is adjusted else replace(solution, adjusted=turned)

@@ -37,7 +37,7 @@ from neurocal_cli.points import Correspondences
 
 __all__ = ["fit_robustly"]
 
-# Repeated by tests/test_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets with one
+# Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets with one
 # wrong view; clean data are the same to the last bit with and without) and tests/test_wrong_inputs.py.
 _CHANCE = 0.01  # of calling any point of a good data set wrong
 _FLOOR = 1e-7  # of the image's spread: rounding, not noise
@@ -132,7 +132,8 @@ class _Search:
     def without_outlier_views(self) -> None:
         """Set aside views that are of another camera, or of another target than their points say.
 
-        A lens that is chosen for wrong views with the others hides them: a pinhole looks for them first.
+        A distortion model that is chosen with the wrong views among the others hides them, so that a pinhole
+        looks for them first.
         """
         if self.options.distortion == "auto":
             pinhole = replace(self.options, distortion="")

@@ -71,7 +71,7 @@ def calibration_of(
         max_px=float(np.sqrt(squared.max())),
         covariance=block[np.ix_(free, free)],
         covariance_names=tuple(np.array(list(std))[free].tolist()),
-        distortion_model=problem.lens.model,
+        distortion_model=problem.distortion.model,
         distortion=state.k,
         network=_network_record(solution, rmse),
         straight_lines=solution.straight_lines,
@@ -95,7 +95,7 @@ def _camera_covariance(
     entries = np.zeros((len(problem.free_camera),) * 2)
     entries[np.ix_(free, free)] = cov.entries
     return parameter_covariance(
-        intrinsics, problem.lens.model, entries, problem.views.pixel_scale, problem.fixed
+        intrinsics, problem.distortion.model, entries, problem.views.pixel_scale, problem.fixed
     )
 
 
@@ -145,8 +145,8 @@ def _corner_warning(problem: Problem) -> tuple[str, ...]:
     if problem.restraint is None:
         return ()
     return (
-        f"the distortion model {problem.lens.model} that fits the points best is not monotonic (maps two "
-        "directions to one pixel) in the image's corners, where there are no points; the best monotonic fit "
+        f"the distortion model {problem.distortion.model} that fits the points best is not monotonic (maps "
+        "two directions to one pixel) in the image's corners, where there are no points; the best monotonic fit "
         "is used, which is a guess in the corners; add views that show the board there",
     )
 

@@ -201,14 +201,14 @@ class _RigAssembly:
         columns: NDArray[np.intp],
     ) -> dict[str, Any]:
         block, std = parameter_covariance(
-            intrinsics, camera.lens, self._shared_block(columns), seen.pixel_scale, given.fixed
+            intrinsics, camera.model, self._shared_block(columns), seen.pixel_scale, given.fixed
         )
         names = list(std)
         free = [k for k, name in enumerate(names) if name not in given.fixed]
         before: tuple[str, ...] = ()
         chosen = bool(given.lens_choice)
         if given.std.keys() >= std.keys():
-            alone = Distortion(camera.lens, given.distortion)
+            alone = Distortion(camera.model, given.distortion)
             before = parameter_warnings(given.intrinsics, alone, given.std, chosen)
         now = parameter_warnings(intrinsics, camera.distortion, std, chosen)
         return {

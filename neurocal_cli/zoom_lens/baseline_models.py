@@ -146,6 +146,6 @@ def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Ri
     start = np.asarray(np.linalg.lstsq(monomials(x, powers), outputs, rcond=None)[0], dtype=float)
     constants = np.zeros(table.normal.H.shape[1] - outputs.shape[1])
     error = QuadraticError(x, table.local, table.normal, lens.variance)
-    found = error.minimum(_Polynomials(scale, powers, start), constants, DescentOptions())
-    moved = table.constants.moved(found.shared) if len(constants) else table.constants
-    return lambda to: (found.model.local(to), moved)
+    found, shared, _ = error.minimum(_Polynomials(scale, powers, start), constants, DescentOptions())
+    moved = table.constants.moved(shared) if len(shared) else table.constants
+    return lambda to: (found.local(to), moved)

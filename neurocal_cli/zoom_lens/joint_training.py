@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
-from neurocal_cli.zoom_lens.network_training import RULE, followed
+from neurocal_cli.zoom_lens.network_training import followed
 from neurocal_cli.zoom_lens.parameter_networks import LensNets
 from neurocal_cli.zoom_lens.quadratic_error import QuadraticError, gauss_newton, loosened
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData
@@ -28,8 +29,10 @@ _SETTLED = 0.5  # of 2 E, a quarter of a standard deviation: a round that gains 
 NEARLY = 1e-3  # share of 2 E: what gains less than this in the last round has converged
 # On one set of matrices. A step that gains less than 0.02 of 2 E, a seventh of a standard deviation, is
 # the last.
-_OPTIONS = replace(RULE, least_damping=1e-12, largest_damping=1e8, negligible=0.02, max_iterations=25)
-_DAMPING = (1e-8, 1e-2)  # at the start on new matrices
+_OPTIONS = DescentOptions(
+    damping=1e-4, shrink=0.1, least_damping=1e-12, largest_damping=1e8,
+    tolerance=0.0, negligible=0.02, by_promise=False, flat=0.0, max_iterations=25,
+)  # fmt: skip
 _FIRST = 4  # rounds in which the priors follow the data
 
 
@@ -105,7 +108,6 @@ class JointLearner:
     ) -> None:
         self.data, self.x, self.variance, self.scatter = data, x, variance, scatter
         self.nets, self.constants = nets, constants
-        self.damping = 1e-4
 
     def linearise(self) -> float:
         """Renew the normal matrices where the networks are; 2 E."""
@@ -126,11 +128,9 @@ class JointLearner:
 
     def descend(self) -> float:
         """Levenberg-Marquardt on the present normal matrices; 2 E at the end."""
-        options = replace(_OPTIONS, damping=self.damping)
-        found = self.error.minimum(self.nets, self.shared, options)
-        self.damping = float(np.clip(found.damping, *_DAMPING))
-        self.accept(found.model, found.shared)
-        return found.cost
+        nets, shared, cost = self.error.minimum(self.nets, self.shared, _OPTIONS)
+        self.accept(nets, shared)
+        return cost
 
     def accept(self, nets: LensNets, shared: Array) -> None:
         """Take over networks and a step of the constants."""

@@ -11,7 +11,7 @@ The evidence compares starts and topologies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,20 +20,17 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 from neurocal_cli.zoom_lens.mlfn import Topology, respond_with_jacobian
 
-__all__ = ["RULE", "Schedule", "Trained", "followed", "prior_precision", "sparse_controls", "train"]
+__all__ = ["Schedule", "Trained", "followed", "prior_precision", "sparse_controls", "train"]
 
 _FLAT = 1e-4  # precision of the weights that are free: a std of 100 spreads of the targets
 _MOST = 1e4  # precision of a prior
 _LEAST, _LEAST_SPARSE, _LEAST_TILT = 0.03, 1.0, 1.0
 _ENOUGH_VALUES = 4
-# Marquardt's own rule. Nielsen's finds networks as probable from as many starts, but others; this one is kept
-# so that lenses stay the same.
-RULE = DescentOptions(
-    shrink=0.2, grow=5.0, accelerate=1.0, by_ratio=False, tolerance=0.0, by_promise=False, flat=0.0
-)
 # A network never stops by itself: its priors follow the data until the schedule ends.
-_OPTIONS = replace(RULE, damping=1e-2, least_damping=1e-10, largest_damping=np.inf, max_iterations=1_000_000)
-_LARGEST_DAMPING = 1e8  # from where it finds back when the priors have changed
+_OPTIONS = DescentOptions(
+    damping=1e-2, shrink=0.2, least_damping=1e-10, largest_damping=np.inf,
+    tolerance=0.0, flat=0.0, max_iterations=1_000_000,
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -148,7 +145,6 @@ def train(
                 learner.follow(allow_scatter=iteration >= schedule.settle)
                 descent.renew()
             descent.step()
-            descent.damping = np.minimum(descent.damping, _LARGEST_DAMPING)
     return learner.result()
 
 

@@ -51,27 +51,6 @@ class LocalModel(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Minimum(Generic[Model]):
-    """What `QuadraticError.minimum` found.
-
-    Attributes
-    ----------
-    model : LocalModel
-    shared : (Q,) array
-        Step of the constants.
-    cost : float
-        2 E.
-    damping : float
-        lambda at the end.
-    """
-
-    model: Model
-    shared: Array
-    cost: float
-    damping: float
-
-
-@dataclass(frozen=True, eq=False)
 class QuadraticError:
     """2 E of any model.
 
@@ -113,11 +92,11 @@ class QuadraticError:
         rhs[P:] = pull[:, L:].sum(axis=0)
         return gauss_newton(J, self.normal.H / self.variance, prior), rhs
 
-    def minimum(self, model: Model, shared: Array, options: DescentOptions) -> Minimum[Model]:
-        """Where a model and a step of the constants lead from here."""
+    def minimum(self, model: Model, shared: Array, options: DescentOptions) -> tuple[Model, Array, float]:
+        """The model and the constants' step at the minimum, and 2 E there."""
         problem = _Problem(self, model, shared)
-        damping = float(minimise(problem, options).damping[0])
-        return Minimum(problem.model, problem.shared, float(problem.cost[0]), damping)
+        minimise(problem, options)
+        return problem.model, problem.shared, float(problem.cost[0])
 
 
 class _Problem(Generic[Model]):

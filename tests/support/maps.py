@@ -15,7 +15,7 @@ def some_map(degree: int = 4) -> SmoothMap:
     grid = np.stack(np.meshgrid(np.arange(9.0), np.arange(6.0)), axis=-1).reshape(-1, 2)
     frame = Frame.of(grid, (640, 480))
     homography = np.array([0.4, 0.05, 0.02, -0.04, 0.3, -0.01, 0.1, -0.05])
-    now = SmoothMap(frame, np.concatenate([homography, np.zeros(6)])).shaped(3, degree)
+    now = SmoothMap(frame, np.concatenate([homography, np.zeros(6)])).with_model(3, degree)
     values = now.parameters.copy()
     values[8:14] = [0.02, -0.03, -0.2, 0.05, 0.02, -0.01]
     values[14:] = rng.normal(0, 0.0005, len(values) - 14)

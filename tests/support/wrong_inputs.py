@@ -225,7 +225,7 @@ FLAT: dict[str, Spoiler] = {
         [Pose.from_euler(a, 0, 0.1, np.array([-100.0, -60.0, 450.0])) for a in (0.0, 0.05, -0.05)],
         CAMERA.A, 5,
     ),
-    "a lens that bends, called a pinhole": lambda p, rng: Input(
+    "strong distortion, called a pinhole": lambda p, rng: Input(
         moved(p, pixels=through_lens([-0.35])), {"distortion": "none"}
     ),
     "type 2 with a wrong centre": lambda p, rng: Input(p, {"type": 2, "image_center": (420.0, 180.0)}),

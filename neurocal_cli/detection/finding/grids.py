@@ -1,7 +1,9 @@
-"""All chessboards in a picture, whatever their size: `find_grids`.
+"""All chessboards of an image, of any size: `find_grids` runs the steps of this package.
 
-Saddles of the brightness are linked along edges; blocks of 3 x 3 linked vertices grow into grids
-on a reduced picture, and are completed and made precise on finer and finer ones.
+On a reduced image, saddle points of the brightness are linked along edges, and blocks of 3 x 3 linked
+vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices.
+
+In: an image. Out: grids with vertices known to a few tenths of a pixel, for `measuring`.
 """
 
 from __future__ import annotations
@@ -13,51 +15,53 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.accept import edges_seen, has_block, is_smooth
-from neurocal_cli.detection.finding.claims import disputed, distinct, touching
-from neurocal_cli.detection.finding.fold import joined, unfolded
-from neurocal_cli.detection.finding.grow import Lattice, cleaned, grown, smoothing
+from neurocal_cli.detection.finding.accept import edges_visible, has_block, is_smooth
+from neurocal_cli.detection.finding.folds import split_at_folds
+from neurocal_cli.detection.finding.from_links import lattice_from_links
+from neurocal_cli.detection.finding.grow import grow, remove_outliers
+from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
 from neurocal_cli.detection.finding.levels import Level, levels_of
-from neurocal_cli.detection.finding.linked import linked
-from neurocal_cli.detection.finding.merge import merged
-from neurocal_cli.detection.finding.refine import settle
+from neurocal_cli.detection.finding.links import Links, find_links
+from neurocal_cli.detection.finding.merge import merge_lattices
+from neurocal_cli.detection.finding.overlaps import any_overlap, drop_duplicates, trim_overlaps
 from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
-from neurocal_cli.detection.finding.seeds import Links, find_links, find_seeds, find_slim_seeds
-from neurocal_cli.detection.finding.stretch import stretched
+from neurocal_cli.detection.finding.seeds import find_seeds_2x3, find_seeds_3x3
+from neurocal_cli.detection.finding.stretch import stretch
+from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
 __all__ = ["find_grids"]
 
-# px; grids are looked for and grow on levels up to this size: on larger ones they only become
-# more precise, unless nothing has been found till there.
+# Grids are searched on levels of up to this number of pixels. Larger levels only refine them, unless
+# nothing has been found yet. Chosen for time: tests/benchmarks/test_detection_speed.py.
 _SEARCHED = 1.4e6
-# Pixels of the largest level that is searched when smaller ones gave nothing: a board that is not seen
-# at this size would have to be a speck in a picture that fills the memory.
+# Larger levels are never searched, for the memory and time it takes.
 _MOST_SEARCHED = 30_000_000
-_TRIES, _SLIM_TRIES = 8, 4  # seeds per level that come to nothing
-_BEHIND = 3.0  # times larger are the squares of a board before what need not be looked at
+# Insensitive; they bound the time: tests/benchmarks/test_detection_speed.py, "clutter only".
+_TRIES, _TRIES_2X3 = 8, 4  # seeds of a level that may fail; bounds the time where there is no board
+_BEHIND = 3.0  # ratio of the squares' sizes from which on a second board is not searched
 
 Size = tuple[int, int]
 
 
 def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list[Grid]:
-    """Find every chessboard in a picture.
+    """Find every chessboard in an image.
 
     Parameters
     ----------
     image : (height, width) array
         Grey, of 8 or 16 bits or real numbers of any range.
     sizes : collection of (int, int), optional
-        Columns and rows, either way round, of a board that alone is wanted: once it is seen whole, others
-        whose squares are a third of its and smaller, far behind it, are let be.
+        Columns and rows, in either order, of the only board wanted. Once it is found whole, boards far
+        behind it, with squares a third of its size or smaller, are not searched.
 
     Returns
     -------
     grids : list of Grid
-        The one that fills most of the picture first. Vertices are good to a few tenths of a pixel.
-        Planes that meet at a fold are grids of their own. A grid has at least 3 x 3 vertices:
-        anything smaller is found in clutter too, and no vertex between others tests its lines.
+        The largest in the image first. Vertices are accurate to a few tenths of a pixel. Planes that
+        meet at a fold are separate grids. A grid has at least 3 x 3 vertices, because smaller ones
+        occur in clutter and no third vertex tests their lines.
     """
     lattices: list[Lattice] = []
     saddles: Saddles
@@ -65,49 +69,50 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
     levels = levels_of(image)
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
-        lattices = [_finer(level, x) for x in lattices]
+        lattices = [_to_finer_level(level, x) for x in lattices]
         if level in small or (not lattices and level.image.size <= _MOST_SEARCHED):
             if level is small[0]:
-                lattices = [y for x in lattices for y in _boards(cleaned(level, grown(level, x)))]
-            saddles = find_saddles(level, _covered(level, lattices) if lattices else None)
-            lattices += _new(level, saddles, lattices, wanted)
+                lattices = [y for x in lattices for y in _boards(remove_outliers(level, grow(level, x)))]
+            saddles = find_saddles(level, _mask(level, lattices) if lattices else None)
+            lattices += _find_new(level, saddles, lattices, wanted)
             if level not in small[1:]:
-                lattices = _separated(level, lattices)
+                lattices = _split_planes(level, lattices)
     if not lattices and levels and levels[0] in small:
-        lattices = _separated(levels[0], _slivers(levels[0], saddles))
+        lattices = _split_planes(levels[0], _find_slivers(levels[0], saddles))
     return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
 
 
-def _separated(level: Level, lattices: list[Lattice]) -> list[Lattice]:
-    """Grids of one plane each."""
+def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:
+    """Lattices without duplicates, each on one plane, with occluded parts joined."""
     result = []
-    several = distinct(lattices)
-    if touching(several):
-        several = [part for x in disputed(several) for part in _boards(cleaned(level, x))]
+    several = drop_duplicates(lattices)
+    if any_overlap(several):
+        several = [part for x in trim_overlaps(several) for part in _boards(remove_outliers(level, x))]
     for lattice in several:
-        planes = [part for part in unfolded(lattice) if has_block(part)]
+        planes = [part for part in split_at_folds(lattice) if has_block(part)]
         if len(planes) > 1 or (planes and planes[0].seen.sum() < lattice.seen.sum()):
-            # What was taken out at a fold for lying between two planes may belong to one.
-            planes = [cleaned(level, grown(level, x, outwards=False)) for x in planes]
+            # A vertex removed near the fold may belong to one of the planes.
+            planes = [remove_outliers(level, grow(level, x, outwards=False)) for x in planes]
         result += [x for x in planes if has_block(x) and is_smooth(level, x)]
-    return [x for x in (_mended(level, x) for x in merged(distinct(result))) if has_block(x)]
+    filled = (_fill_gaps(level, x) for x in merge_lattices(drop_duplicates(result)))
+    return [x for x in filled if has_block(x)]
 
 
-def _mended(level: Level, lattice: Lattice) -> Lattice:
-    """Look for vertices behind hidden ones, in a lattice that has such."""
+def _fill_gaps(level: Level, lattice: Lattice) -> Lattice:
+    """Search for missing vertices, also behind a missing neighbour."""
     if lattice.seen.all():
         return lattice
-    return cleaned(level, grown(level, lattice, outwards=False, reach=2))
+    return remove_outliers(level, grow(level, lattice, outwards=False, reach=2))
 
 
 def _area(pixels: Array) -> float:
-    """Of all whole squares [px^2]."""
+    """Area of all complete squares [px^2]."""
     p, q = pixels[1:, 1:] - pixels[:-1, :-1], pixels[1:, :-1] - pixels[:-1, 1:]
     return float(np.nansum(np.abs(p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0])) / 2)
 
 
-def _whole(lattices: Iterable[Lattice], wanted: frozenset[Size]) -> float:
-    """Width of the squares [px] of the nearest grid of a wanted size that is seen whole; 0 if none is."""
+def _nearest_whole(lattices: Iterable[Lattice], wanted: frozenset[Size]) -> float:
+    """Largest width of the squares [px] among complete grids of a wanted size; 0 without any."""
     widths = (x.width for x in lattices if x.contrast.shape in wanted and x.seen.all())
     return max(widths, default=0.0)
 
@@ -118,23 +123,25 @@ def _sides(points: Array) -> Array:
     return np.maximum(*(np.hypot(x[..., 0], x[..., 1]).max(axis=(1, 2)) for x in (along, down)))
 
 
-def _new(
+def _find_new(
     level: Level, saddles: Saddles, known: list[Lattice], wanted: frozenset[Size] = frozenset()
 ) -> list[Lattice]:
-    """Grids of a level's saddles beside the known ones; with more effort for the first in an image."""
+    """Grids of a level's saddles besides the known ones. The first grid of an image gets more effort."""
     if len(saddles) < 9:
         return []
     links = find_links(level, saddles)
-    seeds, _ = find_seeds(saddles, links)
-    found = _sprouted(
+    seeds = find_seeds_3x3(saddles, links)
+    found = _grow_from_seeds(
         level, saddles, links, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES, known, wanted
     )
     if not found and not known and level.scale == 1:
-        found = _sprouted(level, saddles, links, *find_slim_seeds(saddles, links), _SLIM_TRIES, known, wanted)
+        found = _grow_from_seeds(
+            level, saddles, links, *find_seeds_2x3(saddles, links), _TRIES_2X3, known, wanted
+        )
     return found
 
 
-def _sprouted(
+def _grow_from_seeds(
     level: Level,
     saddles: Saddles,
     links: Links,
@@ -144,26 +151,28 @@ def _sprouted(
     known: list[Lattice],
     wanted: frozenset[Size],
 ) -> list[Lattice]:
-    """Grids that grow from seeds, until some of these have come to nothing."""
+    """Grids that grow from seeds, until a number of seeds has failed."""
     found: list[Lattice] = []
     free, taken = np.ones(len(saddles), dtype=bool), np.zeros(len(saddles), dtype=bool)
-    nearest = _whole(known, wanted)
+    nearest = _nearest_whole(known, wanted)
     sides = _sides(saddles.points[seeds]) if wanted and len(seeds) else np.full(len(seeds), np.inf)
     for seed, parity, side in zip(seeds, dark, sides.tolist(), strict=True):
         if side * _BEHIND < nearest or not free[seed].all():
             continue
         free[seed] = False
-        planted = linked(level, saddles, links, int(seed[1, 1]), taken) if len(seed) == 3 else None
-        if planted is not None and planted.seen.all() and level.scale > 1:
-            grid = planted  # if there is more of it, finer levels show
+        lattice = (
+            lattice_from_links(level, saddles, links, int(seed[1, 1]), taken) if len(seed) == 3 else None
+        )
+        if lattice is not None and lattice.seen.all() and level.scale > 1:
+            grid = lattice  # finer levels complete it
         else:
             first = Lattice(saddles.points[seed], saddles.contrast[seed], int(parity))
-            grid = cleaned(level, grown(level, first if planted is None else planted))
-        boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_seen(level, x)]
+            grid = remove_outliers(level, grow(level, first if lattice is None else lattice))
+        boards = [x for x in _boards(grid) if is_smooth(level, x) and edges_visible(level, x)]
         if boards:
             found += boards
-            nearest = max(nearest, _whole(boards, wanted))
-            taken |= _covered(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] > 0
+            nearest = max(nearest, _nearest_whole(boards, wanted))
+            taken |= _mask(level, boards)[tuple(np.rint(saddles.points.T[::-1]).astype(int))] > 0
             free &= ~taken
         else:
             tries -= 1
@@ -172,36 +181,38 @@ def _sprouted(
     return found
 
 
-def _slivers(level: Level, saddles: Saddles) -> list[Lattice]:
-    """Grids of squares so narrow that their edges' directions are not seen."""
-    part = stretched(level, saddles.points) if len(saddles) >= 9 else None
+def _find_slivers(level: Level, saddles: Saddles) -> list[Lattice]:
+    """Grids of squares too narrow for the directions of their edges to be measured."""
+    part = stretch(level, saddles.points) if len(saddles) >= 9 else None
     if part is None:
         return []
     found = []
-    for lattice in _new(part.level, find_saddles(part.level), []):
-        there = part.back(lattice.pixels[lattice.seen])
+    for lattice in _find_new(part.level, find_saddles(part.level), []):
         pixels = np.full_like(lattice.pixels, np.nan)
-        settled = settle(level.image, there, smoothing(0.0))
-        close = np.hypot(*(settled - there).T) < 1
-        pixels[lattice.seen] = np.where(close[:, None], settled, there)
-        grid = grown(level, replace(lattice, pixels=pixels))
-        found += _boards(cleaned(level, grid))
+        pixels[lattice.seen] = part.back(lattice.pixels[lattice.seen])
+        grid = grow(level, _refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))
+        found += _boards(remove_outliers(level, grid))
     return found
 
 
-def _finer(level: Level, lattice: Lattice) -> Lattice:
+def _to_finer_level(level: Level, lattice: Lattice) -> Lattice:
     """The same grid on the next level."""
     lattice = replace(lattice, pixels=2 * lattice.pixels)
-    row, col = np.nonzero(lattice.seen)
+    return _refined(level, lattice, lattice.derivative_sigma, 2)
+
+
+def _refined(level: Level, lattice: Lattice, sigma: float, most: float) -> Lattice:
+    """The lattice with its vertices at the saddle points next to them, if these are within `most` px."""
+    start = lattice.pixels[lattice.seen]
+    refined = refine_saddles(level.image, start, sigma)
+    close = np.hypot(*(refined - start).T) < most
     pixels = lattice.pixels.copy()
-    settled = settle(level.image, pixels[row, col], smoothing(lattice.width))
-    close = np.hypot(*(settled - pixels[row, col]).T) < 2
-    pixels[row, col] = np.where(close[:, None], settled, pixels[row, col])
+    pixels[lattice.seen] = np.where(close[:, None], refined, start)
     return replace(lattice, pixels=pixels)
 
 
-def _covered(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
-    """Paint the squares of grids, and a little around them."""
+def _mask(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
+    """A mask of the squares of grids and a margin around them."""
     mask = np.zeros(level.image.shape, dtype=np.uint8)
     for lattice in lattices:
         p = lattice.pixels
@@ -215,5 +226,5 @@ def _covered(level: Level, lattices: list[Lattice]) -> NDArray[np.uint8]:
 
 
 def _boards(lattice: Lattice) -> list[Lattice]:
-    """Parts of a lattice that are boards."""
-    return [part for part in joined(lattice) if has_block(part)]
+    """Connected parts of a lattice that are large enough for a board."""
+    return [part for part in lattice.connected_parts() if has_block(part)]

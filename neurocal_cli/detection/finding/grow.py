@@ -1,116 +1,51 @@
-"""A grid grows from a block of vertices, layer by layer, as far as the board goes on."""
+"""Growing a lattice layer by layer, and removing its outliers.
+
+In: a level and a lattice of at least 2 x 3 vertices. Out: the lattice, as far as the board is visible. Every
+new vertex is predicted from its neighbours, searched near there, and accepted if it lies within a tolerance
+of the prediction and the image around it looks like a vertex.
+"""
 
 from __future__ import annotations
-
-from dataclasses import dataclass, replace
-from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.levels import Level, sampled
-from neurocal_cli.detection.finding.predict import Expected, expected
-from neurocal_cli.detection.finding.refine import settle
-from neurocal_cli.detection.finding.verify import look
-from neurocal_cli.detection.medians import median
+from neurocal_cli.detection.finding.lattice import Index, Lattice, in_whole_square, signs
+from neurocal_cli.detection.finding.levels import Level, interpolate
+from neurocal_cli.detection.finding.predict import PredictedVertices, predict_vertices
+from neurocal_cli.detection.finding.subpixel import refine_saddles
+from neurocal_cli.detection.finding.vertex_check import check_vertices
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "Lattice",
-    "cleaned",
-    "cropped",
-    "framed",
-    "frontier",
-    "grown",
-    "judged",
-    "signs",
-    "smoothing",
-    "squared",
-]
+__all__ = ["check_lattice", "frontier", "grow", "remove_outliers"]
 
-Index = NDArray[np.intp]
-
-_SEARCHED = 0.24  # squares to either side of where a vertex is expected
-_STEPS = 7
-_MOST_SPREAD = 5.0  # of an expectation that is worth looking at
+# Insensitive, with exceptions: half of _STEPS loses 3 of 1204 vertices, half of _MOST_SPREAD loses 47, and
+# twice _WEAKEST, more than the contrast of the neighbours, stops growth. tests/test_finding.py repeats this.
+_SEARCHED = 0.24  # squares; half width of the search around a prediction ...
+_STEPS = 7  # ... at so many places each way
+_MOST_SPREAD = 5.0  # of a prediction that is used
 _OFF, _OFF_SPREAD, _OFF_PX = 0.045, 0.025, 0.45  # squares, squares per spread, px: see `_tolerance`
-_WEAKEST = 0.55  # least contrast over the neighbours'
-_EVEN_ALONE, _OFF_ALONE = 0.88, 0.3  # of a vertex that closes no square; the latter over the tolerance
-_LAYERS = 200
-_ROUNDS = 12  # of taking out wrong vertices, at most
+_WEAKEST = 0.55  # least contrast, relative to the neighbours
+_EVEN_ALONE, _OFF_ALONE = 0.88, 0.3  # stricter limits outside complete squares; the latter per tolerance
+_LAYERS = 200  # at most
+_ROUNDS = 12  # of removing outliers, at most
 
 
-@dataclass(frozen=True, eq=False)
-class Lattice:
-    """A grid while it grows.
+def grow(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) -> Lattice:
+    """Add vertices between the known ones and, if outwards, around them, until none is accepted any more.
 
-    Attributes
-    ----------
-    pixels : (rows, cols, 2) array [px of its level]
-        nan where unknown.
-    contrast : (rows, cols) array [DN]
-        Around each known vertex; nan elsewhere.
-    dark : int
-        0 or 1: the square between (c, r) and (c + 1, r + 1) is dark where ``c + r + dark`` is even.
+    With a reach of 2, growth also steps over a single hidden vertex.
     """
-
-    pixels: Array
-    contrast: Array
-    dark: int
-
-    @property
-    def seen(self) -> NDArray[np.bool_]:
-        """(rows, cols) which vertices are known."""
-        return np.isfinite(self.pixels[..., 0])
-
-    @cached_property
-    def known(self) -> tuple[Index, Index, Expected]:
-        """Rows and columns (N,) of the known vertices, and where their neighbours put them."""
-        row, col = np.nonzero(self.seen)
-        return row, col, expected(self.pixels, row, col)
-
-    def with_contrast(self, contrast: Array) -> Lattice:
-        """The same vertices, with contrasts (rows, cols) that have been looked at again."""
-        result = replace(self, contrast=contrast)
-        vars(result).update({name: x for name, x in vars(self).items() if name == "known"})
-        return result
-
-    @property
-    def width(self) -> float:
-        """Median of the squares' narrower widths [px]."""
-        p = self.pixels
-        c, r = p[:-1, 1:] - p[:-1, :-1], p[1:, :-1] - p[:-1, :-1]
-        area = np.abs(c[..., 0] * r[..., 1] - c[..., 1] * r[..., 0])
-        longest = np.maximum(np.hypot(c[..., 0], c[..., 1]), np.hypot(r[..., 0], r[..., 1]))
-        known = longest > 0
-        return median(area[known] / longest[known]) if known.any() else 0.0
-
-
-def signs(row: Index, col: Index, dark: int) -> Array:
-    """+1 where the square towards growing c and r is dark, else -1."""
-    return np.where((row + col + dark) % 2 == 0, 1.0, -1.0)
-
-
-def smoothing(width: float) -> float:
-    """Smoothing of derivatives for squares of a width, a few values only [px]."""
-    return min(max(round(0.15 * width / 0.25) * 0.25, 0.75), 2.0)
-
-
-def grown(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) -> Lattice:
-    """Add vertices between and, unless told otherwise, around the known ones until none fits any more.
-
-    With a reach of 2, one vertex in a row may be hidden and the next still be found.
-    """
-    sigma, start = smoothing(lattice.width), lattice
+    sigma, start = lattice.derivative_sigma, lattice
     tried: set[tuple[int, int, int]] = set()
-    top, left = 0, 0  # how far its vertices have moved
+    top, left = 0, 0  # shift of the indices by padding
     for _ in range(_LAYERS):
         if outwards:
-            lattice, shift = framed(lattice)
+            lattice, shift = lattice.padded()
             top, left = top + shift[0], left + shift[1]
         row, col, support = _frontier(lattice.seen, reach)
-        # A place is looked at again only when it has more neighbours than before.
+        # A place is searched again only when it has more neighbours than before.
         keys = list(zip((row - top).tolist(), (col - left).tolist(), support.tolist(), strict=True))
         fresh = [k for k, key in enumerate(keys) if key not in tried]
         if not fresh:
@@ -118,36 +53,8 @@ def grown(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1)
         tried.update(keys)
         if len(fresh) < len(keys):
             row, col = row[fresh], col[fresh]
-        lattice = _layer(level, lattice, row, col, sigma, reach)
-    return cropped(lattice if lattice.seen.sum() > start.seen.sum() else start)
-
-
-def framed(lattice: Lattice) -> tuple[Lattice, tuple[int, int]]:
-    """Give a lattice room of one place on every side; how far its vertices moved."""
-    rows, cols = lattice.contrast.shape
-    seen = lattice.seen
-    top, left = int(seen[0].any()), int(seen[:, 0].any())
-    bottom, right = int(seen[-1].any()), int(seen[:, -1].any())
-    if top + left + bottom + right == 0:
-        return lattice, (0, 0)
-    pixels = np.full((rows + top + bottom, cols + left + right, 2), np.nan)
-    contrast = np.full(pixels.shape[:2], np.nan)
-    pixels[top : top + rows, left : left + cols] = lattice.pixels
-    contrast[top : top + rows, left : left + cols] = lattice.contrast
-    return Lattice(pixels, contrast, (lattice.dark + top + left) % 2), (top, left)
-
-
-def cropped(lattice: Lattice) -> Lattice:
-    """Cut off rows and columns without any vertex."""
-    row, col = np.nonzero(lattice.seen)
-    if not len(row):
-        return lattice
-    top, left, bottom, right = row.min(), col.min(), row.max() + 1, col.max() + 1
-    if top == left == 0 and (bottom, right) == lattice.contrast.shape:
-        return lattice
-    part = slice(top, bottom), slice(left, right)
-    dark = int(lattice.dark + top + left) % 2
-    return Lattice(lattice.pixels[part], lattice.contrast[part], dark)
+        lattice = _grow_layer(level, lattice, row, col, sigma, reach)
+    return (lattice if lattice.seen.sum() > start.seen.sum() else start).cropped()
 
 
 def _around(values: NDArray[np.generic]) -> Array:
@@ -157,20 +64,21 @@ def _around(values: NDArray[np.generic]) -> Array:
 
 
 def frontier(lattice: Lattice) -> tuple[Index, Index]:
-    """Unknown places with a known neighbour along an edge and another one near."""
+    """Rows and columns of unknown places with a known neighbour along an edge and another one nearby."""
     return _frontier(lattice.seen, 1)[:2]
 
 
-_BESIDE = 16  # what a neighbour along an edge counts more than one at a corner
+# One convolution counts all neighbours (modulo 16) and those along edges (in sixteens).
+_BESIDE = 16
 _COUNTS = np.array(
     [[1, _BESIDE + 1, 1], [_BESIDE + 1, 1, _BESIDE + 1], [1, _BESIDE + 1, 1]], dtype=np.float32
 )
 
 
 def _frontier(seen: NDArray[np.bool_], reach: int) -> tuple[Index, Index, NDArray[np.generic]]:
-    """See `frontier`; with the number of known places around each.
+    """See `frontier`; also the number of known places around each.
 
-    With a reach of 2, all unknown places at most two from a known one.
+    With a reach of 2, all unknown places at most two away from a known one.
     """
     counts = cv2.filter2D(seen.view(np.uint8), -1, _COUNTS, borderType=cv2.BORDER_CONSTANT)
     around = counts % _BESIDE
@@ -179,43 +87,45 @@ def _frontier(seen: NDArray[np.bool_], reach: int) -> tuple[Index, Index, NDArra
     return row, col, around[row, col]
 
 
-def _layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: float, reach: int) -> Lattice:
-    """Look for vertices at places of a lattice."""
-    at = expected(lattice.pixels, row, col)
-    worth = (at.spread < _MOST_SPREAD * reach) & (at.area > 4) & _inside(level, at.points)
+def _grow_layer(level: Level, lattice: Lattice, row: Index, col: Index, sigma: float, reach: int) -> Lattice:
+    """Search vertices at places of a lattice, and add those accepted."""
+    predicted = predict_vertices(lattice.pixels, row, col)
+    worth = (
+        (predicted.spread < _MOST_SPREAD * reach) & (predicted.area > 4) & _inside(level, predicted.points)
+    )
     if not worth.all():
-        row, col, at = row[worth], col[worth], at[worth]
+        row, col, predicted = row[worth], col[worth], predicted[worth]
     if not len(row):
         return lattice
     dark = signs(row, col, lattice.dark)
-    points = settle(level.image, _searched(level, at, dark), sigma)
+    points = refine_saddles(level.image, _steepest_nearby(level, predicted, dark), sigma)
     good = np.isfinite(points[:, 0])
-    points = np.where(good[:, None], points, at.points)
-    good &= _off(at, points) < _tolerance(at)
-    sight = look(level, points, at, dark)
-    good &= sight.like & (sight.contrast > _WEAKEST * _usual(lattice)[row, col])
+    points = np.where(good[:, None], points, predicted.points)
+    good &= _off(predicted, points) < _tolerance(predicted)
+    check = check_vertices(level, points, predicted, dark)
+    good &= check.is_vertex & (check.contrast > _WEAKEST * _usual_contrast(lattice)[row, col])
     row, col = row[good], col[good]
     pixels, contrast = lattice.pixels.copy(), lattice.contrast.copy()
-    pixels[row, col], contrast[row, col] = points[good], sight.contrast[good]
+    pixels[row, col], contrast[row, col] = points[good], check.contrast[good]
     return Lattice(pixels, contrast, lattice.dark)
 
 
-def _usual(lattice: Lattice) -> Array:
-    """(rows, cols) mean contrast of the known vertices at most two away, the nearer ones counting more."""
+def _usual_contrast(lattice: Lattice) -> Array:
+    """(rows, cols) weighted mean contrast of the known vertices at most two away."""
     seen = lattice.seen
     known = np.where(seen, lattice.contrast, 0.0)
     return np.asarray(_around(_around(known)) / np.maximum(_around(_around(seen)), 1))
 
 
-def _off(at: Expected, points: Array) -> Array:
-    """(N,) how far points are from where they are expected, along the farther way [squares]."""
-    away = np.abs(at.in_squares(points - at.points))
+def _off(predicted: PredictedVertices, points: Array) -> Array:
+    """(N,) distance of points from their predictions, the larger component [squares]."""
+    away = np.abs(predicted.in_squares(points - predicted.points))
     return np.maximum(away[:, 0], away[:, 1])
 
 
-def _tolerance(at: Expected) -> Array:
-    """How far a vertex may be from where it is expected; (N,) [squares]."""
-    return np.asarray(_OFF + _OFF_SPREAD * at.spread + _OFF_PX / np.maximum(at.width, 1e-3))
+def _tolerance(predicted: PredictedVertices) -> Array:
+    """(N,) greatest distance of a vertex from its prediction [squares]."""
+    return np.asarray(_OFF + _OFF_SPREAD * predicted.spread + _OFF_PX / np.maximum(predicted.width, 1e-3))
 
 
 def _inside(level: Level, points: Array) -> NDArray[np.bool_]:
@@ -228,12 +138,12 @@ _SHARES = np.stack(np.meshgrid(*[np.linspace(-_SEARCHED, _SEARCHED, _STEPS)] * 2
 _PRIOR = 1 - 0.4 * np.abs(_SHARES).max(axis=1) / _SEARCHED
 
 
-def _searched(level: Level, at: Expected, dark: Array) -> Array:
-    """Places near the expected ones where a saddle of the right colours is steepest; (N, 2) [px]."""
-    places = at.around(_SHARES, at.points)
+def _steepest_nearby(level: Level, predicted: PredictedVertices, dark: Array) -> Array:
+    """Places near the predictions where a saddle of the right sign is steepest; (N, 2) [px]."""
+    places = predicted.around(_SHARES, predicted.points)
     maps = places.astype(np.float32)
-    uu, uv, vv = (sampled(x, maps) for x in level.curvature)
-    (c_u, c_v), (r_u, r_v) = -dark * at.c.T, at.r.T
+    uu, uv, vv = (interpolate(x, maps) for x in level.curvature)
+    (c_u, c_v), (r_u, r_v) = -dark * predicted.c.T, predicted.r.T
     steepness = (c_u * r_u)[:, None] * uu
     steepness += (c_v * r_v)[:, None] * vv
     steepness += (c_u * r_v + c_v * r_u)[:, None] * uv
@@ -241,61 +151,49 @@ def _searched(level: Level, at: Expected, dark: Array) -> Array:
     return np.asarray(places[np.arange(len(places)), steepness.argmax(axis=1)])
 
 
-def judged(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
-    """The lattice with its vertices' contrasts, and which of them look right and are where they should be."""
-    row, col, at = lattice.known
+def check_lattice(level: Level, lattice: Lattice) -> tuple[Lattice, NDArray[np.bool_]]:
+    """The lattice with the contrasts of its vertices, and a mask of those that pass all tests."""
+    row, col, predicted = lattice.predicted
     points = lattice.pixels[row, col]
-    sight = look(level, points, at, signs(row, col, lattice.dark))
+    check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
     contrast = lattice.contrast.copy()
-    contrast[row, col] = sight.contrast
+    contrast[row, col] = check.contrast
     result = lattice.with_contrast(contrast)
-    right = sight.like & (_off(at, points) < _tolerance(at)) & (at.area > 4) & (at.spread < 2 * _MOST_SPREAD)
-    right &= sight.contrast > _WEAKEST * _usual(result)[row, col]
+    right = (
+        check.is_vertex
+        & (_off(predicted, points) < _tolerance(predicted))
+        & (predicted.area > 4)
+        & (predicted.spread < 2 * _MOST_SPREAD)
+    )
+    right &= check.contrast > _WEAKEST * _usual_contrast(result)[row, col]
     good = np.zeros(contrast.shape, dtype=bool)
     good[row, col] = right
     return result, good
 
 
-def cleaned(level: Level, lattice: Lattice) -> Lattice:
-    """Take out vertices that look wrong or are not where their neighbours put them."""
+def remove_outliers(level: Level, lattice: Lattice) -> Lattice:
+    """Remove vertices that do not look like one or are far from their predictions, the worst ones first."""
     for _ in range(_ROUNDS):
-        row, col, at = lattice.known
+        row, col, predicted = lattice.predicted
         if not len(row):
             break
         pixels, contrast, seen = lattice.pixels, lattice.contrast.copy(), lattice.seen
         points = pixels[row, col]
-        off = _off(at, points) / _tolerance(at)
-        off = np.where((at.area > 0) & (at.spread < 2 * _MOST_SPREAD), off, np.inf)
-        sight = look(level, points, at, signs(row, col, lattice.dark))
-        # One that closes no square has little that speaks for it.
-        closes = squared(seen)[row, col]
-        plain = sight.like & (closes | ((sight.even > _EVEN_ALONE) & (off < _OFF_ALONE)))
-        off = np.where(plain, off, np.inf)
-        contrast[row, col] = sight.contrast
+        off = _off(predicted, points) / _tolerance(predicted)
+        off = np.where((predicted.area > 0) & (predicted.spread < 2 * _MOST_SPREAD), off, np.inf)
+        check = check_vertices(level, points, predicted, signs(row, col, lattice.dark))
+        # There is less evidence for a vertex outside complete squares.
+        closes = in_whole_square(seen)[row, col]
+        accepted = check.is_vertex & (closes | ((check.evenness > _EVEN_ALONE) & (off < _OFF_ALONE)))
+        off = np.where(accepted, off, np.inf)
+        contrast[row, col] = check.contrast
         if not (off > 1).any():
             lattice = lattice.with_contrast(contrast)
             break
-        # Next to a bad vertex good ones look bad too: only the worst of each place goes.
+        # An outlier spoils the predictions of its neighbours: remove only the worst of each neighbourhood.
         worst = np.zeros(pixels.shape[:2])
         worst[row, col] = off
-        bad = (worst > 1) & (worst >= _largest_around(worst))
+        bad = (worst > 1) & (worst >= cv2.dilate(worst, np.ones((3, 3), np.uint8)))
         pixels = np.where(bad[..., None], np.nan, pixels)
         lattice = Lattice(pixels, np.where(bad, np.nan, contrast), lattice.dark)
-    return cropped(lattice)
-
-
-def squared(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which vertices are corners of a square with four known corners."""
-    whole = seen[:-1, :-1] & seen[:-1, 1:] & seen[1:, :-1] & seen[1:, 1:]
-    squared = np.zeros_like(seen)
-    for part in (np.s_[:-1, :-1], np.s_[:-1, 1:], np.s_[1:, :-1], np.s_[1:, 1:]):
-        squared[part] |= whole
-    return squared
-
-
-def _largest_around(values: Array) -> Array:
-    """Maximum over the 3 x 3 places around each."""
-    framed = np.zeros((values.shape[0] + 2, values.shape[1] + 2))
-    framed[1:-1, 1:-1] = values
-    rows = np.maximum(np.maximum(framed[:-2], framed[1:-1]), framed[2:])
-    return np.asarray(np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:]))
+    return lattice.cropped()

@@ -1,4 +1,4 @@
-"""An image at several sizes, with the second derivatives that show where two edges cross.
+"""An image pyramid, with the second derivatives that `saddles` uses.
 
 Pixel (u, v) of a level is pixel (2 u, 2 v) of the level below it: `cv2.pyrDown` keeps the even ones.
 """
@@ -14,21 +14,22 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["Level", "levels_of", "sampled"]
+__all__ = ["Level", "interpolate", "levels_of"]
 
 Image = NDArray[np.float32]
 
-_SMOOTHING = 1.0  # px; of the picture that is looked at, against noise and jagged edges
+# _SMOOTHING, _SMALLEST and _LEAST_NOISE are insensitive; the others bound memory.
+_SMOOTHING = 1.0  # px; against noise and aliasing
 _SMALLEST = 100  # px; the shorter side of the smallest level
-_LARGE = 30_000_000  # pixels of a picture whose noise is looked for in bands only ...
-_BANDS, _BAND = 24, 64  # ... of so many rows
-_ROWS = 32000  # of places that are looked at in one go
-_LEAST_NOISE = 0.12  # DN of a second derivative; what rounding to 8 bits leaves
+_LARGE = 30_000_000  # pixels; in larger images the noise is measured in bands only, to save memory ...
+_BANDS, _BAND = 24, 64  # ... so many, of so many rows
+_ROWS = 32000  # rows of one call to cv2.remap, which counts them in 16 bits
+_LEAST_NOISE = 0.12  # DN/px^2; rounding to 8 bits leaves this much
 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A reduced image.
+    """A level of the pyramid.
 
     Attributes
     ----------
@@ -43,7 +44,7 @@ class Level:
 
     @cached_property
     def smooth(self) -> Image:
-        """The image without its finest grain."""
+        """The image after Gaussian smoothing."""
         return np.asarray(cv2.GaussianBlur(self.image, (0, 0), _SMOOTHING), dtype=np.float32)
 
     @cached_property
@@ -57,11 +58,10 @@ class Level:
 
     @cached_property
     def noise(self) -> float:
-        """Standard deviation of the second derivatives where nothing is [DN/px^2]."""
+        """Standard deviation of the second derivatives by noise alone [DN/px^2], from their median."""
         if self.image.size <= _LARGE:
             sparse = self.curvature[1][::4, ::4]
         else:
-            # Bands tell as much, and the derivatives of such a picture would fill the memory.
             first = np.linspace(0, len(self.image) - _BAND, _BANDS).astype(int)
             bands = [Level(self.image[v : v + _BAND], self.scale).curvature[1] for v in first]
             sparse = np.concatenate([band[4:-4:4, ::4] for band in bands])
@@ -69,12 +69,12 @@ class Level:
 
 
 def levels_of(image: NDArray[np.generic]) -> list[Level]:
-    """Halve an image again and again.
+    """Halve an image repeatedly.
 
     Parameters
     ----------
     image : (height, width) array
-        8 or 16 bits, or real numbers of any range.
+        Of 8 or 16 bits, or real numbers of any range.
 
     Returns
     -------
@@ -90,7 +90,7 @@ def levels_of(image: NDArray[np.generic]) -> list[Level]:
 
 
 def _grey(image: NDArray[np.generic]) -> Image:
-    """Grey levels of 8 bits as real numbers."""
+    """The image as float32, scaled to the grey levels of 8 bits."""
     if image.dtype == np.uint8:
         return image.astype(np.float32)
     if image.dtype == np.uint16:
@@ -107,11 +107,10 @@ def _grey(image: NDArray[np.generic]) -> Image:
     return np.asarray(np.nan_to_num(scaled), dtype=np.float32)
 
 
-def sampled(image: Image, points: NDArray[np.floating]) -> Array:
-    """Interpolate an image at points of any shape (..., 2) [px]; outside the border goes on."""
+def interpolate(image: Image, points: NDArray[np.floating]) -> Array:
+    """Interpolate an image at points (..., 2) [px]; the border is repeated outside."""
     flat = points.reshape(-1, points.shape[-2], 2) if points.ndim > 2 else points.reshape(-1, 1, 2)
     maps = flat.astype(np.float32, copy=False)
-    # The interpolation's tables count rows in 16 bits.
     parts = [
         cv2.remap(image, maps[k : k + _ROWS], None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
         for k in range(0, len(maps), _ROWS)

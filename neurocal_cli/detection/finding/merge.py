@@ -1,15 +1,19 @@
-"""Lattices that continue each other behind something that hides the board are one."""
+"""Joining the two parts of a board that an occluder divides.
+
+In: the lattices of a level. Out: the same, with those joined that continue each other on one grid.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.grow import Lattice
+from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.geometry import Array
 
-__all__ = ["merged"]
+__all__ = ["merge_lattices"]
 
+# Insensitive; tests/test_finding.py divides a board into two halves and expects one grid.
 _NEAR = 4.0  # squares; of one lattice from the other, to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; farthest from whole numbers, median and worst
 _LEAST = 4  # vertices compared
@@ -18,8 +22,8 @@ _TURNS = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))
 Index = NDArray[np.intp]
 
 
-def merged(lattices: list[Lattice]) -> list[Lattice]:
-    """Put lattices together whose coordinates agree where each, continued, meets the other."""
+def merge_lattices(lattices: list[Lattice]) -> list[Lattice]:
+    """Join lattices whose grid coordinates agree where each one, extrapolated, meets the other."""
     result = sorted(lattices, key=lambda x: -int(x.seen.sum()))
     first = 0
     while first < len(result):
@@ -55,7 +59,7 @@ def _union(large: Lattice, small: Lattice) -> Lattice | None:
 
 
 def _motion(base: Lattice, other: Lattice) -> tuple[Index, Index] | None:
-    """The turn (2, 2) and shift (2,) from one lattice's (c, r) to those of the base, if they agree."""
+    """Rotation (2, 2) and shift (2,) from a lattice's (c, r) to those of the base; None if they disagree."""
     row, col = np.nonzero(other.seen)
     grid = _continued(base, other)
     rows, cols = base.seen.shape
@@ -70,7 +74,7 @@ def _motion(base: Lattice, other: Lattice) -> tuple[Index, Index] | None:
         shift = np.rint(np.median(away, axis=0)).astype(np.intp)
         off = np.abs(away - shift).max(axis=1)
         if np.median(off) < _WHOLE and off.max() < _WHOLE_WORST:
-            # The same square has to be dark in both.
+            # The same square must be dark in both.
             square = np.floor(np.array([0.5, 0.5]) @ turn.T + shift).astype(np.intp)
             same = (square.sum() + base.dark) % 2 == other.dark % 2
             return (turn, shift) if same else None
@@ -78,11 +82,11 @@ def _motion(base: Lattice, other: Lattice) -> tuple[Index, Index] | None:
 
 
 def _continued(base: Lattice, other: Lattice) -> Array:
-    """Coordinates (N, 2) of another lattice's vertices in the base, continued as a plane."""
+    """Coordinates (N, 2) of another lattice's vertices on the base, extrapolated by a homography."""
     row, col = np.nonzero(base.seen)
     p, q = base.pixels[row, col], other.pixels[other.seen]
     away = np.sqrt(((p[:, None] - q[None]) ** 2).sum(axis=-1).min(axis=1))
-    # What is near the other lattice counts most: lenses bend the plane.
+    # A lens distorts the plane, so that vertices near the other lattice count most.
     weight = np.exp(-(away - away.min()) / (_NEAR * max(base.width, 1e-3)))
     centre, scale = p.mean(axis=0), max(float(p.std()), 1e-6)
     x, y = ((p - centre) / scale).T

@@ -1,8 +1,9 @@
-"""Where a vertex should be, from its neighbours: a smooth map fitted around every place.
+"""Predicting a vertex from its neighbours, by a local regression.
 
-The map is a quadratic polynomial of the grid coordinates, fitted to the vertices at most three
-squares away. Its second derivatives are held small, as they are for perspective and lens
-distortion, so that few neighbours give a plane map and many a curved one.
+In: an array of known vertices and places in it. Out: the predicted pixel of each place, the steps to the
+next vertices, and the prediction's spread. The map is a quadratic polynomial of the grid coordinates, fitted
+to the vertices at most three squares away by weighted ridge regression. The ridge keeps second derivatives
+small, as perspective and distortion make them, so that few neighbours give a linear map.
 """
 
 from __future__ import annotations
@@ -15,16 +16,17 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["Expected", "expected"]
+__all__ = ["PredictedVertices", "predict_vertices"]
 
+# _REACH and _RIDGE are insensitive; tests/test_finding.py.
 _REACH = 3  # squares
-_WIDTH = 1.4  # squares; of the weights
-_HELD_BACK = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])
+_WIDTH = 1.4  # squares; standard deviation of the Gaussian weights
+_RIDGE = np.diag([1e-9, 1e-3, 1e-3, 0.15, 0.15, 0.15])
 
 _c, _r = (x.ravel().astype(float) for x in np.meshgrid(*[np.arange(-_REACH, _REACH + 1)] * 2))
 _BASIS = np.stack([np.ones_like(_c), _c, _r, 0.5 * _c**2, _c * _r, 0.5 * _r**2], axis=-1)
 _WEIGHT = np.exp(-0.5 * (_c**2 + _r**2) / _WIDTH**2) * (_c**2 + _r**2 > 0)
-# Products of the basis with itself and its weights, a row for each neighbour; then 1, for their number.
+# Weighted products of the basis with itself, one row for each neighbour, and a 1 that counts them.
 _PRODUCTS = (_WEIGHT[:, None, None] * _BASIS[:, :, None] * _BASIS[:, None, :]).reshape(len(_c), -1)
 _PRODUCTS = np.concatenate([_PRODUCTS, np.ones((len(_c), 1))], axis=1)
 _RIGHT = _WEIGHT[:, None] * _BASIS
@@ -32,35 +34,35 @@ _FIRST, _ONES = np.eye(6)[0], np.ones(len(_c))
 
 
 @dataclass(frozen=True, eq=False)
-class Expected:
-    """Expected vertices.
+class PredictedVertices:
+    """Predicted vertices.
 
     Attributes
     ----------
     points : (N, 2) array [px]
-    ways : (N, 2, 2) array [px]
-        To the next vertex along a row, and along a column.
+    steps : (N, 2, 2) array [px]
+        From it to the next vertex along a row, and along a column.
     spread : (N,) array
         Standard deviation of the point per standard deviation of a vertex.
     """
 
     points: Array
-    ways: Array
+    steps: Array
     spread: Array
 
-    def __getitem__(self, which: NDArray[np.generic]) -> Expected:
+    def __getitem__(self, which: NDArray[np.generic]) -> PredictedVertices:
         """Some of them."""
-        return Expected(self.points[which], self.ways[which], self.spread[which])
+        return PredictedVertices(self.points[which], self.steps[which], self.spread[which])
 
     @property
     def c(self) -> Array:
-        """(N, 2) ways along a row [px]."""
-        return self.ways[:, 0]
+        """(N, 2) steps along a row [px]."""
+        return self.steps[:, 0]
 
     @property
     def r(self) -> Array:
-        """(N, 2) ways along a column [px]."""
-        return self.ways[:, 1]
+        """(N, 2) steps along a column [px]."""
+        return self.steps[:, 1]
 
     @cached_property
     def area(self) -> Array:
@@ -69,14 +71,14 @@ class Expected:
 
     @property
     def width(self) -> Array:
-        """(N,) distance between opposite sides of a square, the smaller one [px]."""
-        length = np.hypot(self.ways[..., 0], self.ways[..., 1])
+        """(N,) smaller distance between opposite sides of a square [px]."""
+        length = np.hypot(self.steps[..., 0], self.steps[..., 1])
         longest = np.maximum(length[:, 0], length[:, 1])
         return np.asarray(np.abs(self.area) / np.maximum(longest, 1e-9))
 
     def around(self, shares: Array, points: Array) -> Array:
         """Places (N, K, 2) around points (N, 2), at shares (K, 2) of `c` and `r`."""
-        return np.asarray(points[:, None] + shares @ self.ways)
+        return np.asarray(points[:, None] + shares @ self.steps)
 
     def in_squares(self, away: Array) -> Array:
         """Pixel offsets (N, 2) as shares of `c` and `r`."""
@@ -96,27 +98,27 @@ def _window(width: int) -> NDArray[np.intp]:
     return (size[:, None] * width + size).ravel()
 
 
-def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Expected:
-    """Expect vertices where their neighbours put them, whether they are known or not.
+def predict_vertices(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> PredictedVertices:
+    """Predict vertices from their neighbours, whether they are known or not.
 
     Parameters
     ----------
     pixels : (rows, cols, 2) array [px]
-        nan where unknown.
+        NaN where unknown.
     row, col : (N,) int arrays
     """
     rows, cols = pixels.shape[:2]
-    framed = np.zeros((3, rows + 2 * _REACH, cols + 2 * _REACH))
-    inner = framed[:, _REACH:-_REACH, _REACH:-_REACH]
+    padded = np.zeros((3, rows + 2 * _REACH, cols + 2 * _REACH))
+    inner = padded[:, _REACH:-_REACH, _REACH:-_REACH]
     seen = ~np.isnan(pixels[..., 0])
     np.copyto(inner[:2], pixels.transpose(2, 0, 1), where=seen)
     inner[2] = seen
-    width = framed.shape[2]
-    near = framed.reshape(3, -1).take((row * width + col)[:, None] + _window(width), axis=1)
+    width = padded.shape[2]
+    near = padded.reshape(3, -1).take((row * width + col)[:, None] + _window(width), axis=1)
     known = near[2]
     sums = known @ _PRODUCTS
-    normal = sums[:, :-1].reshape(-1, 6, 6) + _HELD_BACK
-    # About the mean of the neighbours, for the sake of rounding.
+    normal = sums[:, :-1].reshape(-1, 6, 6) + _RIDGE
+    # Relative to the mean of the neighbours, against rounding errors.
     origin = near[:2] @ _ONES
     origin /= np.maximum(sums[:, -1], 1.0)
     offset = near[:2]
@@ -125,4 +127,4 @@ def expected(pixels: Array, row: NDArray[np.intp], col: NDArray[np.intp]) -> Exp
     right[:, :, :2] = (offset @ _RIGHT).transpose(1, 2, 0)
     right[:, :, 2] = _FIRST
     solution = np.linalg.solve(normal, right)
-    return Expected(solution[:, 0, :2] + origin.T, solution[:, 1:3, :2], np.sqrt(solution[:, 0, 2]))
+    return PredictedVertices(solution[:, 0, :2] + origin.T, solution[:, 1:3, :2], np.sqrt(solution[:, 0, 2]))

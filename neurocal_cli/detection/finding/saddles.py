@@ -1,7 +1,9 @@
-"""Places where two edges cross, as the vertices of a chessboard do.
+"""Saddle points of the brightness, where two edges may cross: the candidates for vertices.
 
-A vertex has four *ports*, the directions in which its edges leave it, numbered by growing angle
-(from u towards v) such that a dark sector follows ports 0 and 2 and a bright one ports 1 and 3.
+In: a level of the pyramid. Out: saddles with sub-pixel positions, the directions of their four edges, and
+their contrast; `links` connects them. A vertex has four *ports*, the directions in which its edges leave it,
+numbered by growing angle (from u towards v) such that a dark sector follows ports 0 and 2 and a bright one
+ports 1 and 3.
 """
 
 from __future__ import annotations
@@ -12,26 +14,25 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.levels import Level, sampled
-from neurocal_cli.detection.finding.refine import settle
+from neurocal_cli.detection.finding.levels import Level, interpolate
+from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 
 __all__ = ["Saddles", "find_saddles"]
 
-_THRESHOLD = 5.0  # standard deviations of the noise
-_BORDER = 4  # px
+# Insensitive, apart from _RADII: doubled, the rings reach beyond squares of 6 px, whose board is not found.
+_THRESHOLD = 5.0  # standard deviations of the noise, of the steepness of a saddle
+_BORDER = 4  # px, not searched
 _AROUND = 2  # px, within which a saddle is the steepest
-_BAND = 50_000  # pixels
-_RADII = (5.0, 3.0)  # px; of the rings, the better one first
-_RAYS = 32
-_MOST_BENT = np.radians(22)  # of a line on its way through the vertex
-_MOST_DIFFERENT = np.radians(14)  # between two rings
-_SHARPEST = 3.0  # standard deviations of the noise
-_ROUNDEST = 0.02  # ratio of the principal curvatures: along a bright stripe it is 0
-_NARROWEST = np.radians(14)
-_PER_MEGAPIXEL = 4000  # saddles that are looked at ...
-_MOST = 1400  # ... and kept
-_LEAST = 500
+_BAND = 50_000  # pixels of a band that fits the processor's cache
+_RADII = (5.0, 3.0)  # px of the rings; the larger one is more accurate
+_RAYS = 32  # of a ring
+_MOST_BENT = np.radians(22)  # greatest angle between the two halves of a line through the vertex
+_MOST_DIFFERENT = np.radians(14)  # greatest angle between ports from the two rings
+_LEAST_CURVATURE = 3.0  # standard deviations of the noise, of the weaker principal curvature ...
+_LEAST_RATIO = 0.02  # ... and its ratio to the stronger one, which is 0 along a stripe
+_NARROWEST = np.radians(14)  # least angle between two lines
+_PER_MEGAPIXEL, _LEAST, _MOST = 4000, 500, 1400  # saddles examined, at least examined, and kept; for time
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,20 +68,20 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     ----------
     level : Level
     covered : (height, width) uint8 array, optional
-        Non-zero where not to look.
+        Non-zero where not to search.
     """
-    points = _strongest(level, covered)
-    points = settle(level.image, points, 1.0, rounds=2)
+    points = _steepest_pixels(level, covered)
+    points = refine_saddles(level.image, points, 1.0, rounds=2)
     points = points[np.isfinite(points[:, 0])]
-    curved, sharp = _curved(level, points)
+    curved, sharp = _ports_from_curvature(level, points)
     points, curved = points[sharp], curved[sharp]
     if not len(points):
         return Saddles(np.zeros((0, 2)), np.zeros((0, 4)), np.zeros(0))
     noise = level.noise
-    rings = [_ring(sampled(level.smooth, points + (r * _DIRECTIONS)[:, None]), noise) for r in _RADII]
+    rings = [_ring(interpolate(level.smooth, points + (r * _DIRECTIONS)[:, None]), noise) for r in _RADII]
     (ports, contrast, good), (ports_small, contrast_small, good_small) = rings
-    # Where squares are small, rings reach into the next ones: trust a ring that agrees with a
-    # smaller one, and curvature where none does.
+    # A ring larger than the squares is wrong. Use it only where the smaller ring agrees, and the
+    # curvature where neither ring is reliable.
     good &= ~(good_small & (_differ(ports, ports_small) > _MOST_DIFFERENT))
     astray = _differ(ports_small, curved) > 2 * _MOST_DIFFERENT
     ports_small = np.where(astray[:, None], curved, ports_small)
@@ -91,15 +92,15 @@ def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Sadd
     return Saddles(points[kept], ports[kept], contrast[kept])
 
 
-def _curved(level: Level, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Ports from the second derivatives, and whether both principal curvatures stand out from noise."""
+def _ports_from_curvature(level: Level, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Ports from the second derivatives, and whether both principal curvatures exceed the noise."""
     u, v = np.rint(points.T).astype(np.intp)
     uu, uv, vv = (x[v, u].astype(float) for x in level.curvature)
     middle, radius = 0.5 * (uu + vv), np.hypot(0.5 * (uu - vv), uv)
     rising, falling = np.maximum(middle + radius, 1e-9), np.maximum(radius - middle, 1e-9)
     weaker, stronger = np.minimum(rising, falling), np.maximum(rising, falling)
-    sharp = (weaker > _SHARPEST * level.noise) & (weaker > _ROUNDEST * stronger)
-    # Dark sectors lie to both sides of the direction in which brightness falls off.
+    sharp = (weaker > _LEAST_CURVATURE * level.noise) & (weaker > _LEAST_RATIO * stronger)
+    # The middle of the dark sectors is the direction of the negative principal curvature.
     dark = 0.5 * np.arctan2(2 * uv, uu - vv) + np.pi / 2
     half = np.arctan(np.sqrt(falling / rising))
     ports = np.stack([dark - half, dark + half, dark - half + np.pi, dark + half + np.pi], axis=-1)
@@ -107,7 +108,7 @@ def _curved(level: Level, points: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _differ(first: Array, second: Array) -> Array:
-    """Largest angle between two sets of ports, whichever of the opposite ones come first."""
+    """Largest angle between two sets of ports, modulo pi."""
     away = first[:, :2] - second[:, :2]
     return np.abs((away + np.pi / 2) % np.pi - np.pi / 2).max(axis=1)
 
@@ -117,8 +118,8 @@ _DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=-1)
 _NEXT = (np.arange(_RAYS) + 1) % _RAYS
 
 
-def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:
-    """Whole pixels where the saddle is steepest; (N, 2)."""
+def _steepest_pixels(level: Level, covered: NDArray[np.uint8] | None) -> Array:
+    """The pixels with the steepest saddles; (N, 2)."""
     u, v, steepness = _peaks(level)
     if covered is not None:
         free = covered[v, u] == 0
@@ -132,13 +133,12 @@ def _strongest(level: Level, covered: NDArray[np.uint8] | None) -> Array:
 
 
 def _peaks(level: Level) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    """Whole pixels u, v (N,) where the saddle is steeper than within two pixels, and above the noise."""
+    """Pixels u, v (N,) where the saddle is steepest within two pixels and above the noise; its steepness."""
     uu, uv, vv = level.curvature
     height, width = uv.shape
     least = np.float32((_THRESHOLD * level.noise) ** 2)
     found = [(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.float32))]
     rows = max(8, _BAND // width)
-    # Band by band, which stays in the processor's cache.
     for top in range(_BORDER, height - _BORDER, rows):
         bottom = min(top + rows, height - _BORDER)
         band = slice(top - _AROUND, bottom + _AROUND)
@@ -156,7 +156,7 @@ def _peaks(level: Level) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
 
 
 def _ring(profile: Array, noise: float) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Ports and contrast from the brightness around points, and which are like a vertex's.
+    """Ports and contrast from the brightness on a ring around points, and whether it looks like a vertex.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def _ring(profile: Array, noise: float) -> tuple[Array, Array, NDArray[np.bool_]
     place, ray = np.nonzero(change.T[where])
     here, after = level[ray, place], level[_NEXT[ray], place]
     angle = ((ray + here / (here - after)) * (2 * np.pi / _RAYS)).reshape(-1, 4)
-    # The first sector ends at the second crossing; number the ports so that it is dark.
+    # The first sector lies between the first two ports; number these so that it is dark.
     dark = after[::4] < 0
     angle = np.where(dark[:, None], angle, np.concatenate([angle[:, 1:], angle[:, :1] + 2 * np.pi], axis=1))
     bent = np.abs(angle[:, 2:] - angle[:, :2] - np.pi)
@@ -185,7 +185,7 @@ def _ring(profile: Array, noise: float) -> tuple[Array, Array, NDArray[np.bool_]
     opening = mean[:, 1] - mean[:, 0]
     sound = (bent[:, 0] < _MOST_BENT) & (bent[:, 1] < _MOST_BENT)
     sound &= (opening > _NARROWEST) & (opening < np.pi - _NARROWEST)
-    # Opposite rays, each pair once.
+    # Opposite rays must have equal brightness.
     opposite = np.abs(level[: _RAYS // 2] - level[_RAYS // 2 :]).mean(axis=0)
     size = np.abs(level).mean(axis=0)
     sound &= opposite < 0.7 * size

@@ -1,132 +1,30 @@
-"""Blocks of 3 x 3 vertices that are linked by edges: where grids begin to grow.
+"""Seeds of grids: blocks of 3 x 3 vertices linked by edges, or of 2 x 3 where there are none.
 
-An edge leaves one vertex through a port that a dark sector follows and enters the next through a
-port that a dark sector precedes: along a line of the board, even and odd ports meet.
+In: saddles and their links. Out: blocks of saddles, the most regular ones first, for `grids` to grow.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.levels import Level, sampled
+from neurocal_cli.detection.finding.links import Index, Links
 from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.geometry import Array
 
-__all__ = ["Links", "find_links", "find_seeds", "find_slim_seeds"]
+__all__ = ["find_seeds_2x3", "find_seeds_3x3"]
 
-Index = NDArray[np.intp]
-
-_WIDEST = 0.26  # rad; between a port and the way to the neighbour
-_SHARE = 0.45  # the same as a share of the vertex's narrower angle
-_ASIDE = 2.0  # px; the neighbour may be off the port's direction by so much anyway
-_SIMILAR = 0.33  # least ratio of the contrasts of neighbours
-_IRREGULAR = 0.12  # squares; how much a seed's second differences may vary ...
-_BENT = 0.4  # ... as a share of what they may be
+_IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
+_SECOND = 0.4  # ... and the weight of these differences themselves
 
 
-@dataclass(frozen=True, eq=False)
-class Links:
-    """Neighbours of saddles along their edges.
-
-    Attributes
-    ----------
-    to : (N, 4) int array
-        The neighbour at each port; -1 where there is none.
-    port : (N, 4) int array
-        The neighbour's port that the edge enters.
-    """
-
-    to: Index
-    port: Index
-
-    @cached_property
-    def lists(self) -> tuple[list[list[int]], list[list[int]]]:
-        """Both as lists, to follow one after the other."""
-        return self.to.tolist(), self.port.tolist()
-
-
-def find_links(level: Level, saddles: Saddles) -> Links:
-    """Link every saddle with its nearest suitable neighbour at each port, where both choose each other."""
-    count = len(saddles)
-    place = saddles.points.astype(np.float32)
-    du, dv = (place[None, :, k] - place[:, None, k] for k in (0, 1))
-    distance = du * du + dv * dv
-    np.fill_diagonal(distance, np.inf)
-    port = _port_towards(du, dv, saddles.ports)
-    contrast = saddles.contrast.astype(np.float32)
-    fit = (port >= 0) & (port.T >= 0) & ((port ^ port.T) & 1 == 1)
-    fit &= contrast[:, None] > _SIMILAR * contrast[None, :]
-    fit &= contrast[None, :] > _SIMILAR * contrast[:, None]
-    to = np.full((count, 4), -1, dtype=np.intp)
-    entry = np.full((count, 4), -1, dtype=np.intp)
-    rows = np.arange(count)
-    for p in range(4):
-        length = np.where(fit & (port == p), distance, np.inf)
-        best = length.argmin(axis=1)
-        found = np.isfinite(length[rows, best])
-        to[found, p] = best[found]
-        entry[found, p] = port[best, rows][found]
-    mutual = (to >= 0) & (to[to, entry] == rows[:, None])
-    to[~mutual], entry[~mutual] = -1, -1
-    torn = ~_edges_seen(level, saddles, to, entry)
-    to[torn], entry[torn] = -1, -1
-    return Links(to, entry)
-
-
-def _port_towards(du: NDArray[np.float32], dv: NDArray[np.float32], ports: Array) -> NDArray[np.int8]:
-    """(N, N) the port of each saddle that leads to each other one, or -1."""
-    port = np.full(du.shape, -1, dtype=np.int8)
-    opening = ports[:, 1] - ports[:, 0]
-    widest = _SHARE * np.minimum(opening, np.pi - opening)
-    usual, most = (np.tan(x).astype(np.float32)[:, None] for x in (np.minimum(_WIDEST, widest), widest))
-    for line in range(2):
-        c, s = (f(ports[:, line]).astype(np.float32)[:, None] for f in (np.cos, np.sin))
-        along, across = c * du + s * dv, np.abs(c * dv - s * du)
-        reach = np.abs(along)
-        # Directions are only known to a pixel or two at the end of a short edge.
-        close = across < np.maximum(usual * reach, np.minimum(most * reach, _ASIDE))
-        port[close & (along > 0)] = line
-        port[close & (along < 0)] = line + 2
-    return port
-
-
-def _edges_seen(level: Level, saddles: Saddles, to: Index, entry: Index) -> NDArray[np.bool_]:
-    """(N, 4) whether bright and dark are told apart all along a link."""
-    seen = np.zeros(to.shape, dtype=bool)
-    first, p = np.nonzero(to >= 0)
-    if not len(first):
-        return seen
-    start, end = saddles.points[first], saddles.points[to[first, p]]
-    way = end - start
-    length = np.hypot(*way.T)
-    normal = np.stack([-way[:, 1], way[:, 0]], axis=-1) / length[:, None]
-    reach = np.clip(0.2 * length, 1.0, 2.5)
-    share = np.array([0.3, 0.5, 0.7])
-    middle = start[:, None] + share[:, None] * way[:, None]
-    offset = (reach[:, None] * normal)[:, None]
-    # Growing angles turn from the way to its normal: behind an even port that side is dark.
-    step = sampled(level.smooth, np.stack([middle - offset, middle + offset], axis=1))
-    rise = (step[:, 0] - step[:, 1]) * np.where(p % 2 == 0, 1, -1)[:, None]
-    contrast = np.minimum(saddles.contrast[first], saddles.contrast[to[first, p]])
-    seen[first, p] = rise.min(axis=1) > 0.15 * contrast
-    back = np.zeros_like(seen)
-    back[first, p] = seen[to[first, p], entry[first, p]]
-    return seen & back
-
-
-def find_seeds(saddles: Saddles, links: Links) -> tuple[Index, Array]:
+def find_seeds_3x3(saddles: Saddles, links: Links) -> Index:
     """Find blocks of four closed squares around a vertex, the most regular first.
 
     Returns
     -------
     members : (S, 3, 3) int array
         Saddles of each block; ``[.., r, c]`` with c along port 0 of the middle one, r along port 1.
-    irregularity : (S,) array
-        How little the block is like a smooth map, in squares.
     """
     closed = _closed(links)
     centre = np.flatnonzero(closed.all(axis=1))
@@ -134,19 +32,18 @@ def find_seeds(saddles: Saddles, links: Links) -> tuple[Index, Array]:
     block[:, 1, 1] = centre
     for p, (c, r) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
         block[:, 1 + r, 1 + c] = links.to[centre, p]
-        # The corner between ports p and p + 1: across the neighbour's port before the entry.
+        # The vertex between ports p and p + 1: from the neighbour, through the port before the entry.
         corner = links.to[links.to[centre, p], (links.port[centre, p] - 1) % 4]
         c2, r2 = ((1, 1), (-1, 1), (-1, -1), (1, -1))[p]
         block[:, 1 + r2, 1 + c2] = corner
     grid = saddles.points[block]
     irregularity = _irregularity(grid)
     order = np.argsort(irregularity, kind="stable")
-    order = order[irregularity[order] < _IRREGULAR]
-    return block[order], irregularity[order]
+    return block[order[irregularity[order] < _IRREGULAR]]
 
 
-def find_slim_seeds(saddles: Saddles, links: Links) -> tuple[Index, Index]:
-    """Find blocks of two closed squares side by side, where there are not four.
+def find_seeds_2x3(saddles: Saddles, links: Links) -> tuple[Index, Index]:
+    """Find blocks of two closed squares side by side.
 
     Returns
     -------
@@ -158,7 +55,7 @@ def find_slim_seeds(saddles: Saddles, links: Links) -> tuple[Index, Index]:
     closed = _closed(links)
     middle, p = np.nonzero(closed & np.roll(closed, -1, axis=1))
     right, down, left = (links.to[middle, (p + k) % 4] for k in range(3))
-    # The corners beyond the first and the second square.
+    # The outer vertices of the first and the second square.
     corner = links.to[right, (links.port[middle, p] - 1) % 4]
     other = links.to[down, (links.port[middle, (p + 1) % 4] - 1) % 4]
     block = np.stack([np.stack([left, middle, right], -1), np.stack([other, down, corner], -1)], axis=1)
@@ -171,7 +68,7 @@ def find_slim_seeds(saddles: Saddles, links: Links) -> tuple[Index, Index]:
 
 
 def _closed(links: Links) -> NDArray[np.bool_]:
-    """(N, 4) whether the square between port p and p + 1 closes after four edges."""
+    """(N, 4) whether four links from port p lead around the square to port p + 1."""
     count = len(links.to)
     at = np.repeat(np.arange(count)[:, None], 4, axis=1)
     port = np.repeat(np.arange(4)[None], count, axis=0)
@@ -184,9 +81,9 @@ def _closed(links: Links) -> NDArray[np.bool_]:
 
 
 def _irregularity(grid: Array) -> Array:
-    """How little (S, 3, 3, 2) blocks are like a smooth map, in squares; (S,) array.
+    """How far (S, 3, 3, 2) blocks are from a smooth map [squares]; (S,) array.
 
-    Perspective and lenses make squares grow steadily, alike in neighbouring rows.
+    Perspective and distortion make squares grow steadily, and alike in neighbouring rows.
     """
     if not len(grid):
         return np.zeros(0)
@@ -198,7 +95,7 @@ def _irregularity(grid: Array) -> Array:
     along_r = grid[:, 0] + grid[:, 2] - 2 * grid[:, 1]
     worst = np.zeros(len(grid))
     for bent in (along_c, along_r):
-        for part, weight in ((bent, _BENT), (np.diff(bent, axis=1), 1.0)):
+        for part, weight in ((bent, _SECOND), (np.diff(bent, axis=1), 1.0)):
             along = (part[..., 0] * r[:, None, 1] - part[..., 1] * r[:, None, 0]) / area
             across = (c[:, None, 0] * part[..., 1] - c[:, None, 1] * part[..., 0]) / area
             worst = np.maximum(worst, weight * np.maximum(np.abs(along), np.abs(across)).max(axis=1))

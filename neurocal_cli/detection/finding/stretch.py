@@ -1,4 +1,7 @@
-"""Boards seen so obliquely that their squares are slivers: a stretched picture shows them better."""
+"""Stretching the image of a very oblique board across its narrow squares.
+
+In: the saddles of a level without grids. Out: a stretched part of the level, in which to search again.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,13 @@ import numpy as np
 from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.geometry import Array
 
-__all__ = ["Stretched", "stretched"]
+__all__ = ["Stretched", "stretch"]
 
-_FACTOR = 2.0
-_ONE_WAY = 1.8  # least ratio of the gradients across and along the slivers
+_FACTOR = 2.0  # of the stretch
+_ANISOTROPY = 1.8  # least ratio of the gradients across and along the squares
 _AROUND = 12  # px; beyond the outermost saddles
-_STRAY = 3.0  # times the saddles' median distance from their middle
-_LARGEST = 0.25  # share of the picture that they are spread over
+_STRAY = 3.0  # times the median distance from the middle; farther saddles are ignored
+_LARGEST = 0.25  # share of the image that the saddles may cover
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +42,8 @@ class Stretched:
         return np.asarray((points - self.forth[:, 2]) @ np.linalg.inv(self.forth[:, :2]).T)
 
 
-def stretched(level: Level, saddles: Array) -> Stretched | None:
-    """Stretch the surroundings of saddles across the way most edges run.
+def stretch(level: Level, saddles: Array) -> Stretched | None:
+    """Stretch the surroundings of saddles across the direction of most edges.
 
     Parameters
     ----------
@@ -50,10 +53,9 @@ def stretched(level: Level, saddles: Array) -> Stretched | None:
     Returns
     -------
     part : Stretched or None
-        None where saddles are all over the picture, or edges run both ways.
+        None where saddles cover too much of the image, or edges have no main direction.
     """
     height, width = level.image.shape
-    # Stray saddles do not widen the part.
     away = np.hypot(*(saddles - np.median(saddles, axis=0)).T)
     saddles = saddles[away <= _STRAY * np.median(away)]
     low = np.maximum(np.floor(saddles.min(axis=0)) - _AROUND, 0).astype(int)
@@ -63,7 +65,7 @@ def stretched(level: Level, saddles: Array) -> Stretched | None:
     crop = level.smooth[low[1] : high[1], low[0] : high[0]]
     gradient = np.stack([cv2.Sobel(crop, cv2.CV_32F, *order).ravel() for order in ((1, 0), (0, 1))])
     strength, direction = np.linalg.eigh(gradient.astype(float) @ gradient.T)
-    if strength[1] < _ONE_WAY**2 * strength[0]:
+    if strength[1] < _ANISOTROPY**2 * strength[0]:
         return None
     along, across = direction.T
     across = across * np.sign(across[0] * along[1] - across[1] * along[0])  # not mirrored

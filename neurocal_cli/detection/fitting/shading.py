@@ -1,4 +1,7 @@
-"""Levels of the dark and the light squares over the image: low polynomials, fitted robustly."""
+"""Levels of the dark and the light squares over the image: polynomials of low degree, fitted robustly.
+
+In: levels measured inside squares or by edge fits. Out: `Shading`, the levels and their slopes anywhere.
+"""
 
 from __future__ import annotations
 
@@ -7,9 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.robust import median
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_median
 from neurocal_cli.geometry import Array
 
 __all__ = ["Levels", "Shading", "fit_shading", "square_levels"]
@@ -17,11 +20,12 @@ __all__ = ["Levels", "Shading", "fit_shading", "square_levels"]
 _x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
 # Weights of a square's corners in places (64, 4) of its interior, away from the blurred edges.
 _INTERIOR = np.stack([(1 - _x) * (1 - _y), _x * (1 - _y), (1 - _x) * _y, _x * _y], axis=-1)
-_STEPS = 2  # after the last degree
+# Insensitive.
+_STEPS = 2  # reweighted fits after the last degree has been reached
 _TUKEY = 5.0  # standard deviations beyond which a level counts as an outlier
 _TINY = 1e-9  # DN^2
 _RIDGE = 1e-12
-_LEAST_CONTRAST = 1e-3  # DN; where there is none, the fits fail by themselves but must not divide by it
+_LEAST_CONTRAST = 1e-3  # DN, against division by 0
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 
 
@@ -34,7 +38,7 @@ class Levels:
     place : (N, 2) array [px]
     level, variance : (N,) arrays [DN], [DN^2]
     noise : (N,) array [DN^2]
-        Variance of the pixels there, where it has been measured.
+        Variance of the pixels there, if measured.
     """
 
     place: Array
@@ -54,7 +58,7 @@ class Shading:
     dark, light : (6,) arrays [DN]
         Coefficients of 1, x, y, x^2, x y, y^2.
     spread : (2,) array [DN^2]
-        Variance of single squares' levels around the dark and the light polynomial, and of these.
+        Variance of single squares around the dark and the light polynomial, with that of the polynomial.
     """
 
     frame: Frame
@@ -79,7 +83,7 @@ class Shading:
 
 
 def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels]:
-    """Medians of the interiors of the squares whose four vertices are seen: dark and light ones."""
+    """Medians inside the dark and the light squares whose four vertices are known."""
     seen = grid.seen
     whole = seen[:-1, :-1] & seen[1:, :-1] & seen[:-1, 1:] & seen[1:, 1:]
     r, c = np.nonzero(whole)
@@ -91,7 +95,7 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
     values = image[v, u].astype(float)
     half = values.shape[1] // 2
     level = np.sort(values, axis=1)[:, half]
-    noise = (1.4826 * np.sort(np.abs(values - level[:, None]), axis=1)[:, half]) ** 2 + 1 / 12
+    noise = (MAD_TO_SIGMA * np.sort(np.abs(values - level[:, None]), axis=1)[:, half]) ** 2 + 1 / 12
     is_dark = (c + r + grid.dark) % 2 == 0
     middle = corners.mean(axis=1)
     dark, light = (
@@ -102,7 +106,7 @@ def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tupl
 
 
 def fit_shading(frame: Frame, dark: Levels, light: Levels) -> Shading:
-    """Polynomials through levels, as high as the levels' number allows."""
+    """Fit polynomials to levels, of the highest degree that their number allows."""
     (low, low_spread), (high, high_spread) = (_fit(frame, levels) for levels in (dark, light))
     return Shading(frame, low, high, np.array([low_spread, high_spread]))
 
@@ -113,25 +117,25 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
     if n == 0:
         return coefficients, np.inf
     terms = _terms(frame, levels.place)
-    residual, spread = levels.level - median(levels.level), 0.0
+    residual, spread = levels.level - upper_median(levels.level), 0.0
     most = max([m for m in _TERMS if 3 * m <= n], default=1)
-    # From the median on to higher degrees: hidden squares must be known before they can bend anything.
+    # From the median to higher degrees: hidden squares must be found before they can change a slope.
     for used in (*_TERMS, *(most,) * _STEPS):
         used = min(used, most)
-        # The median does not see the outliers that the weights have to find.
-        scatter = median(residual**2) / 0.455 * n / max(n - used, 1)
+        # The median is robust against the outliers that the weights have to find.
+        scatter = upper_median(residual**2) / CHI2_MEDIAN * n / max(n - used, 1)
         weight = np.maximum(1 - residual**2 / (_TUKEY**2 * scatter + _TINY), 1e-6) ** 2
         root = np.sqrt(weight / (levels.variance + spread))
         weighted = terms[:, :used].T * root
         normal = weighted @ weighted.T
-        # Of terms that can't be told apart none is made up.
+        # Keeps inseparable terms finite.
         normal.ravel()[:: used + 1] *= 1 + _RIDGE
         coefficients[:used] = np.linalg.solve(normal, weighted @ (levels.level * root))
         residual = levels.level - terms[:, :used] @ coefficients[:used]
-        # What the levels' own errors may do by chance is not taken for spread of the squares.
+        # Spread of the squares is only what the errors of the levels cannot explain.
         chance = 1 + 4 / np.sqrt(n)
-        spread = max(scatter - chance * median(levels.variance), 0.0)
-    return coefficients, spread + most / n * median(levels.variance)
+        spread = max(scatter - chance * upper_median(levels.variance), 0.0)
+    return coefficients, spread + most / n * upper_median(levels.variance)
 
 
 def _terms(frame: Frame, place: Array) -> Array:

@@ -1,13 +1,14 @@
-"""The smooth map from a grid's coordinates to pixels: homography, radial distortion, polynomial rest.
+"""The smooth map from grid coordinates to pixels: homography, radial distortion, polynomial.
 
-With x the grid coordinates scaled to [-1, 1] and pixels relative to the image's centre in half diagonals,
+It predicts mid-points along their edges and the curvature of edges; `map_fit` fits it. With x the
+grid coordinates scaled to [-1, 1] and pixels relative to the image's centre in half diagonals,
 
     q = (h0 x + h1 y + h2, h3 x + h4 y + h5) / (1 + h6 x + h7 y)
     p = q + e (k1 rho + k2 rho^2) + sum_k a_k T_k(x, y),    e = q - c
     rho = (1 + m) e_u^2 + 2 n e_u e_v + (1 - m) e_v^2
 
-with m and n for pixels that are not square, and T_k products of Chebyshev's polynomials of a total
-degree from 2 on.
+with m and n for pixels that are not square, and T_k products of Chebyshev polynomials of a total degree
+of at least 2.
 """
 
 from __future__ import annotations
@@ -20,18 +21,18 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["FORMS", "LENS", "Frame", "Places", "SmoothMap", "homography_start"]
+__all__ = ["MAP_MODELS", "RICHEST_LENS", "Frame", "Places", "SmoothMap", "homography_start"]
 
-# Forms of the map from the simplest on: (radial parameters, degree of the polynomial rest).
-FORMS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
-LENS = 3  # index of the richest form without a polynomial
+# Models of the map, the simplest first: (set of radial parameters, degree of the polynomial).
+MAP_MODELS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
+RICHEST_LENS = 3  # index of the richest model without a polynomial
 
 _HOMOGRAPHY, _LENS = 8, 6
 _REST = _HOMOGRAPHY + _LENS
 _FREE_LENS: tuple[tuple[int, ...], ...] = ((), (10,), (8, 9, 10, 11), (8, 9, 10, 11, 12, 13))
-# Standard deviations of what is known beforehand: the centre of distortion [half diagonals], k1 and k2,
-# m and n, the polynomial's coefficients [half diagonals]. They only bind what the data leave open.
-_CENTRE_PRIOR, _RADIAL_PRIOR, _PIXEL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.03, 0.1
+# Prior standard deviations of the centre of distortion [half diagonals], of k1 and k2, and of all others
+# [half diagonals]. Insensitive: they only matter for what the data do not determine.
+_CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -63,29 +64,29 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Grid points, each with a direction in the image, as maps of one form need them.
+    """Grid points, each with a direction in the image, prepared for maps of one model.
 
     Attributes
     ----------
     ground : (3, N) array
         Scaled coordinates x and y, and 1.
-    way : (2, N) array [px]
+    axis : (2, N) array [px]
         Unit vectors, times the frame's unit.
     origin : (N,) array [px]
         The frame's centre along them.
     rest : (2 m, N) array or None [px]
-        What the polynomials' coefficients change there, along u and along v.
+        Derivatives by the polynomials' coefficients, along u and along v.
     """
 
     ground: Array
-    way: Array
+    axis: Array
     origin: Array
     rest: Array | None
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothMap:
-    """A map with its parameters, of which some may be held at 0.
+    """A map with its parameters, some of which may be fixed at 0.
 
     Attributes
     ----------
@@ -93,11 +94,11 @@ class SmoothMap:
     parameters : (P,) array
         h0..h7, c_u, c_v, k1, k2, m, n, then a_k along u and along v.
     radial : int
-        What is free of the lens: nothing, k1, both and the centre, m and n as well.
+        Free parameters of the lens: none; k1; k1, k2 and the centre; all with m and n.
     degree : int
-        Of the polynomial rest, 0 without.
+        Of the polynomial; 0 without.
     covariance : (P, P) array
-        Of the parameters; 0 for those held.
+        Of the parameters; 0 for fixed ones.
     """
 
     frame: Frame
@@ -114,15 +115,15 @@ class SmoothMap:
 
     @property
     def prior(self) -> Array:
-        """(P,) inverse variances of what is known beforehand."""
+        """(P,) inverse variances of the prior."""
         weights = np.zeros(len(self.parameters))
         weights[8:10], weights[10:12], weights[12:] = 1 / np.square(
             [_CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR]
         )
         return weights
 
-    def shaped(self, radial: int, degree: int) -> SmoothMap:
-        """The map with other free parameters; new ones are 0 and old ones dropped."""
+    def with_model(self, radial: int, degree: int) -> SmoothMap:
+        """The map with other free parameters; new ones are 0, and old ones are dropped."""
         old = self.parameters[_REST:].reshape(2, -1)
         rest = np.zeros((2, len(_orders(degree, self.frame))))
         common = min(old.shape[1], rest.shape[1])
@@ -153,19 +154,19 @@ class SmoothMap:
         return np.asarray(frame.centre + frame.unit * q.T).reshape(grid.shape)
 
     def places(self, grid: Array, direction: Array) -> Places:
-        """Grid points (N, 2) and unit vectors (2, N), prepared for maps of this form."""
+        """Grid points (N, 2) and unit vectors (2, N), prepared for maps of this model."""
         frame = self.frame
         ground = np.ones((3, len(grid)))
         ground[:2] = ((grid - frame.origin) / frame.half).T
-        way = frame.unit * direction
+        axis = frame.unit * direction
         rest = None
         if self.degree:
             terms = _rest(self.degree, frame, ground[0], ground[1]).T
-            rest = (way[:, None] * terms).reshape(-1, len(grid))
-        return Places(ground, way, frame.centre @ direction, rest)
+            rest = (axis[:, None] * terms).reshape(-1, len(grid))
+        return Places(ground, axis, frame.centre @ direction, rest)
 
     def along(self, places: Places) -> tuple[Array, Array]:
-        """Pixels along the places' directions, and what they change by.
+        """Pixels along the places' directions, and their derivatives.
 
         Parameters
         ----------
@@ -176,53 +177,53 @@ class SmoothMap:
         -------
         value : (N,) array [px]
         derivatives : (P, N) array
-            By the parameters; 0 for those of the lens that are held.
+            By the parameters; 0 for fixed ones of the lens.
         """
-        values, way = self.parameters, places.way
-        out = np.empty((len(values), way.shape[1]))
+        values, axis = self.parameters, places.axis
+        out = np.empty((len(values), axis.shape[1]))
         homogeneous = self._homography @ places.ground
         depth = 1 / homogeneous[2]
         q = homogeneous[:2] * depth
-        value = (way * q).sum(axis=0)
+        value = (axis * q).sum(axis=0)
         value += places.origin
         if places.rest is not None:
             out[_REST:] = places.rest
             value += values[_REST:] @ places.rest
         if self.radial:
-            further, bent = self._lens(q, way, out[_HOMOGRAPHY:_REST])
+            further, turned = self._lens(q, axis, out[_HOMOGRAPHY:_REST])
             value += further
-            way = way + bent
+            axis = axis + turned
         else:
             out[_HOMOGRAPHY:_REST] = 0.0
         ground = places.ground * depth
-        np.multiply(way[:, None], ground, out=out[:6].reshape(2, 3, -1))
-        towards = (way * q).sum(axis=0)
+        np.multiply(axis[:, None], ground, out=out[:6].reshape(2, 3, -1))
+        towards = (axis * q).sum(axis=0)
         np.multiply(ground[:2], -towards, out=out[6:8])
         return value, out
 
-    def _lens(self, q: Array, way: Array, out: Array) -> tuple[Array, Array]:
-        """What the lens adds along ways (2, N), and to these; out (6, N) takes its derivatives."""
+    def _lens(self, q: Array, axis: Array, out: Array) -> tuple[Array, Array]:
+        """Contribution of the lens along axes (2, N) and its derivative by q; out (6, N) takes the others."""
         (k1, k2), metric = self.parameters[10:12], self._metric
         e = q - self.parameters[8:10, None]
         slope = metric @ e
         rho = (e * slope).sum(axis=0)
-        length = (way * e).sum(axis=0)
+        length = (axis * e).sum(axis=0)
         stretch = rho * k2
         growth = stretch * 2
         stretch += k1
         stretch *= rho
         growth += k1
         growth *= length
-        bent = way * stretch
+        turned = axis * stretch
         slope *= 2 * growth
-        bent += slope
-        np.negative(bent, out=out[:2])
+        turned += slope
+        np.negative(turned, out=out[:2])
         np.multiply(length, rho, out=out[2])
         np.multiply(out[2], rho, out=out[3])
         e_u, e_v = e
         np.multiply(growth, e_u * e_u - e_v * e_v, out=out[4])
         np.multiply(growth, 2 * e_u * e_v, out=out[5])
-        return length * stretch, bent
+        return length * stretch, turned
 
     @property
     def _homography(self) -> Array:
@@ -257,8 +258,8 @@ def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
 def _orders(degree: int, frame: Frame) -> tuple[tuple[int, int], ...]:
     """Orders (i, j) of the polynomials in x and in y.
 
-    Edges tell a place along a line only at the line's vertices. An order as high as their number less
-    one can be anything between them.
+    Edges determine the map along a line at the line's vertices only. An order must therefore be lower than
+    the number of vertices minus one.
     """
     most_x, most_y = (2 * frame.half - 1).tolist()
     return _orders_up_to(degree, max(most_x, 0), max(most_y, 0))

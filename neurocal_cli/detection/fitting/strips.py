@@ -1,4 +1,7 @@
-"""The pixels along lines of a chessboard: where the lines run, and windows of pixels around them."""
+"""Lines of a grid in the image, and the strips of pixels along them.
+
+In: a smooth map. Out: `Lines`, a local frame for each edge, and `Strips`, its pixels, for the edge fits.
+"""
 
 from __future__ import annotations
 
@@ -10,23 +13,23 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.geometry import Array
 
-__all__ = ["Lines", "Strips", "gather", "grid_lines"]
+__all__ = ["Lines", "Strips", "grid_lines", "strip_pixels"]
 
 Single = NDArray[np.float32]
 
 _AROUND = np.array([[0, 0], [-0.5, 0], [0.5, 0], [-0.5, -0.2], [-0.5, 0.2], [0.5, -0.2], [0.5, 0.2]])
-_CLOSEST = 0.5  # px
+_CLOSEST = 0.5  # px, least distance of parallel lines, against division by 0; insensitive
 _NEIGHBOURS = np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
 class Lines:
-    """Pieces of grid lines in the image, one cell long, each with the frame that its pixels are seen in.
+    """Pieces of grid lines in the image, one square long, each with a local frame.
 
     Attributes
     ----------
     middle : (E, 2) array [px]
-        Where the map sees the middle of the piece; origin of the frame.
+        Pixel of the middle of the piece; origin of the frame.
     tangent, normal : (E, 2) arrays
         Unit vectors; the normal points to the light side.
     curvature : (E,) array [1/px]
@@ -62,7 +65,7 @@ class Lines:
         across = s * s
         across *= _column(0.5 * self.curvature)
         across += d
-        # The frame is orthogonal, but longer than one where the line is bent.
+        # The vectors are orthogonal, but longer than one on curved lines.
         square = (self.tangent**2).sum(axis=1, keepdims=True)
         t, n = self.tangent / square, self.normal / square
         u, v = s * _column(t[:, 0]), s * _column(t[:, 1])
@@ -72,7 +75,7 @@ class Lines:
 
 
 def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light: Array) -> Lines:
-    """Lines of a grid as a map sees them.
+    """Lines of a grid in the image, by a map.
 
     Parameters
     ----------
@@ -95,7 +98,7 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
     normal = turned * (light * np.where(vertical, -1, 1))[:, None]
     ends = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], tangent)
     sag = np.einsum("eki,ei->ek", points[:, 1:3] - middle[:, None], normal)
-    # The parabola through both ends, its slope at the origin folded into the frame.
+    # A parabola through both ends; turn the frame by its slope at the origin.
     curvature = 2 * (sag[:, 1] / ends[:, 1] - sag[:, 0] / ends[:, 0]) / (ends[:, 1] - ends[:, 0])
     slope = sag[:, 0] / ends[:, 0] - 0.5 * curvature * ends[:, 0]
     tangent, normal = tangent + slope[:, None] * normal, normal - slope[:, None] * tangent
@@ -116,7 +119,7 @@ class Strips:
     Attributes
     ----------
     s, d : (E, N) arrays [px]
-        Tangential and normal coordinate, the latter less the line's curve.
+        Tangential coordinate, and normal distance from the curved line.
     value : (E, N) array [DN]
     inside : (E, N) bool array
         False for the padding and for pixels outside the strip or the image.
@@ -135,7 +138,7 @@ class Strips:
     beyond: Array
 
 
-def gather(
+def strip_pixels(
     image: NDArray[np.generic], lines: Lines, half_width: Array, trim: Array, stride: int = 1
 ) -> Strips:
     """Pixels of the strips ``|d| <= half_width`` between the ends of lines.
@@ -149,9 +152,9 @@ def gather(
     lines : Lines
     half_width : (E,) array [px]
     trim : (E, 2) array [px]
-        What is left out at the two ends.
+        Length to leave out at the two ends.
     stride : int
-        Only every so manieth column.
+        Use every n-th column only.
     """
     steep = np.abs(lines.tangent[:, 1]) > np.abs(lines.tangent[:, 0])
     order = np.where(steep[:, None], [[1, 0]], [[0, 1]])
@@ -166,13 +169,13 @@ def gather(
     column = first[:, None] + stride * np.arange(count)
     a: Array = column - middle[:, :1]
     along = a / t[:, :1]
-    # The chord's height over the tangent, to the first order: columns are cut straight.
+    # Height of the curve over its tangent, to first order.
     height = middle[:, 1:] + along * t[:, 1:] + 0.5 * lines.curvature[:, None] * along**2 / n[:, 1:]
     spread = half_width / np.abs(t[:, 0])
     rows = int(np.ceil(2 * spread.max() + 1))
     top = np.ceil(height - spread[:, None])
     window = _Window(np.asarray(column, dtype=float), top, rows, a, top - middle[:, 1:])
-    s, d = window.seen_along(t), window.seen_along(n)
+    s, d = window.coordinates_along(t), window.coordinates_along(n)
     d -= _column(0.5 * lines.curvature) * s * s
     inside = np.abs(d) <= _column(half_width)
     inside &= (s >= _column(low)) & (s <= _column(high))
@@ -196,13 +199,13 @@ def _values(image: NDArray[np.generic], lines: Lines, u: Single, v: Single) -> S
 
 
 def packed(wanted: NDArray[np.bool_], count: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Where the wanted ones of each row are, side by side.
+    """Positions of the wanted elements of each row, side by side.
 
     Parameters
     ----------
     wanted : (E, N) bool array
     count : (E,) int array
-        Of the wanted ones in each row.
+        Number of wanted elements in each row.
 
     Returns
     -------
@@ -240,11 +243,11 @@ class _Window:
     a: Array
     b: Array
 
-    def seen_along(self, way: Array) -> Single:
+    def coordinates_along(self, axis: Array) -> Single:
         """(E, C rows) coordinates along directions (E, 2) from the middle."""
-        first = (self.a * way[:, :1] + self.b * way[:, 1:]).astype(np.float32)
-        down = _column(way[:, 1]) * np.arange(self.rows, dtype=np.float32)
-        return np.asarray((first[:, :, None] + down[:, None]).reshape(len(way), -1), dtype=np.float32)
+        first = (self.a * axis[:, :1] + self.b * axis[:, 1:]).astype(np.float32)
+        down = _column(axis[:, 1]) * np.arange(self.rows, dtype=np.float32)
+        return np.asarray((first[:, :, None] + down[:, None]).reshape(len(axis), -1), dtype=np.float32)
 
     def framed(self, steep: NDArray[np.bool_], size: tuple[int, ...]) -> NDArray[np.bool_] | None:
         """(E, C rows) which pixels lie in an image of (height, width); None if all do."""

@@ -1,1 +1,1 @@
-"""Which grid is which plane of a board, and which of its points is which."""
+"""Identifying grids with planes of a board, and their vertices with its vertices."""

@@ -1,8 +1,8 @@
-"""Whether the board ends at a side of a grid, or its pattern goes on.
+"""Whether the board ends at a side of a grid, or its pattern continues.
 
-Beyond the outer vertices lies one more ring of squares. Where the board ends, what lies beyond the
-ring is the same behind its dark squares as behind its light ones, and it begins where the next
-vertices would be: something in front of the board or the image's border cut it elsewhere.
+In: an image and a grid. Out: an `End` for each of its four sides. Beyond the outer vertices lies one more
+ring of squares. Where the board ends, the light beyond the ring is the same behind dark and light squares,
+and it begins where the next vertices would be. An occluder or the image's border cuts the ring elsewhere.
 """
 
 from __future__ import annotations
@@ -21,17 +21,18 @@ __all__ = ["DIRECTIONS", "End", "board_ends"]
 # Sides of a grid by the direction (c, r) that leads out of it.
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
+# tests/test_identity.py classifies the ends of rendered boards, occluders and image borders.
 _STEPS = np.arange(0.60, 1.41, 0.05)  # squares outwards from the outer vertices
 _RING, _BEYOND = _STEPS < 0.76, _STEPS > 1.19
 _ACROSS = np.array([0.3, 0.5, 0.7])  # of a square's width
 _SAME, _DIFFERENT = 0.35, 0.6  # of the contrast between a dark and a light square
-_AT_THE_LINE = 0.12  # squares; a cut this near the outer line of the pattern is its end
+_AT_THE_LINE = 0.12  # squares; greatest distance of the board's end from the next vertices
 _SHARE = 0.75  # of the squares along a side that must agree
-_FEWEST = 2  # squares of a side that can be judged
+_FEWEST = 2  # squares of a side that must be usable
 
 
 class End(Enum):
-    """What is known of a side of a grid."""
+    """What the image shows at a side of a grid."""
 
     BOARD = "the board ends there"
     PATTERN = "the pattern goes on"
@@ -45,7 +46,7 @@ class _Side:
     Attributes
     ----------
     light : (N,) bool array
-        Whether the ring's square is light.
+        Whether the square of the ring is light.
     profile : (N, steps) array
         NaN where it leaves the image or the vertices are missing.
     """
@@ -55,20 +56,20 @@ class _Side:
 
 
 def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], End]:
-    """Tell for each side of a grid, named by its direction, whether the board ends there.
+    """Classify the sides of a grid, named by their directions.
 
     Parameters
     ----------
     grey : (height, width) array
     grid : Grid
     """
-    with np.errstate(invalid="ignore"):  # what is not known is nan
+    with np.errstate(invalid="ignore"):  # unknown values are NaN
         sides = _opposite(grey, grid.pixels.transpose(1, 0, 2), grid.dark)
         sides += _opposite(grey, grid.pixels, grid.dark)
-        return {direction: _judge(side) for direction, side in zip(DIRECTIONS, sides, strict=True)}
+        return {direction: _classify(side) for direction, side in zip(DIRECTIONS, sides, strict=True)}
 
 
-def _judge(side: _Side) -> End:
+def _classify(side: _Side) -> End:
     ring = side.profile[:, _RING].mean(axis=1)
     valid = np.abs(ring - side.light) < _SAME
     count = np.count_nonzero(valid)
@@ -81,7 +82,7 @@ def _judge(side: _Side) -> End:
     turns = np.abs(beyond - ring) > _SAME
     at_line = np.abs(_crossings(profile, ring, beyond) - 1) < _AT_THE_LINE
     agreeing, turning = np.count_nonzero(turns & at_line), np.count_nonzero(turns)
-    step = _median(beyond[~light]) - _median(beyond[light])
+    step = float(np.median(beyond[~light]) - np.median(beyond[light]))
     if step > _DIFFERENT and agreeing >= _SHARE * count:
         return End.PATTERN
     if abs(step) < _SAME and turning >= _FEWEST and agreeing >= _SHARE * turning:
@@ -89,15 +90,8 @@ def _judge(side: _Side) -> End:
     return End.UNKNOWN
 
 
-def _median(x: Array) -> float:
-    """The median; nan where anything is."""
-    ordered = np.sort(x)  # nan comes last
-    middle = 0.5 * (ordered[(len(x) - 1) // 2] + ordered[len(x) // 2])
-    return float("nan") if np.isnan(ordered[-1]) else float(middle)
-
-
 def _crossings(profile: Array, ring: Array, beyond: Array) -> Array:
-    """Where each profile is halfway between its ends [squares]; meaningless where those are equal."""
+    """Where each profile is halfway between its ends [squares]; arbitrary where these are equal."""
     rise = np.where(beyond > ring, 1.0, -1.0)[:, None]
     height = rise * (profile - 0.5 * (ring + beyond)[:, None])
     k = np.argmax(height[:, 1:] > 0, axis=1)  # the first step that is past the middle
@@ -129,7 +123,7 @@ def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[_Side]:
     level, values = values[: light.size].reshape(light.shape), values[light.size :].reshape(places.shape[:-1])
     padded = np.full((2, light.shape[1] + 2), np.nan)
     padded[:, 1:-1] = level
-    # Of the ring's colour is what lies beside the square inside: one neighbour may be missing.
+    # The squares beside the inner one have the colour of the ring's square; one of them may be missing.
     before, after = padded[:, :-2], padded[:, 2:]
     same = 0.5 * (np.where(np.isnan(before), after, before) + np.where(np.isnan(after), before, after))
     contrast = np.where(light, same - level, level - same)
@@ -161,7 +155,7 @@ def _between(line: Array, shares: Array) -> Array:
 
 
 def _sample(grey: NDArray[np.generic], places: Array) -> Array:
-    """Image between its pixels, linearly, at places (N, 2); NaN outside."""
+    """The image at places (N, 2), by linear interpolation in float64; NaN outside."""
     height, width = grey.shape
     if height < 2 or width < 2:
         return np.full(len(places), np.nan)

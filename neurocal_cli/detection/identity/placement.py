@@ -1,4 +1,4 @@
-"""How a grid may lie on a plane of the board: turned, mirrored where seen from behind, and shifted."""
+"""Placements of a grid on a plane of the board: turned, mirrored if seen from behind, and shifted."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def placements(
     *,
     mirrored: bool,
 ) -> Iterator[Placement]:
-    """All ways to lay a grid on a plane that its ends allow.
+    """All placements of a grid on a plane that agree with its ends.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def placements(
     ends : dict of End
         By the sides' directions; an absent one is unknown.
     mirrored : bool
-        Whether the plane may be seen from the side its axes turn the other way on.
+        Whether the plane may be seen from behind.
     """
     last = plane.cols - 1, plane.rows - 1
     cols, rows = grid.shape
@@ -100,7 +100,7 @@ def _allowed(
     last: tuple[int, int],
     ends: Mapping[tuple[int, int], End],
 ) -> bool:
-    """Whether the sides of a grid lie at the plane's ends where the board ends, and not where it goes on.
+    """Whether a grid's sides lie at the plane's ends exactly where the board ends.
 
     Parameters
     ----------

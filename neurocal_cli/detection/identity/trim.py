@@ -1,7 +1,7 @@
-"""Lines of vertices that a grid only seems to have.
+"""Removing outer lines of a grid that are not lines of the board.
 
-Where the paper of a board ends near its outer squares, a corner of the paper can look like a vertex,
-and where two planes meet, a square's corner at the fold can.
+A corner of the paper can look like a vertex where the paper ends near the outer squares, and so can the
+corner of a square at a fold.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["trimmed"]
 
-_FEW = 0.34  # share of a line's vertices up to which it may be none
-_FEW_AT_FOLDS = 0.6  # of one of several planes, whose places are proved by one camera seeing them all
+# tests/test_identity.py removes such lines, and keeps them on larger boards.
+_FEW = 0.34  # greatest share of vertices of a line that may be removed
+_FEW_AT_FOLDS = 0.6  # the same for several planes, which one camera tests afterwards
 
 
 def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
-    """Grid without the outer lines that are hardly there and keep it from fitting any plane.
+    """Remove outer lines with few vertices from a grid that is too large for every plane.
 
     Parameters
     ----------
@@ -31,7 +32,7 @@ def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
     Returns
     -------
     grid : Grid
-        The one given if it fits, or would not fit without such lines either.
+        The given one if it fits, or does not fit without such lines either.
     """
     left = grid
     few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
@@ -54,7 +55,7 @@ def _fits(grid: Grid, planes: Sequence[Plane]) -> bool:
 
 
 def _cropped(pixels: Array, dark: int, side: int) -> Grid:
-    """Without a side's line, and without the lines that are empty then."""
+    """The grid without the line of a side, and without lines that are empty then."""
     rows, cols = pixels.shape[:2]
     window = [slice(0, rows), slice(0, cols)]
     window[1 if side < 2 else 0] = slice(1, None) if side % 2 == 0 else slice(0, -1)

@@ -1,0 +1,136 @@
+"""Write the reference pages from the program itself: the commands' help and the names of the package.
+
+Run ``python docs/tools/reference.py`` and commit the result; a test compares the pages with the program.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+
+import neurocal_cli
+from neurocal_cli.commands import neurocal
+
+DOCS = Path(__file__).resolve().parents[1]
+MADE = "<!-- Made by docs/tools/reference.py; edit the program instead. -->"
+
+# The names of the package by topic. A name that is in none of them goes to the last.
+TOPICS = {
+    "Calibrating": ["calibrate", "Calibration", "Correspondences", "Camera", "Intrinsics", "Pose"],
+    "Judging": ["evaluate_camera", "evaluate_stereo", "evaluate_rig", "evaluate_lens"],
+    "Points from images": ["detect_points", "Board", "read_board", "read_image"],
+    "Removing distortion": ["undistort_points", "undistort_image"],
+    "Two cameras": ["calibrate_stereo", "fit_rig", "Rig", "triangulate"],
+    "Zoom lenses": ["fit_lens", "fit_lens_cameras", "camera_at", "ZoomLens"],
+    "Files": ["read_points", "write_points", "read_calibration", "write_calibration", "read_rig", "write_rig",
+              "read_lens", "write_lens", "read_lens_points", "read_lens_data"],
+    "Errors": ["NeurocalError"],
+    "More": [],
+}  # fmt: skip
+
+
+def pages() -> dict[str, str]:
+    """Paths below ``docs`` and texts of all pages that are made here."""
+    made = {f"commands/{_file(ctx)}": _command_page(ctx) for ctx in _walk(_root())}
+    return made | {"reference/api.md": _api_page()}
+
+
+def _root() -> click.Context:
+    return click.Context(neurocal, info_name="neurocal", **neurocal.context_settings)
+
+
+def _walk(ctx: click.Context) -> Iterator[click.Context]:
+    """The command and all below it that a user sees."""
+    yield ctx
+    if isinstance(ctx.command, click.Group):
+        for name in ctx.command.list_commands(ctx):
+            command = ctx.command.get_command(ctx, name)
+            if command is not None and not command.hidden:
+                yield from _walk(click.Context(command, info_name=name, parent=ctx))
+
+
+def _file(ctx: click.Context) -> str:
+    name = ctx.command_path.partition(" ")[2].replace(" ", "-")
+    return f"{name or 'index'}.md"
+
+
+def _command_page(ctx: click.Context) -> str:
+    summary, *paragraphs = re.split(r"\n\s*\n", inspect.cleandoc(ctx.command.help or ""))
+    parts = [MADE, f"# {ctx.command_path}", _prose(summary), _code(ctx.get_usage().partition(": ")[2])]
+    examples = [p for p in paragraphs if p.startswith("\b\nExamples:")]
+    parts += [_paragraph(p) for p in paragraphs if p not in examples]
+    parts += _list("Commands", [(_link(child), _summary(child)) for child in list(_walk(ctx))[1:]])
+    parts += _list(
+        "Arguments",
+        [(f"`{p.metavar}`", p.description) for p in ctx.command.params if hasattr(p, "description")],
+    )
+    parts += _list(
+        "Options", [_option(ctx, p) for p in ctx.command.get_params(ctx) if isinstance(p, click.Option)]
+    )
+    for example in examples:
+        parts += ["## Examples", _code(inspect.cleandoc(example.partition("Examples:")[2]))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _paragraph(text: str) -> str:
+    return _code(inspect.cleandoc(text[1:])) if text.startswith("\b\n") else _prose(text)
+
+
+def _prose(text: str) -> str:
+    return " ".join(text.split()).replace("<", "&lt;").replace("*", r"\*")
+
+
+def _code(text: str) -> str:
+    return f"```text\n{text.strip()}\n```"
+
+
+def _link(ctx: click.Context) -> str:
+    return f"[`{ctx.command_path}`]({_file(ctx)})"
+
+
+def _summary(ctx: click.Context) -> str:
+    return re.split(r"\n\s*\n", inspect.cleandoc(ctx.command.help or ""))[0]
+
+
+def _option(ctx: click.Context, option: click.Option) -> tuple[str, str]:
+    names = ", ".join(option.opts)
+    values = "" if option.is_flag else f" {option.make_metavar(ctx)}"
+    if isinstance(option.show_default, str):
+        default = option.show_default
+    else:
+        default = "" if option.is_flag or option.default is None else str(option.default)
+    return f"`{names}{values}`", f"{option.help or ''} {f'Default: {default}.' if default else ''}"
+
+
+def _list(title: str, rows: list[tuple[str, str]]) -> list[str]:
+    return [f"## {title}", "\n".join(f"* {term}<br>{_prose(text)}" for term, text in rows)] if rows else []
+
+
+def _api_page() -> str:
+    names = list(neurocal_cli.__all__)
+    known = {name for topic in TOPICS.values() for name in topic}
+    parts = [
+        MADE,
+        "# Python",
+        "Everything that a program needs is in the package `neurocal_cli` itself: "
+        "`from neurocal_cli import calibrate`. The functions do what the commands of the same names do. "
+        "Where a command ends with exit status 1, they raise `NeurocalError`. "
+        "[Use it from Python](../how-to/python.md) has examples.",
+    ]
+    for topic, members in TOPICS.items():
+        here = [name for name in members if name in names]
+        if topic == "More":
+            here += [name for name in names if name not in known]
+        if here:
+            parts += [f"## {topic}", *(f"::: neurocal_cli.{name}" for name in here)]
+    return "\n\n".join(parts) + "\n"
+
+
+if __name__ == "__main__":
+    for path, text in pages().items():
+        (DOCS / path).parent.mkdir(exist_ok=True)
+        (DOCS / path).write_text(text, encoding="utf-8")

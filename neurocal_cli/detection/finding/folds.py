@@ -1,0 +1,130 @@
+"""Splitting a lattice that covers two planes at the fold between them.
+
+In: a lattice. Out: one lattice for each plane. Along a line of vertices on one plane, second differences
+change slowly, for any tilt and any lens distortion. At a fold they jump: at one vertex if the fold goes
+through it, else at the two vertices beside it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.detection.finding.lattice import Lattice
+from neurocal_cli.detection.medians import median, quantile
+from neurocal_cli.geometry import Array
+
+__all__ = ["largest_second_difference", "split_at_folds"]
+
+# Least second difference of a fold [squares], and its least ratio to those of distant rows; paper is not
+# flat either. Insensitive, as all constants here; FOLDED and
+# WHOLE in tests/test_finding.py repeat this.
+_FOLDS = ((0.13, 4.0), (0.06, 12.0))
+_VERTEX_ERROR = 0.2  # px, that errors of the vertices add
+_UNKNOWN = 0.03  # squares; second difference of distant rows where there are none
+_LEAST_ROWS = 4
+_BETWEEN = 1.4  # factor that makes a jump shared by two rows comparable with that of one row
+_ONE_SIDED = 0.7  # weight of a jump that can be compared with one side only
+
+
+def split_at_folds(lattice: Lattice) -> list[Lattice]:
+    """Split a lattice into connected parts without a fold.
+
+    Vertices on a fold are dropped: they belong to both planes, and their edges change direction there.
+    """
+    whole = lattice.connected_parts()
+    if len(whole) != 1:
+        return [part for piece in whole for part in split_at_folds(piece)]
+    lattice = whole[0]
+    row, col = _sharpest_folds(lattice)
+    if row[1] == 0 and col[1] == 0:
+        return [lattice]
+    pixels = lattice.pixels if row[1] >= col[1] else lattice.pixels.transpose(1, 0, 2)
+    position = max(row, col, key=lambda fold: fold[1])[0]
+    index = np.arange(len(pixels))
+    if position in (1, len(pixels) - 2):
+        # Either a fold or a wrong outermost row: drop the outermost row only.
+        position = 0.0 if position == 1 else len(pixels) - 1
+    parts = []
+    for side in (index < position - 0.25, index > position + 0.25):
+        kept = np.where(side[:, None, None], pixels, np.nan)
+        if pixels is not lattice.pixels:
+            kept = kept.transpose(1, 0, 2)
+        part = lattice.subset(np.isfinite(kept[..., 0]))
+        parts += split_at_folds(part) if part.seen.any() else []
+    return parts
+
+
+def _sharpest_folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The sharpest folds along a row and along a column; see `_fold`."""
+    width = max(median(lattice.predicted[2].width), 1.0)
+    along_columns, along_rows = _second_differences(lattice)
+    return _fold(along_columns, width), _fold(along_rows, width)
+
+
+def largest_second_difference(lattice: Lattice) -> float:
+    """Largest median second difference of any row or column [squares], folds included."""
+    return max(float(_size(second).max()) for second in _second_differences(lattice))
+
+
+def _second_differences(lattice: Lattice) -> tuple[Array, Array]:
+    """Those along columns (rows, cols, 2) and along rows (cols, rows, 2) [squares]; NaN where unknown."""
+    pixels = lattice.pixels
+    row, col, at = lattice.predicted
+    along = []
+    for lines, index in ((pixels, (row, col)), (pixels.swapaxes(0, 1), (col, row))):
+        second = np.full(lines.shape, np.nan)
+        second[1:-1] = lines[2:] - 2 * lines[1:-1] + lines[:-2]
+        second[index] = at.in_squares(second[index])
+        along.append(second)
+    return along[0], along[1]
+
+
+def _fold(second: Array, width: float) -> tuple[float, float]:
+    """Find the sharpest fold.
+
+    Parameters
+    ----------
+    second : (rows, cols, 2) array [squares]
+        Second differences along the columns, NaN where unknown.
+    width : float [px]
+        Of the squares.
+
+    Returns
+    -------
+    position, size : float
+        Among the rows, and in squares; (0, 0) without a fold.
+    """
+    rows = len(second)
+    if rows < _LEAST_ROWS:
+        return 0.0, 0.0
+    before, after, far = (np.full_like(second, np.nan) for _ in range(3))
+    before[1:], after[:-1], far[:-2] = second[:-1], second[1:], second[2:]
+    at = _size(_against_one_or_both(second, before, after))
+    # Between row i and i + 1.
+    between = _BETWEEN * _size(0.5 * (second + after - before - far))
+    size = np.empty(2 * rows)
+    size[::2], size[1::2] = at, between
+    best = int(size.argmax())
+    others = np.abs(np.arange(2 * rows) - best) > 3
+    far_off = size[others & (size > 0)]
+    usual = quantile(far_off, 0.25) if len(far_off) else _UNKNOWN
+    least = min(max(fold + _VERTEX_ERROR / width, ratio * usual) for fold, ratio in _FOLDS)
+    if size[best] < least:
+        return 0.0, 0.0
+    return 0.5 * best, float(size[best])
+
+
+def _against_one_or_both(values: Array, first: Array, second: Array) -> Array:
+    """Differences from the mean of two arrays, with less weight where one of them is unknown."""
+    both = values - 0.5 * (first + second)
+    one = _ONE_SIDED * (values - np.where(np.isnan(first), second, first))
+    return np.where(np.isnan(both), one, both)
+
+
+def _size(values: Array) -> Array:
+    """Median length of each row's vectors; 0 where fewer than two are known."""
+    ordered = np.hypot(values[..., 0], values[..., 1])
+    ordered.sort(axis=1)  # unknown ones come last
+    count, row = (ordered >= 0).sum(axis=1), np.arange(len(ordered))
+    middle = 0.5 * (ordered[row, (count - 1) // 2] + ordered[row, count // 2])
+    return np.where(count >= 2, middle, 0.0)

@@ -1,0 +1,121 @@
+"""A short cut for growth: most of a grid at once, by following links from vertex to vertex.
+
+In: saddles, their links, and the middle of a seed. Out: a lattice, or None. The lattice is only accepted
+where every vertex passes the tests that `grow` applies; growing layer by layer gives the same, more slowly.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.finding.folds import largest_second_difference, split_at_folds
+from neurocal_cli.detection.finding.grow import check_lattice
+from neurocal_cli.detection.finding.lattice import Lattice, in_whole_square
+from neurocal_cli.detection.finding.levels import Level
+from neurocal_cli.detection.finding.links import Links
+from neurocal_cli.detection.finding.saddles import Saddles
+from neurocal_cli.detection.finding.subpixel import refine_saddles
+from neurocal_cli.geometry import Array
+
+__all__ = ["lattice_from_links"]
+
+# (c, r) from a vertex to its neighbour at the port along c, and at the next ones.
+_STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
+# Insensitive: a lattice rejected here grows instead, which only costs time
+# (tests/benchmarks/test_detection_speed.py).
+_NEAR = 1.0  # px, that a saddle may move when derivatives are smoothed more
+_FEWEST = 12  # vertices; fewer are grown from the seed
+_ROUNDS, _WRONG = 3, 0.35  # rounds of removing outliers, and their greatest share
+_MOST_BENT = 0.16  # squares; a larger second difference may be a fold
+_WHOLE = 0.5  # least share of an outer line that is linked; beyond the board, links lead astray
+
+
+def lattice_from_links(
+    level: Level, saddles: Saddles, links: Links, middle: int, taken: NDArray[np.bool_]
+) -> Lattice | None:
+    """Follow the links that start at a vertex, and test what they lead to.
+
+    Parameters
+    ----------
+    level : Level
+    saddles : Saddles
+    links : Links
+    middle : int
+        The vertex; its port 0 leads along c.
+    taken : (N,) bool array
+        Saddles that belong to other grids.
+
+    Returns
+    -------
+    lattice : Lattice or None
+        None where the vertices fail the tests.
+    """
+    places = _follow(links, middle, taken.tolist())
+    if len(places) < _FEWEST:
+        return None
+    lattice = _lattice(saddles, places)
+    row, col = np.nonzero(lattice.seen)
+    refined = refine_saddles(level.image, lattice.pixels[row, col], lattice.derivative_sigma)
+    stays = np.abs(refined - lattice.pixels[row, col]).max(axis=1) < _NEAR
+    lattice.pixels[row, col] = np.where(stays[:, None], refined, np.nan)
+    # Links cross folds.
+    part = _with(split_at_folds(lattice), saddles.points[middle])
+    for _ in range(_ROUNDS):
+        count = 0 if part is None else np.count_nonzero(part.seen)
+        if part is None or count < _FEWEST:
+            break
+        part, good = check_lattice(level, part)
+        wrong = count - np.count_nonzero(good)
+        if wrong == 0:
+            # A fold may hide in a gap.
+            return part if largest_second_difference(part) < _MOST_BENT else None
+        if wrong > _WRONG * count:
+            break
+        # Vertices left out here can be found again when the grid grows.
+        part = _with(part.subset(in_whole_square(good)).connected_parts(), saddles.points[middle])
+    return None
+
+
+def _with(parts: list[Lattice], point: Array) -> Lattice | None:
+    """The lattice that has a vertex at a point [px]."""
+    near = (part for part in parts if (np.abs(part.pixels - point) < _NEAR).all(axis=-1).any())
+    return next(near, None)
+
+
+def _lattice(saddles: Saddles, places: dict[tuple[int, int], int]) -> Lattice:
+    """Saddles at their places (c, r), without ragged outer lines and those outside complete squares."""
+    place, index = np.array(list(places)), np.array(list(places.values()))
+    left, top = place.min(axis=0)
+    cols, rows = place.max(axis=0) - (left, top) + 1
+    member = np.full((rows, cols), -1, dtype=np.intp)
+    member[place[:, 1] - top, place[:, 0] - left] = index
+    seen = in_whole_square(member >= 0)
+    for line in (np.s_[0], np.s_[-1], np.s_[:, 0], np.s_[:, -1]):
+        seen[line] &= seen[line].mean() > _WHOLE
+    row, col = np.nonzero(seen)
+    pixels, contrast = np.full((rows, cols, 2), np.nan), np.full((rows, cols), np.nan)
+    pixels[row, col], contrast[row, col] = (x[member[row, col]] for x in (saddles.points, saddles.contrast))
+    # The square between ports 0 and 1 of the middle vertex is dark.
+    return Lattice(pixels, contrast, int(left + top) % 2).cropped()
+
+
+def _follow(links: Links, middle: int, taken: list[bool]) -> dict[tuple[int, int], int]:
+    """Saddles by their places (c, r) relative to the middle one, found breadth first."""
+    to, entry = links.lists
+    places, along = {(0, 0): middle}, {middle: 0}  # saddle by place, and its port along c
+    waiting = deque(places)
+    while waiting:
+        c, r = waiting.popleft()
+        saddle = places[c, r]
+        for turn, (dc, dr) in enumerate(_STEPS):
+            port = (along[saddle] + turn) % 4
+            neighbour, there = to[saddle][port], (c + dc, r + dr)
+            if neighbour < 0 or taken[neighbour] or there in places or neighbour in along:
+                continue
+            places[there] = neighbour
+            along[neighbour] = (entry[saddle][port] + 2 - turn) % 4
+            waiting.append(there)
+    return places

@@ -1,0 +1,84 @@
+"""Whether the image around a point looks like a vertex.
+
+In: points, the steps of the grid there, and the expected colours. Out: contrast, evenness, and a decision for
+each point, from twelve samples: inside the four squares and on both sides of the four edges.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.finding.levels import Level, interpolate
+from neurocal_cli.detection.finding.predict import PredictedVertices
+from neurocal_cli.geometry import Array
+
+__all__ = ["VertexCheck", "check_vertices"]
+
+_INTO = 0.3  # squares; from the vertex into the four squares around it
+_ALONG, _ASIDE = 0.36, 0.16  # squares; along its edges, and to either side of them
+_LEAST_EVENNESS = 0.6  # a visible vertex has 0.9 and more, even if blurred or noisy
+_LEAST_EDGE = 0.3  # of the contrast, across every edge
+
+
+@dataclass(frozen=True, eq=False)
+class VertexCheck:
+    """What the samples around points say.
+
+    Attributes
+    ----------
+    contrast : (N,) array [DN]
+        Bright minus dark squares around the vertex; negative when their colours are the other way.
+    even : (N,) array
+        Darkest bright minus brightest dark square, over the contrast: 1 for an ideal vertex.
+    like : (N,) bool array
+        Two bright and two dark squares, and an edge between every two.
+    """
+
+    contrast: Array
+    evenness: Array
+    is_vertex: NDArray[np.bool_]
+
+
+def _offsets() -> Array:
+    """(12, 2) places in squares: inside the four squares, then beside the four edges."""
+    i, a, s = _INTO, _ALONG, _ASIDE
+    inside = [(i, i), (-i, i), (-i, -i), (i, -i)]  # colours alternate, the first dark
+    beside = [(a, s), (-s, a), (-a, -s), (s, -a)]  # on the dark side of each edge
+    across = [(a, -s), (s, a), (-a, s), (-s, -a)]
+    return np.array(inside + beside + across)
+
+
+_OFFSETS = _offsets()
+_CONTRAST = np.array([0.5, -0.5, 0.5, -0.5] + [0.0] * 8)  # mean of bright minus mean of dark squares
+_STEPS = np.concatenate([np.zeros((4, 4)), np.diag([1.0, -1, 1, -1]), np.diag([-1.0, 1, -1, 1])])  # at edges
+
+
+def check_vertices(level: Level, points: Array, predicted: PredictedVertices, dark: Array) -> VertexCheck:
+    """Sample the squares and edges around points.
+
+    Parameters
+    ----------
+    level : Level
+    points : (N, 2) array [px]
+    at : Expected
+        The steps of the grid at the points.
+    dark : (N,) array of +-1
+        +1 where the square towards growing c and r is dark.
+    """
+    places = predicted.around(_OFFSETS, points)
+    value = interpolate(level.smooth, places)
+    value *= -dark[:, None]
+    contrast = value @ _CONTRAST
+    scale = np.maximum(np.abs(contrast), 1e-9)
+    flat = np.minimum(value[:, 0], value[:, 2]) - np.maximum(value[:, 1], value[:, 3])
+    flat /= scale
+    is_vertex = (contrast > 0) & (flat > _LEAST_EVENNESS)
+    is_vertex &= (value @ _STEPS).min(axis=1) > _LEAST_EDGE * contrast
+    size = np.array(level.image.shape[::-1])
+    if places.min() <= -1 or (places.max(axis=(0, 1)) >= size).any():
+        # Samples beyond the border only repeat it.
+        is_vertex &= ((places > -1) & (places < size)).all(axis=(1, 2))
+    return VertexCheck(contrast, flat, is_vertex)

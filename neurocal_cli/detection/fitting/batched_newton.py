@@ -1,0 +1,324 @@
+"""Damped Gauss-Newton on thousands of fits of five to seven values at once, in float32.
+
+This is not the package's least-squares core, because its problems are different: one image has hundreds of
+independent fits to hundreds of pixels each. Arrays hold all fits side by side, pixels are float32 to halve
+memory traffic, and fits that have not converged with the others go on by themselves. The small
+systems of normal equations are solved in float64.
+
+In: a model with derivatives, a start, a prior. Out: `BatchFit` with values, Fisher information and chi2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = [
+    "BLUR",
+    "CONTRAST",
+    "LEAST_BLUR",
+    "MEAN",
+    "MORE_STEPS",
+    "BatchFit",
+    "LevelPrior",
+    "Linearised",
+    "Part",
+    "ProfileShape",
+    "fit_batch",
+    "rows_for",
+]
+
+Single = NDArray[np.float32]
+Part = NDArray[np.intp] | slice  # of the fits
+
+# The last three values of every fit: mean level and half contrast [DN], sigma_t [px].
+MEAN, CONTRAST, BLUR = -3, -2, -1
+LEAST_BLUR = 0.2905  # px; a pixel's box alone has sqrt(1/12) = 0.2887
+# Insensitive.
+_MOST, _CONVERGED = 0.9, 0.5  # share of the fits whose last step is below so many standard deviations
+MORE_STEPS = 20  # at most, of fits that have not converged with the others
+_DAMPING, _LEAST_DAMPING = 1.0, 0.01  # first and last damping after a step that raised the cost
+_FLOAT32 = 1e-6  # relative error of float32 sums
+_NOTHING = 1e-9  # information that keeps fits without pixels regular
+
+
+@dataclass(frozen=True, eq=False)
+class LevelPrior:
+    """Gaussian prior of mean level, half contrast and blur.
+
+    Attributes
+    ----------
+    mean : (E, 3) array [DN, DN, px]
+    precision : (E, 3, 3) array
+    """
+
+    mean: Array
+    precision: Array
+
+    def part(self, which: NDArray[np.intp]) -> LevelPrior:
+        """The prior of some fits."""
+        return LevelPrior(self.mean[which], self.precision[which])
+
+
+@dataclass(frozen=True, eq=False)
+class ProfileShape:
+    """Shape of the edges' profiles; see `edge_profile`.
+
+    Attributes
+    ----------
+    tails : (E, 2) array
+        a_3 and a_5 of each edge.
+    bend : (RESPONSE_TERMS,) array
+        b_0, b_1, ... of the response, the same for all edges.
+    half : (E, 2) array or None [px]
+        Half widths of the pixel's box along the edges' normals (see `pixel_box`), for edges so sharp that
+        they matter; (V, 2, 2) of both lines through vertices.
+    """
+
+    tails: Array
+    nonlinearity: Array
+    half: Array | None = None
+
+    def part(self, which: Part) -> ProfileShape:
+        """That of some fits."""
+        return ProfileShape(
+            self.tails[which], self.nonlinearity, None if self.half is None else self.half[which]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A model linearised at some values.
+
+    Attributes
+    ----------
+    rows : (E, R, N) array
+        The residual and the model's derivatives by the P values, in standard deviations of the pixels' noise;
+        see `rows_for`.
+    z, x : (E, N) arrays
+        Distance from the edge in sigma, and light between the levels.
+    """
+
+    rows: Single
+    z: Single
+    x: Single
+
+    @property
+    def residual(self) -> Single:
+        """(E, N) pixels less the model, in standard deviations of the noise."""
+        return self.rows[:, 0]
+
+    def products(self, count: int) -> Array:
+        """(E, P + 1, P + 1) sums over pixels for P values: chi2, the gradient beside it, the information."""
+        return (self.rows @ self.rows.swapaxes(1, 2))[:, : count + 1, : count + 1].astype(float)
+
+    def part(self, which: NDArray[np.intp]) -> Linearised:
+        """That of some fits."""
+        return Linearised(self.rows[which], self.z[which], self.x[which])
+
+    def put(self, which: NDArray[np.intp], part: Linearised) -> None:
+        """Replace the part of some fits, in place."""
+        self.rows[which], self.z[which], self.x[which] = part.rows, part.z, part.x
+
+
+def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) -> NDArray[np.floating]:
+    """An array (E, R, N) for the rows of a model, R padded with zeros to a multiple of eight.
+
+    Products of six rows take twice as long as those of eight in OpenBLAS.
+    """
+    used = 1 + values
+    rows = np.empty((count, -(-used // 8) * 8, pixels), dtype=kind)
+    rows[:, used:] = 0
+    return rows
+
+
+@dataclass(frozen=True, eq=False)
+class BatchFit:
+    """Fitted values.
+
+    Attributes
+    ----------
+    values : (E, P) array
+        Coordinates first; the last three are at `MEAN`, `CONTRAST`, `BLUR`.
+    information : (E, P, P) array
+        Fisher information of the pixels, without the prior.
+    prior : Prior
+    chi2, count : (E,) arrays
+        Weighted sum of squared residuals, and number of pixels.
+    step : (E,) array
+        The last step, in standard deviations.
+    linear : Linear
+        The model at the values.
+    """
+
+    values: Array
+    information: Array
+    prior: LevelPrior
+    chi2: Array
+    count: NDArray[np.int64]
+    step: Array
+    linear: Linearised
+
+    @cached_property
+    def covariance(self) -> Array:
+        """(E, P, P) of the values."""
+        total = self.information.copy()
+        total[:, MEAN:, MEAN:] += self.prior.precision
+        diagonal = np.einsum("eii->ei", total)  # a view
+        # float32 sums may be slightly indefinite where values are strongly correlated.
+        diagonal *= 1 + _FLOAT32
+        diagonal += _NOTHING
+        return np.asarray(np.linalg.inv(total), dtype=float)
+
+    @property
+    def variance_growth(self) -> Array:
+        """(E,) factor on variances for fits whose last step was longer than a standard deviation."""
+        return np.where(self.step > 1, 1 + self.step**2, 1.0)
+
+    def scaled(self, noise: float) -> BatchFit:
+        """The same fits for a variance of the pixels that is larger by a factor."""
+        return replace(self, information=self.information / noise, chi2=self.chi2 / noise)
+
+
+def fit_batch(
+    model_of: Callable[[Part], Callable[[Array], Linearised]],
+    start: Array,
+    prior: LevelPrior,
+    count: NDArray[np.int64],
+    steps: int,
+    more: int = MORE_STEPS,
+) -> BatchFit:
+    """Fit all at once, and then those that have not converged by themselves.
+
+    Parameters
+    ----------
+    model_of : function of a part of the fits
+        Gives a function of their values.
+    start : (E, P) array
+        Values to begin with.
+    prior : Prior
+    count : (E,) array
+        Of the pixels.
+    steps, more : int
+        Greatest number, of all fits and of those that have not converged.
+    """
+    model = model_of(slice(None))
+    state = _State.of(model, start, prior)
+    # A few fits that cannot converge must not hold up the others.
+    state.iterate(model, prior, steps, _MOST)
+    unconverged = np.flatnonzero(state.size >= _CONVERGED)
+    if len(unconverged) and more:
+        part = state.part(unconverged)
+        part.iterate(model_of(unconverged), prior.part(unconverged), more, 1.0)
+        state.put(unconverged, part)
+    information, chi2 = state.products[:, 1:, 1:], state.products[:, 0, 0]
+    return BatchFit(state.values, information, prior, chi2, count, state.size, state.linear)
+
+
+@dataclass(eq=False)
+class _State:
+    """Fits between steps: values, model there, its products, cost, damping, and size of the last step."""
+
+    values: Array
+    linear: Linearised
+    products: Array
+    cost: Array
+    damping: Array
+    size: Array
+
+    @classmethod
+    def of(cls, model: Callable[[Array], Linearised], values: Array, prior: LevelPrior) -> _State:
+        linear = model(values)
+        products, none = linear.products(values.shape[1]), np.zeros(len(values))
+        return cls(values, linear, products, _cost(products, values, prior), none, none)
+
+    def part(self, which: NDArray[np.intp]) -> _State:
+        """Some of the fits."""
+        return _State(
+            self.values[which],
+            self.linear.part(which),
+            self.products[which],
+            self.cost[which],
+            self.damping[which],
+            self.size[which],
+        )
+
+    def put(self, which: NDArray[np.intp], part: _State) -> None:
+        """Copy the results of some fits back."""
+        self.values[which], self.size[which] = part.values, part.size
+        self.linear.put(which, part.linear)
+        self.products[which] = part.products
+
+    def iterate(
+        self, model: Callable[[Array], Linearised], prior: LevelPrior, steps: int, most: float
+    ) -> None:
+        """Levenberg-Marquardt steps until a share of the fits has converged."""
+        for _ in range(steps):
+            tried = _moved(self.values, self._step(prior))
+            ahead = model(tried)
+            products = ahead.products(tried.shape[1])
+            cost = _cost(products, tried, prior)
+            # Edges sharper than a pixel are not linear within a step: undo steps that raise the cost.
+            worse = ~(cost <= self.cost * (1 + _FLOAT32) + _FLOAT32)
+            if worse.any():
+                back = np.flatnonzero(worse)
+                tried[back], cost[back] = self.values[back], self.cost[back]
+                products[back] = self.products[back]
+                ahead.put(back, self.linear.part(back))
+            if worse.any() or self.damping.any():
+                shorter = np.maximum(10 * self.damping, _DAMPING)
+                longer = np.where(self.damping > _LEAST_DAMPING, 0.1 * self.damping, 0.0)
+                self.damping = np.where(worse, shorter, longer)
+            self.values, self.linear, self.products, self.cost = tried, ahead, products, cost
+            if (self.size < _CONVERGED).mean() >= most:
+                break
+
+    def _step(self, prior: LevelPrior) -> Array:
+        """The next step; sets `size` to the length of the undamped one."""
+        information, gradient = self.products[:, 1:, 1:].copy(), self.products[:, 1:, 0].copy()
+        pull = self.values[:, MEAN:] - prior.mean
+        gradient[:, MEAN:] -= (prior.precision @ pull[:, :, None])[:, :, 0]
+        information[:, MEAN:, MEAN:] += prior.precision
+        diagonal = np.einsum("eii->ei", information)  # a view
+        diagonal += _NOTHING
+        step = _solved(information, gradient)
+        sharpest = (self.values[:, BLUR] <= LEAST_BLUR) & (step[:, BLUR] < 0)
+        if sharpest.any():
+            # A blur at its limit is held there while the other values are solved for.
+            information[sharpest, BLUR] = 0.0
+            information[sharpest, :, BLUR] = 0.0
+            gradient[sharpest, BLUR] = 0.0
+            information[sharpest, BLUR, BLUR] = 1.0
+            step = _solved(information, gradient)
+        self.size = np.sqrt(np.maximum(np.einsum("ei,ei->e", step, gradient), 0))
+        if self.damping.any():
+            diagonal *= 1 + self.damping[:, None]
+            damped = np.flatnonzero(self.damping)
+            step[damped] = _solved(information[damped], gradient[damped])
+        return step
+
+
+def _cost(products: Array, values: Array, prior: LevelPrior) -> Array:
+    pull = values[:, MEAN:] - prior.mean
+    return np.asarray(products[:, 0, 0] + np.einsum("ei,eij,ej->e", pull, prior.precision, pull))
+
+
+def _solved(information: Array, gradient: Array) -> Array:
+    return np.asarray(np.linalg.solve(information, gradient[:, :, None])[:, :, 0], dtype=float)
+
+
+def _moved(values: Array, step: Array) -> Array:
+    """Values after a step that is limited to where the model is nearly linear."""
+    sigma = values[:, BLUR]
+    most = sigma[:, None]
+    moved = values + step
+    moved[:, :MEAN] = values[:, :MEAN] + np.minimum(np.maximum(step[:, :MEAN], -most), most)
+    least = np.maximum(0.6 * sigma, LEAST_BLUR)
+    moved[:, BLUR] = np.minimum(np.maximum(moved[:, BLUR], least), 1.6 * sigma)
+    return moved

@@ -1,0 +1,211 @@
+"""Parameters that all edges of a board have in common: pixel noise, profile shape, blur, levels.
+
+In: the fits of all edges. Out: their common parameters, as weights, shape and priors for the next fits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.batched_newton import (
+    BLUR,
+    CONTRAST,
+    LEAST_BLUR,
+    MEAN,
+    BatchFit,
+    LevelPrior,
+    ProfileShape,
+    rows_for,
+)
+from neurocal_cli.detection.fitting.edge_fit import OFFSET, EdgeData
+from neurocal_cli.detection.fitting.edge_profile import (
+    RESPONSE_TERMS,
+    erf_and_density,
+    response,
+    response_terms,
+    tail_terms,
+)
+from neurocal_cli.detection.fitting.shading import Shading
+from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
+from neurocal_cli.geometry import Array
+
+__all__ = ["BoardBlur", "PixelNoise", "level_prior", "profile_shape"]
+
+Single = NDArray[np.float32]
+
+# Insensitive, apart from _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.
+_FLAT = 0.95  # light, from -1 to 1, beyond which a pixel has the dark or the light level
+_LEAST_SHARE = 0.3  # of the largest noise; clipped pixels seem to have less
+_ROUND = 0.5  # relative deviation of the squared blur at which an edge counts half ...
+_ROUND_EDGES = 1.0  # ... and the weight, in edges, of the prior that blur is the same in all directions
+_BLUR_SPREAD = 0.03  # least relative deviation of an edge's blur from the board's
+_ENOUGH = 10000  # pixels that are enough to estimate the profile's shape
+# Prior standard deviations of tails and response: they matter where blur and contrast have the same effect,
+# and are weak against ten thousand pixels.
+_TAILS, _RESPONSE = 0.01, 0.06
+_RIDGE = 1e-5
+_LEAST_SPREAD = 0.0002  # of the levels' variance, in variances of the noise
+_TINY = np.float32(1e-30)
+
+
+@dataclass(frozen=True)
+class PixelNoise:
+    """Variance of the pixels [DN^2] on the dark side, at the edge, on the light side."""
+
+    dark: float
+    edge: float
+    light: float
+
+    @classmethod
+    def of(cls, fit: BatchFit, root: Single, floor: float) -> PixelNoise:
+        """From the residuals of fits.
+
+        Parameters
+        ----------
+        fit : Fit
+        root : (E, N) array [1/DN]
+            Square root of the weights of the fits, 0 for unused pixels.
+        floor : float [DN^2]
+            Least variance, by rounding.
+        """
+        x, used = fit.linear.x, root > 0
+        square = np.square(fit.linear.residual / np.maximum(root, _TINY))
+        variances = []
+        for part in (x < -_FLAT, np.abs(x) <= _FLAT, x > _FLAT):
+            mine = part & used
+            count = mine.sum(axis=1)
+            some = count >= min(8, int(count.max(initial=0)))
+            sums = np.einsum("en,en->e", square, mine.astype(np.float32))
+            # The median is robust against hidden edges.
+            variances.append(upper_median(sums[some] / np.maximum(count[some], 1)) if some.any() else 0.0)
+        return cls(*(max(v, floor, _LEAST_SHARE * max(variances)) for v in variances))
+
+    def times(self, factor: float) -> PixelNoise:
+        """The noise times a factor."""
+        return PixelNoise(factor * self.dark, factor * self.edge, factor * self.light)
+
+    def weights(self, x: Single) -> Single:
+        """Inverse variances [1/DN^2] of pixels at a light x between the levels."""
+        variance = np.minimum(np.maximum(x, 0), 1) * np.float32(self.light - self.edge)
+        variance += np.maximum(np.minimum(x, 0), -1) * np.float32(self.edge - self.dark)
+        variance += np.float32(self.edge)
+        return np.reciprocal(variance, out=variance)
+
+
+def profile_shape(
+    data: EdgeData, fit: BatchFit, shape: ProfileShape, good: NDArray[np.bool_]
+) -> ProfileShape:
+    """Improve the shape of the profile by linear least squares on the residuals of all fits.
+
+    Shift, blur and levels are unknowns too, because the fits have absorbed part of the shape in them.
+
+    Parameters
+    ----------
+    data : EdgeData
+    fit : Fit
+    shape : Shape
+        The shape used in these fits.
+    good : (E,) bool array
+        Edges to use.
+    """
+    # A part of the pixels is enough for a dozen numbers.
+    step = max(1, int(data.count[good].sum()) // _ENOUGH)
+    edges, (_, width, length) = np.flatnonzero(good)[:, None], fit.linear.rows.shape
+    # Each edge with another offset, or all pixels would lie at the same distances from the edges.
+    some = np.arange(0, length - step + 1, step) + 7 * edges % step
+    place, first = edges * length + some, edges * (width * length) + some
+    z, x, Q, root, scale = (
+        y.reshape(-1).take(place) for y in (fit.linear.z, fit.linear.x, data.Q, data.root, data.gain)
+    )
+    _, density = erf_and_density(z)
+    scale *= root
+    scale *= fit.values[good, CONTRAST].astype(np.float32)[:, None]
+    steep = scale * Q if not shape.nonlinearity.any() else response(x, shape.nonlinearity)[1] * Q * scale
+    # One product for each edge: these are too small for threads, whose start takes longer.
+    columns = rows_for(len(z), RESPONSE_TERMS + 6, z.shape[1], z.dtype)
+    others, tails, bends = np.split(columns[:, : RESPONSE_TERMS + 7], [5, 7], axis=1)
+    tail_terms(z, density, out=tails)
+    tails *= steep[:, None]
+    response_terms(x, scale, out=bends)
+    for k, row in enumerate((0, 1 + OFFSET, fit.values.shape[1])):
+        others[:, k] = fit.linear.rows.reshape(-1).take(first + row * length)
+    np.multiply(x, scale, out=others[:, 3])
+    others[:, 4] = root
+    products = (columns @ columns.swapaxes(1, 2)).sum(axis=0, dtype=float)
+    # The residual is the first row, the unknowns follow; the shape comes last.
+    rest = slice(1, RESPONSE_TERMS + 7)
+    normal, right = products[rest, rest], products[rest, 0]
+    normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
+    # Blur, contrast, tails and the odd terms of the response are strongly correlated.
+    believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _RESPONSE)]) ** -2
+    known = np.concatenate([shape.tails.mean(axis=0), shape.nonlinearity])
+    right[4:] -= believed * known
+    np.einsum("ii->i", normal)[4:] += believed
+    change = np.linalg.solve(normal, right)[4:]
+    return replace(shape, tails=shape.tails + change[:2], nonlinearity=shape.nonlinearity + change[2:])
+
+
+@dataclass(frozen=True, eq=False)
+class BoardBlur:
+    """Blur of all edges of a board: ``sigma^2 = n^T S n`` for an edge with the normal n.
+
+    Attributes
+    ----------
+    matrix : (2, 2) array [px^2]
+        S: a multiple of the identity without motion blur and astigmatism.
+    spread : float [px^2]
+        Variance of the blur of single edges around that, without the variance of the fits.
+    """
+
+    matrix: Array
+    spread: float
+
+    @classmethod
+    def of(cls, fit: BatchFit, normal: Array, good: NDArray[np.bool_]) -> BoardBlur:
+        """From the fits of edges with normals (E, 2), as far as they are good."""
+        if not good.any():
+            good = np.ones_like(good)
+        sigma, (n_u, n_v) = fit.values[good, BLUR], normal[good].T
+        usual = upper_median(sigma)
+        terms = np.stack([n_u * n_u, 2 * n_u * n_v, n_v * n_v])
+        # Robust against single edges, and isotropic unless many edges disagree.
+        rest = sigma**2 - usual**2
+        weight = 1 / (1 + (rest / (_ROUND * usual**2)) ** 2)
+        normal_matrix = (terms * weight) @ terms.T + np.eye(3) * _ROUND_EDGES
+        uu, uv, vv = np.linalg.solve(normal_matrix, terms @ (weight * rest))
+        matrix = usual**2 * np.eye(2) + np.array([[uu, uv], [uv, vv]])
+        blur = cls(matrix, 0.0)
+        scatter = upper_median((sigma - blur.along(normal[good])) ** 2) / CHI2_MEDIAN
+        return cls(matrix, max(scatter - 2 * upper_median(fit.covariance[good, BLUR, BLUR]), 0.0))
+
+    def along(self, normal: Array) -> Array:
+        """(E,) blur [px] of edges with normals (E, 2)."""
+        square = ((normal @ self.matrix) * normal).sum(axis=1)
+        return np.sqrt(np.maximum(square, LEAST_BLUR**2))
+
+
+def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: float, noise: float) -> LevelPrior:
+    """Prior of the levels and the blur of single edges from those of the whole board.
+
+    Parameters
+    ----------
+    shading : Shading
+    place : (E, 2) array [px]
+    sigma : (E,) array [px]
+        Blur.
+    blur_spread : float [px^2]
+        Variance of the blur of single edges around that.
+    noise : float [DN^2]
+        Variance of a pixel.
+    """
+    mean, contrast = shading.at(place)
+    low, high = 1 / (shading.spread + _LEAST_SPREAD * noise)
+    precision = np.zeros((len(place), 3, 3))
+    # Of A = (light + dark) / 2 and B = (light - dark) / 2, from those of dark and light.
+    precision[:, MEAN, MEAN] = precision[:, CONTRAST, CONTRAST] = high + low
+    precision[:, MEAN, CONTRAST] = precision[:, CONTRAST, MEAN] = high - low
+    precision[:, BLUR, BLUR] = 1 / (blur_spread + (_BLUR_SPREAD * sigma) ** 2)
+    return LevelPrior(np.stack([mean, contrast, sigma], axis=-1), precision)

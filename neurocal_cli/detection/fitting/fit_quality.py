@@ -1,0 +1,70 @@
+"""Rejecting fits that disagree with their pixels, with the rest of the board, or with the map.
+
+In: fits. Out: masks of the typical ones, to learn common parameters from, and of those that are reported.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.batched_newton import BLUR, CONTRAST, MEAN, BatchFit
+from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
+from neurocal_cli.geometry import Array
+
+__all__ = ["is_reliable", "is_typical"]
+
+# Insensitive within what they must contain: a ratio of 1 to the prior, and fits of 8 pixels for the smallest
+# squares. tests/test_measuring.py counts the fits of hidden edges that are accepted.
+_LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # relative to the prior
+_MOST_BLUR = 2.0  # ratio to the prior, or its inverse
+_MOST_BEYOND = 0.3  # share of the pixels outside the image
+_LEAST_COUNT = 8  # pixels
+_LIMIT = 6.0  # standard deviations, of the distance from the map and of chi2
+_ROUGH = 0.5  # relative excess of chi2 that is always accepted
+_LEAST_SHARE = 0.2  # of good fits; fewer agree by chance
+_MOST_SPREAD = 0.5  # standard deviation of an offset, in sigma
+# A fit has converged if its last step is below so many standard deviations or px. The latter is for sharp
+# images, whose noise is below the error of the edge model.
+_MOST_STEP, _MOST_MOVE = 1.0, 0.03
+
+
+def is_typical(fit: BatchFit) -> NDArray[np.bool_]:
+    """(E,) mask of fits with the contrast and chi2 of most fits of the board."""
+    contrast = fit.values[:, CONTRAST] / upper_median(fit.values[:, CONTRAST])
+    rough = fit.chi2 / np.maximum(fit.count, 1)
+    usual = upper_median(rough)
+    scatter = MAD_TO_SIGMA * upper_median(np.abs(rough - usual)) + 0.2 * usual
+    return (contrast > _LEAST_CONTRAST**2) & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
+
+
+def is_reliable(fit: BatchFit, departure: Array, beyond: Array) -> NDArray[np.bool_]:
+    """(E,) mask of fits that agree with their pixels, the rest of the board, and the map.
+
+    Parameters
+    ----------
+    fit : Fit
+    departure : (E,) array
+        Distance from the map, in standard deviations.
+    beyond : (E,) array
+        Share of the pixels that lie outside the image.
+    """
+    contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, CONTRAST]
+    blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]
+    good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
+    good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
+    good &= (beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
+    # The values before the levels are offset and tilt of each line in turn.
+    offsets = range(0, fit.values.shape[1] + MEAN, 2)
+    spread = fit.covariance[:, offsets, offsets]
+    good &= (spread > 0).all(axis=1)
+    moved = fit.step * np.sqrt(np.maximum(spread.max(axis=1), 0.0))
+    good &= (fit.step < _MOST_STEP) | (moved < _MOST_MOVE)
+    good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
+    good &= np.abs(departure) < _LIMIT
+    rough = fit.chi2 / np.maximum(fit.count, 1)
+    usual = upper_median(rough[good]) if good.any() else 1.0
+    scatter = MAD_TO_SIGMA * upper_median(np.abs(rough[good] - usual)) if good.any() else 0.0
+    chance = usual * np.sqrt(2 / np.maximum(fit.count, 1))
+    good &= rough - usual < _LIMIT * np.maximum(scatter, chance) + _ROUGH * usual
+    return good & (good.mean() > _LEAST_SHARE) if len(good) else good

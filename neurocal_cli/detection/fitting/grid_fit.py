@@ -1,0 +1,320 @@
+"""The fits of all edges of a board, in stages: from vertices known to half a pixel to the noise limit.
+
+A map through the found vertices, offsets of the edges from moments, a first fit with independent levels,
+common parameters, a last fit, and the map through it. In: `GridImage`. Out: `GridFit`, for `measuring`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.batched_newton import CONTRAST, MEAN, BatchFit, ProfileShape
+from neurocal_cli.detection.fitting.common_parameters import BoardBlur, PixelNoise, level_prior, profile_shape
+from neurocal_cli.detection.fitting.edge_fit import (
+    OFFSET,
+    EdgeData,
+    fit_edges,
+    light_at,
+    moments,
+    with_weight,
+)
+from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
+from neurocal_cli.detection.fitting.initial_fit import fit_initial
+from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map
+from neurocal_cli.detection.fitting.map_selection import select_map
+from neurocal_cli.detection.fitting.pixel_box import half_widths
+from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading, square_levels
+from neurocal_cli.detection.fitting.smooth_map import RICHEST_LENS, Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
+from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
+from neurocal_cli.geometry import Array
+
+__all__ = ["GridEdges", "GridFit", "GridImage", "fit_grid", "fit_grid_vertices"]
+
+Image = NDArray[np.generic]
+
+# Insensitive: later stages correct the errors of earlier ones.
+_START_SIGMA = 0.3  # px, of the coordinates of the found vertices
+_GOOD_START = 1.3  # chi2 per coordinate of these vertices at which no richer map is tried
+_ANCHOR = 2.0  # px, of these vertices in later maps, which they only keep regular
+_ENOUGH = 60  # edges that need no such anchors
+_MOMENT_SIGMA = 0.05  # px, of offsets from moments
+_WIDEST = 12.0  # px, half width of the strips for moments
+_STEPS = 6  # Gauss-Newton steps, at most
+_LEAST_VARIANCE = 1e-12  # px^2
+_LEAST_SCALE = 0.1  # of the noise by the final residuals, relative to the first estimate
+_PRECISE = 0.003  # sigma; standard deviation of offsets below which the profile is estimated again
+
+
+@dataclass(frozen=True, eq=False)
+class GridEdges:
+    """The edges between neighbouring vertices of a grid, those along c first.
+
+    Attributes
+    ----------
+    index : (E, 2) int array
+        First vertex, (c, r).
+    vertical : (E,) bool array
+    centre : (E, 2) array [squares]
+    light : (E,) array
+        +1 where the light side is that of growing r (c for vertical ones), else -1.
+    """
+
+    index: NDArray[np.int64]
+    vertical: NDArray[np.bool_]
+    centre: Array
+    light: Array
+
+    @classmethod
+    def of(cls, grid: Grid) -> GridEdges:
+        """All edges between two known vertices."""
+        seen = grid.seen
+        along_c = np.argwhere(seen[:, :-1] & seen[:, 1:])[:, ::-1]
+        along_r = np.argwhere(seen[:-1] & seen[1:])[:, ::-1]
+        index = np.concatenate([along_c, along_r])
+        vertical = np.arange(len(index)) >= len(along_c)
+        centre = index + np.where(vertical[:, None], [0.0, 0.5], [0.5, 0.0])
+        light = np.where((index.sum(axis=1) + grid.dark) % 2 == 1, 1.0, -1.0)
+        return cls(index.astype(np.int64), vertical, centre, light)
+
+
+@dataclass(frozen=True, eq=False)
+class GridImage:
+    """An image and a grid in it, prepared for the fits.
+
+    Attributes
+    ----------
+    image : (H, W) array [DN]
+    grid : Grid
+    edges : Edges
+    anchors : Rows
+        The found vertices.
+    floor : float [DN^2]
+        Least variance of the pixels, by rounding.
+    """
+
+    image: Image
+    grid: Grid
+    edges: GridEdges
+    anchors: Observations
+    floor: float
+
+    @classmethod
+    def of(cls, image: Image, grid: Grid, floor: float) -> GridImage:
+        """From an image and a grid in it."""
+        vertices = np.argwhere(grid.seen)[:, ::-1].astype(float)
+        anchors = Observations.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
+        return cls(image, grid, GridEdges.of(grid), anchors, floor)
+
+    def lines(self, at: SmoothMap) -> Lines:
+        """The edges in the image, by a map."""
+        return grid_lines(at, self.edges.centre, self.edges.vertical, self.edges.light)
+
+    def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
+        """Edges as observations of a map, with an unknown common shift to the light side."""
+        value = (lines.middle * lines.normal).sum(axis=1) + offset
+        edges = Observations(self.edges.centre, lines.normal, value, variance, np.ones((len(offset), 1)))
+        if len(offset) > _ENOUGH:
+            return edges
+        anchors = replace(self.anchors, variance=np.full_like(self.anchors.variance, _ANCHOR**2))
+        return edges.joined_with(anchors)
+
+
+@dataclass(frozen=True, eq=False)
+class GridFit:
+    """Fitted edges and their common parameters.
+
+    Attributes
+    ----------
+    lines : Lines
+    fit : Fit
+    data : EdgeData
+    map : MapFit
+    shading : Shading
+    shape : Shape
+    noise : Noise
+    good : (E,) bool array
+        Edges that passed the quality tests.
+    """
+
+    lines: Lines
+    fit: BatchFit
+    data: EdgeData
+    map: MapFit
+    shading: Shading
+    shape: ProfileShape
+    noise: PixelNoise
+    good: NDArray[np.bool_]
+
+    @property
+    def unevenness(self) -> float:
+        """Variance [px^2] of the edges around the smooth map beyond that of their fits.
+
+        Its causes are an uneven print or board, and errors of the model of the pixels. For a calibration it
+        is noise of the points.
+        """
+        if not self.good.any():
+            return 0.0
+        return max(self.map.excess - 1, 0.0) * upper_median(self.fit.covariance[self.good, OFFSET, OFFSET])
+
+
+def fit_grid(grid_image: GridImage) -> GridFit:
+    """All stages: map of the found vertices, moments, first fit, common parameters, last fit."""
+    frame = Frame.of(grid_image.anchors.grid, (grid_image.image.shape[1], grid_image.image.shape[0]))
+    n = len(grid_image.anchors.grid) // 2
+    points = grid_image.anchors.value.reshape(2, n).T
+    start = homography_start(frame, grid_image.anchors.grid[:n], points)
+    found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
+    dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
+    shading = fit_shading(frame, dark, light)
+    noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
+    mapped, sigma = _by_moments(grid_image, found, shading)
+    first = _first_fit(grid_image, mapped, sigma, shading, noise)
+    return _last_fit(grid_image, first)
+
+
+def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
+    """The map through offsets from moments, and the blur [px]."""
+    lines = grid_image.lines(found.map)
+    # Oblique crossing lines enter wide strips from the side.
+    slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
+    half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
+    half = np.clip(half, 2.0, _WIDEST)
+    strips = strip_pixels(grid_image.image, lines, half, 0.2 * lines.length[:, None], usual_stride(lines))
+    offset, _, blur = moments(strips, half, *shading.at(lines.middle))
+    sigma = float(np.clip(upper_median(blur), 0.33, 0.25 * upper_median(lines.width)))
+    observations = grid_image.observations(lines, offset, np.full(len(offset), _MOMENT_SIGMA**2))
+    return fit_map(found.map, observations, found.shift), sigma
+
+
+def _first_fit(
+    grid_image: GridImage, mapped: MapFit, sigma: float, shading: Shading, noise: float
+) -> GridFit:
+    """Edges fitted with independent levels, and the map through them."""
+    lines = grid_image.lines(mapped.map)
+    offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
+    free = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
+    data, fit, shape = free.data, free.fit, free.shape
+    good = is_typical(fit)
+    variance = fit.covariance[:, OFFSET, OFFSET]
+    good &= variance > 0
+    variance = np.where(good, variance, _ANCHOR**2)
+    observations = grid_image.observations(lines, fit.values[:, OFFSET], variance)
+    # At least the model of the vertices' map; polynomials, for uneven boards, only after the last fit.
+    chosen = select_map(
+        mapped.map,
+        observations,
+        mapped.shift,
+        least=mapped.model_index,
+        most=max(mapped.model_index, RICHEST_LENS),
+    )
+    good &= chosen.weight[: len(good)] > 0
+    return GridFit(lines, fit, data, chosen, shading, shape, PixelNoise(noise, noise, noise), good)
+
+
+def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
+    """Edges fitted with common parameters, and the map through them."""
+    good, n = first.good, len(first.good)
+    lines = grid_image.lines(first.map.map)
+    shading = _shading(first)
+    fit, data, shape, noise = _fine_fit(grid_image, first, lines, shading)
+    scale = max(upper_median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
+    fit, noise = fit.scaled(scale), noise.times(scale)
+    variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
+    trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
+    observations = grid_image.observations(lines, fit.values[:, OFFSET], trusted)
+    # More accurate edges may need a richer model.
+    mapped = select_map(first.map.map, observations, first.map.shift, least=first.map.model_index)
+    expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
+    departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
+    # An uneven board departs from its map everywhere: no single edge is an outlier for that, but all
+    # of them are less certain.
+    uneven = max(MAD_TO_SIGMA * upper_median(np.abs(departure)), 1.0)
+    mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
+    good = is_reliable(fit, departure, data.beyond)
+    return GridFit(lines, fit, data, mapped, shading, shape, noise, good)
+
+
+def _fine_fit(
+    grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading
+) -> tuple[BatchFit, EdgeData, ProfileShape, PixelNoise]:
+    """Fits to all pixels, with levels, blur, profile and noise of the whole board."""
+    n, half_length = len(first.good), 0.5 * lines.length
+    shape = profile_shape(first.data, first.fit, first.shape, first.good)
+    noise = PixelNoise.of(first.fit, first.data.root, grid_image.floor)
+    blur = BoardBlur.of(first.fit, lines.normal, first.good)
+    sigma = blur.along(lines.normal)
+    data = edge_pixels(grid_image.image, lines, sigma, shading, REACH * sigma, 1)
+    prior = level_prior(shading, lines.middle, sigma, blur.spread, noise.edge)
+    offset = first.map.residual[:n] + first.map.shift[0]
+    start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
+    data = with_weight(data, noise.weights(light_at(data, start)))
+    fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
+    usual = upper_median(sigma)
+    if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
+        # The profile, estimated from a part of the pixels, is now the largest error: estimate it again.
+        shape = profile_shape(data, fit, shape, first.good)
+        noise = PixelNoise.of(fit, data.root, grid_image.floor)
+        data = with_weight(data, noise.weights(fit.linear.x))
+        fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
+    return fit, data, shape, noise
+
+
+def fit_grid_vertices(
+    grid_image: GridImage, fitted: GridFit
+) -> tuple[BatchFit, tuple[Lines, Lines], NDArray[np.bool_]]:
+    """Fits of all known vertices after those of the edges, with their lines and a mask of reliable ones."""
+    grid = grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2]
+    lines = vertex_lines(fitted.map.map, grid)
+    light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
+    place = lines[0].middle
+    blur = BoardBlur.of(fitted.fit, fitted.lines.normal, fitted.good)
+    sigma = 0.5 * (blur.along(lines[0].normal) + blur.along(lines[1].normal))
+    contrast = fitted.shading.at(place)[1]
+    slopes = fitted.shading.slopes(place)
+    data = vertex_data(
+        grid_image.image, lines, light, sigma, REACH, slopes, contrast, _ends(grid_image.grid.seen)
+    )
+    tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
+    shape = ProfileShape(tails, fitted.shape.nonlinearity)
+    if fitted.shape.half is not None:
+        shape = replace(shape, half=np.stack([half_widths(line.normal) for line in lines], axis=1))
+    prior = level_prior(fitted.shading, place, sigma, blur.spread, fitted.noise.edge)
+    start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
+    half = (0.5 * lines[0].length, 0.5 * lines[1].length)
+    unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
+    fit = fit_vertices(unit, start, prior, half, shape, _STEPS)
+    root = np.sqrt(fitted.noise.weights(fit.linear.x)) * (data.root > 0)
+    fit = fit_vertices(replace(data, root=root), fit.values, prior, half, shape, _STEPS)
+    fit = fit.scaled(max(upper_median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
+    departure = np.zeros(len(grid))
+    for line, which in zip(lines, (FIRST, SECOND), strict=True):
+        variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
+        variance *= fitted.map.excess
+        departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
+    return fit, lines, is_reliable(fit, departure, data.beyond)
+
+
+def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(V, 2, 2) mask of known vertices without a neighbour: before and after, along c and along r."""
+    beyond = ~np.pad(seen, 1)
+    along_c = np.stack([beyond[1:-1, :-2], beyond[1:-1, 2:]], axis=-1)
+    along_r = np.stack([beyond[:-2, 1:-1], beyond[2:, 1:-1]], axis=-1)
+    return np.asarray(np.stack([along_c[seen], along_r[seen]], axis=1))
+
+
+def _shading(first: GridFit) -> Shading:
+    """Shading of the whole board from the levels of its edges."""
+    covariance, values, good = first.fit.covariance, first.fit.values, first.good
+    both = covariance[:, MEAN, MEAN] + covariance[:, CONTRAST, CONTRAST]
+    cross = 2 * covariance[:, MEAN, CONTRAST]
+    place = first.lines.middle[good]
+    dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
+    light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
+    return fit_shading(first.shading.frame, dark, light)

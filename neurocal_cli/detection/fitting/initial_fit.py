@@ -1,0 +1,133 @@
+"""The first fits of a board's edges, each with its own levels, to estimate blur and profile.
+
+In: lines from the map, rough offsets and blur. Out: `InitialFit`, from which `grid_fit` estimates what all
+edges have in common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.batched_newton import BLUR, BatchFit, LevelPrior, ProfileShape
+from neurocal_cli.detection.fitting.common_parameters import profile_shape
+from neurocal_cli.detection.fitting.edge_fit import EdgeData, fit_edges, with_weight
+from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis
+from neurocal_cli.detection.fitting.fit_quality import is_typical
+from neurocal_cli.detection.fitting.pixel_box import half_widths
+from neurocal_cli.detection.fitting.shading import Shading
+from neurocal_cli.detection.fitting.strips import Lines
+from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.geometry import Array
+
+__all__ = ["InitialFit", "fit_initial"]
+
+# Insensitive, apart from edges sharper than a pixel ("straight, psf 0.15" in tests/rendered.py). There, half
+# of _FEW_STEPS raises errors by 50 %, and twice _CLEARLY, never taking the box, makes them 8 times larger.
+_SLACK = 0.5  # px, added to the strips because lines are not accurate yet
+_FEW_STEPS, _STEPS = 3, 6  # Gauss-Newton steps before and after blur and shape are known
+_CLEARLY = 0.97  # ratio of chi2 below which the smooth profile is preferred to the pixel's box
+_WORSE = 1.2  # ratio of chi2 from which on fits with the new blur are rejected
+_BLUR_OFF = 0.2  # relative error of the blur that makes the fits start again
+_LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations of the prior
+
+
+@dataclass(frozen=True, eq=False)
+class InitialFit:
+    """Fits of edges with independent levels.
+
+    Attributes
+    ----------
+    data : EdgeData
+        The pixels used.
+    fit : Fit
+    shape : Shape
+    """
+
+    data: EdgeData
+    fit: BatchFit
+    shape: ProfileShape
+
+    @property
+    def rough(self) -> float:
+        """Typical chi2 per pixel."""
+        return upper_median(self.fit.chi2 / np.maximum(self.fit.count, 1))
+
+    def blur(self, otherwise: float) -> float:
+        """Typical blur [px]."""
+        good = is_typical(self.fit)
+        return upper_median(self.fit.values[good, BLUR]) if good.any() else otherwise
+
+
+def fit_initial(
+    image: NDArray[np.generic], lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
+) -> InitialFit:
+    """Fit edges with independent levels.
+
+    Parameters
+    ----------
+    image : (H, W) array
+    lines : Lines
+    offset : (E,) array [px]
+        Start of the edges' distances from their lines.
+    sigma : float [px]
+        Start of the blur.
+    shading : Shading
+    noise : float [DN^2]
+        Variance of a pixel.
+    """
+    known = np.stack([*shading.at(lines.middle), np.full(len(offset), sigma)], axis=-1)
+    start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), known], axis=1)
+    started = _few_steps(image, lines, start, known, shading, noise)
+    found = started.blur(sigma)
+    # The effect of crossing lines on the pixels depends on the blur.
+    if abs(found - sigma) > _BLUR_OFF * sigma or (found < SHARP) != (sigma < SHARP):
+        known[:, 2] = found
+        start = np.where(is_typical(started.fit)[:, None], started.fit.values, start)
+        start[:, BLUR] = found
+        again = _with_best_profile(_few_steps(image, lines, start, known, shading, noise), lines, found)
+        if again.rough < _WORSE * started.rough:
+            return again
+    return _with_best_profile(started, lines, sigma)
+
+
+def _few_steps(
+    image: NDArray[np.generic], lines: Lines, start: Array, known: Array, shading: Shading, noise: float
+) -> InitialFit:
+    """A few steps, to estimate the blur; known (E, 3) are mean level, contrast and blur."""
+    blur, half_length = known[:, 2], 0.5 * lines.length
+    data = edge_pixels(image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
+    data = with_weight(data, np.full_like(data.root, 1 / noise))
+    spread = known * [0.0, 0.0, _LOOSE_BLUR] + known[:, 1:2] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
+    prior = LevelPrior(known.copy(), (1 / spread**2)[:, :, None] * np.eye(3))
+    shape = _blur_profiles(lines, float(blur[0]))[-1]
+    return InitialFit(data, fit_edges(data, start, prior, half_length, shape, _FEW_STEPS, 0), shape)
+
+
+def _with_best_profile(started: InitialFit, lines: Lines, sigma: float) -> InitialFit:
+    """Continue the fits with the blur profile that gives the lower chi2."""
+    results = [_converged(started, lines, shape) for shape in _blur_profiles(lines, sigma)]
+    # Prefer the pixel's box: both agree where all edges run along the pixels.
+    return results[0] if results[0].rough < _CLEARLY * results[-1].rough else results[-1]
+
+
+def _converged(started: InitialFit, lines: Lines, shape: ProfileShape) -> InitialFit:
+    data, fit, half_length = started.data, started.fit, 0.5 * lines.length
+    if (shape.half is None) != (started.shape.half is None):
+        fit = fit_edges(data, fit.values, fit.prior, half_length, shape, _FEW_STEPS, 0)
+    shape = profile_shape(data, fit, shape, is_typical(fit))
+    return InitialFit(data, fit_edges(data, fit.values, fit.prior, half_length, shape, _STEPS), shape)
+
+
+def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:
+    """Profiles of pure blur: the series and, for sharp images, the pixel's box."""
+    none = np.zeros(RESPONSE_TERMS)
+    tails = box_kurtosis(lines.normal, np.full(len(lines.normal), sigma))
+    shapes = [ProfileShape(tails[:, None] * [1.0, 0.0], none)]
+    if sigma < SHARP:
+        # Cameras that sharpen images do not leave the profile of a pixel's box.
+        shapes.append(ProfileShape(np.zeros((len(tails), 2)), none, half_widths(lines.normal)))
+    return shapes

@@ -1,0 +1,251 @@
+"""Robust dense fit of the smooth map, apart from the least-squares core: weights change with each step.
+
+This is not the package's least-squares core, because its problem is different: a dense fit of 8 to 64
+parameters to about a hundred observations, 0.5 ms each and eight times for each grid. It has no blocks to
+eliminate, Tukey's weights change from step to step, and fits end early when a model gains too little.
+
+In: a start, observations. Out: the map with its covariance, residuals, weights of outliers, excess variance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.fitting.smooth_map import MAP_MODELS, SmoothMap
+from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.geometry import Array
+
+__all__ = [
+    "STEPS",
+    "MapFit",
+    "MapSolution",
+    "Observations",
+    "fit_map",
+    "loss_of",
+    "robust_scale",
+    "solve_map",
+    "with_covariance",
+]
+
+# Insensitive.
+STEPS = 25  # at most
+_SHIFT_PRIOR = 1e-2  # 1/px^2, of the shifts: 10 px
+_TINY = 1e-300
+_BELIEF = 20  # weight, in observations, of the prior that the given variances are true
+_CREEPING = 5e-3  # relative gain of chi2 below which steps end
+_CONVERGED = 0.2  # of chi2
+_DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
+_ROBUST = 1.5  # standard deviation over the median absolute value, about 1.4826
+_TUKEY = 6.0  # standard deviations beyond which an observation is an outlier
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Positions known along one direction each: ``direction . p = value``.
+
+    Attributes
+    ----------
+    grid : (N, 2) array [squares]
+    direction : (N, 2) array
+        Unit vectors.
+    value : (N,) array [px]
+    variance : (N,) array [px^2]
+    shift : (N, K) array
+        Derivatives of the values by further unknowns, which are fitted with the map.
+    """
+
+    grid: Array
+    direction: Array
+    value: Array
+    variance: Array
+    shift: Array
+
+    @classmethod
+    def of_points(cls, grid: Array, pixels: Array, sigma: float, shifts: int = 0) -> Observations:
+        """Both coordinates of points (N, 2)."""
+        n = len(grid)
+        return cls(
+            np.tile(grid, (2, 1)),
+            np.repeat(np.eye(2), n, axis=0),
+            pixels.T.reshape(-1),
+            np.full(2 * n, sigma**2),
+            np.zeros((2 * n, shifts)),
+        )
+
+    @property
+    def informative(self) -> NDArray[np.bool_]:
+        """(N,) mask of the observations that determine the map; anchors, maybe more than half, do not."""
+        quarter = len(self.variance) // 4
+        return np.asarray(self.variance < 100 * np.partition(self.variance, quarter)[quarter])
+
+    def joined_with(self, other: Observations) -> Observations:
+        """Both together."""
+        names = ("grid", "direction", "value", "variance", "shift")
+        return Observations(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+
+
+@dataclass(frozen=True, eq=False)
+class MapFit:
+    """A map fitted to observations.
+
+    Attributes
+    ----------
+    map : SmoothMap
+    shift : (K,) array [px]
+        Unknowns of `Rows.shift`.
+    shift_variance : (K,) array [px^2]
+    residual : (N,) array [px]
+        Value minus map and shift.
+    weight : (N,) array
+        From 1 down to 0 for outliers.
+    chi2 : float
+        Of the good observations; about their number minus that of the parameters.
+    excess : float
+        Variance of the good and informative residuals relative to the given variances; 1 where the
+        difference may be chance, less where they are smaller.
+    """
+
+    map: SmoothMap
+    shift: Array
+    shift_variance: Array
+    residual: Array
+    weight: Array
+    chi2: float
+    excess: float
+
+    @property
+    def model_index(self) -> int:
+        """Index of the map's model in `MAP_MODELS`."""
+        return MAP_MODELS.index((self.map.radial, self.map.degree))
+
+
+def fit_map(start: SmoothMap, observations: Observations, shift: Array, steps: int = STEPS) -> MapFit:
+    """Levenberg-Marquardt with Tukey's weights, from a start that is nearly right.
+
+    Parameters
+    ----------
+    start : SmoothMap
+        Its model is kept.
+    rows : Rows
+    shift : (K,) array [px]
+        Start of the shifts.
+    steps : int
+        At most.
+    """
+    return with_covariance(solve_map(start, observations, shift, steps), observations)
+
+
+@dataclass(frozen=True, eq=False)
+class MapSolution:
+    """A fitted map: shifts, residuals (N,) and derivatives (P, N) of the predictions."""
+
+    map: SmoothMap
+    shift: Array
+    residual: Array
+    jacobian: Array
+
+
+def solve_map(
+    start: SmoothMap, observations: Observations, shift: Array, steps: int, worth: float = 0.0
+) -> MapSolution:
+    """Fit a map of the start's model; stop after the first step if it lowers chi2 by less than `worth`."""
+    free, m = start.free, len(start.free)
+    prior = np.concatenate([start.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
+    values = np.concatenate([start.parameters[free], shift])
+    places = start.places(observations.grid, np.ascontiguousarray(observations.direction.T))
+    inverse_sigma = 1 / np.sqrt(observations.variance)
+
+    def compared(now: SmoothMap, shift: Array) -> tuple[Array, Array]:
+        """Residuals (N,) and derivatives (P, N) of the predictions."""
+        value, along = now.along(places)
+        residual = observations.value - value - observations.shift @ shift
+        return residual, np.concatenate([along[free], observations.shift.T])
+
+    residual, jacobian = compared(start, shift)
+    # Before the first step all residuals may be large: no weights yet.
+    precision, informative = inverse_sigma * inverse_sigma, observations.informative
+    weight, damping, least = precision, _DAMPING, 0.0
+    square = residual * residual
+    for _ in range(steps):
+        weighted = jacobian * weight
+        gradient = weighted @ residual - prior * values
+        normal = weighted @ jacobian.T
+        normal.ravel()[:: len(values) + 1] += prior
+        moved = values + _solved(normal, gradient, damping)
+        tried = start.moved(free, moved[:m])
+        ahead, slopes = compared(tried, moved[m:])
+        square_ahead = ahead * ahead
+        before = weight @ square + prior @ (values * values)
+        after = weight @ square_ahead + prior @ (moved * moved)
+        if not after <= before:
+            # Strongly correlated parameters: keep the damping from now on.
+            damping = least = 10 * damping
+            continue
+        start, values, residual, jacobian, square = tried, moved, ahead, slopes, square_ahead
+        damping = max(0.1 * damping, least)
+        if before - after < worth:
+            break
+        worth = 0.0
+        z = residual * inverse_sigma
+        scale = robust_scale(z[informative])
+        if before - after < max(_CONVERGED * scale**2, _CREEPING * after) and damping <= max(_DAMPING, least):
+            break
+        weight = _tukey(z / scale) * precision
+    return MapSolution(start, values[m:], residual, jacobian)
+
+
+def loss_of(z: Array) -> float:
+    """Chi2 with every term limited to 100, for outliers."""
+    return float(np.minimum(z * z, 100.0).sum())
+
+
+def _tukey(z: Array) -> Array:
+    weight = np.maximum(1 - np.square(z * (1 / _TUKEY)), 0)
+    return np.square(weight, out=weight)
+
+
+def robust_scale(z: Array) -> float:
+    """Robust standard deviation of normalised residuals; at least 1.
+
+    Errors of the map that most observations share do not make them outliers.
+    """
+    return max(1.0, _ROBUST * upper_median(np.abs(z)))
+
+
+def _solved(normal: Array, gradient: Array, damping: float) -> Array:
+    """Solution of damped normal equations, with scaled parameters."""
+    size = 1 / np.sqrt(np.maximum(normal.diagonal(), _TINY))
+    scaled = normal * size[:, None] * size
+    scaled.ravel()[:: len(size) + 1] += damping
+    return np.asarray(size * np.linalg.solve(scaled, gradient * size))
+
+
+def with_covariance(solution: MapSolution, observations: Observations) -> MapFit:
+    """A solution with its covariance, weights and excess variance."""
+    now, shift, residual, jacobian = solution.map, solution.shift, solution.residual, solution.jacobian
+    free, informative = now.free, observations.informative
+    z = residual / np.sqrt(observations.variance)
+    weight = _tukey(z / robust_scale(z[informative]))
+    good = weight > 0
+    normal = (jacobian * (good / observations.variance)) @ jacobian.T
+    normal.ravel()[:: len(normal) + 1] += np.concatenate([now.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
+    size = 1 / np.sqrt(np.maximum(normal.diagonal(), _TINY))
+    inverse = np.linalg.inv(normal * size[:, None] * size) * size[:, None] * size
+    informative = good & informative
+    left = int(informative.sum()) - len(free) - len(shift)
+    excess = float((z[informative] ** 2).sum()) / max(left, 0.2 * len(z))
+    shrunk = min(1.0, (excess * left + _BELIEF) / (left + _BELIEF)) if left > 0 else 1.0
+    covariance = np.zeros((len(now.parameters),) * 2)
+    covariance[free[:, None], free] = inverse[: len(free), : len(free)]
+    return MapFit(
+        map=replace(now, covariance=covariance),
+        shift=shift,
+        shift_variance=np.diag(inverse)[len(free) :].copy(),
+        residual=residual,
+        weight=weight,
+        chi2=float((z[good] ** 2).sum()),
+        excess=excess if excess > 1 + 3 * np.sqrt(2 / max(left, 1)) else shrunk,
+    )

@@ -1,0 +1,124 @@
+"""How well points of several planes fit one projective camera, by the direct linear transform.
+
+It tests arrangements of grids in `identify`. Distortion is not modelled: its few pixels are small compared
+with the squares by which wrong arrangements miss.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["CameraFit", "fit_camera", "is_flat", "rigid_motion"]
+
+_FLAT = 1e-6  # ratio of smallest and largest extent of points in one plane: rounding errors
+_WEAK = 3.0  # ratio by which an affine camera must fit worse for perspective to be certain
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """A projective camera fitted to points.
+
+    Attributes
+    ----------
+    rms : float [px]
+    handed : int
+        1 for a camera, -1 for the mirror image of one, 0 if undecided: too little perspective, or all points
+        in one plane.
+    """
+
+    rms: float
+    handed: int
+
+
+def is_flat(world: Array) -> bool:
+    """Whether points (N, 3) lie in one plane."""
+    extents = np.linalg.svd(world - world.mean(axis=0), compute_uv=False)
+    return bool(extents[2] <= _FLAT * extents[0])
+
+
+def fit_camera(world: Array, pixels: Array, front: Array | None = None) -> CameraFit:
+    """Fit a camera to points by the direct linear transform.
+
+    Parameters
+    ----------
+    world : (N, 3) array
+    pixels : (N, 2) array [px]
+    front : (3,) array, optional
+        Of points in one plane, the normal that must point away from the camera.
+    """
+    plane = _plane_coordinates(world, front) if is_flat(world) else None
+    points = world if plane is None else plane
+    P, rms = _linear_camera(points, pixels)
+    if not np.isfinite(rms):
+        return CameraFit(np.inf, 0)
+    depth = np.column_stack([points, np.ones(len(points))]) @ P[2]
+    if depth.min() < 0 < depth.max():
+        return CameraFit(np.inf, 0)
+    sign = np.sign(depth[0])
+    if plane is not None:
+        handed = 0 if front is None else int(sign * np.sign(np.linalg.det(P)))
+        return CameraFit(rms, handed)
+    if _affine_rms(points, pixels) < _WEAK * rms:
+        return CameraFit(rms, 0)
+    return CameraFit(rms, int(sign * np.sign(np.linalg.det(P[:, :3]))))
+
+
+def rigid_motion(first: Array, second: Array) -> tuple[Array, Array] | None:
+    """Rotation R and translation t with ``second = first R^T + t``; None if no motion fits.
+
+    Parameters
+    ----------
+    first, second : (N, 3) arrays
+    """
+    a, b = first.mean(axis=0), second.mean(axis=0)
+    U, _, Vt = np.linalg.svd((first - a).T @ (second - b))
+    R = Vt.T @ np.diag([1.0, 1.0, np.linalg.det(Vt.T @ U.T)]) @ U.T
+    t = b - R @ a
+    misses = np.abs(first @ R.T + t - second).max()
+    return (R, t) if misses <= _FLAT * max(float(np.ptp(first)), 1e-300) else None
+
+
+def _plane_coordinates(world: Array, front: Array | None) -> Array:
+    """Coordinates within the points' plane, turning clockwise when seen against `front`."""
+    centred = world - world.mean(axis=0)
+    x, y, normal = np.linalg.svd(centred, full_matrices=False)[2]
+    if front is not None and normal @ front * np.linalg.det([x, y, normal]) < 0:
+        y = -y
+    return centred @ np.array([x, y]).T
+
+
+def _linear_camera(points: Array, pixels: Array) -> tuple[Array, float]:
+    """Matrix (3, d + 1) that projects points (N, d) to pixels, and its rms error [px]."""
+    T, x = _scaled(points)
+    S, d = _scaled(pixels)
+    zeros = np.zeros_like(x)
+    rows = np.concatenate([np.hstack([x, zeros, -d[:, :1] * x]), np.hstack([zeros, x, -d[:, 1:2] * x])])
+    normal = np.linalg.eigh(rows.T @ rows)[1][:, 0]
+    P = np.linalg.inv(S) @ normal.reshape(3, -1) @ T
+    seen = np.column_stack([points, np.ones(len(points))]) @ P.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        error = seen[:, :2] / seen[:, 2:] - pixels
+    return P, _rms(error)
+
+
+def _affine_rms(points: Array, pixels: Array) -> float:
+    x = np.column_stack([points, np.ones(len(points))])
+    return _rms(x @ np.linalg.lstsq(x, pixels, rcond=None)[0] - pixels)
+
+
+def _rms(error: Array) -> float:
+    return float(np.sqrt((error**2).sum(axis=1).mean()))
+
+
+def _scaled(points: Array) -> tuple[Array, Array]:
+    """Matrix that centres and scales points, and the homogeneous points it gives."""
+    centre = points.mean(axis=0)
+    size = float(np.sqrt(((points - centre) ** 2).mean())) or 1.0
+    d = points.shape[1]
+    T = np.eye(d + 1) / size
+    T[:d, d], T[d, d] = -centre / size, 1.0
+    return T, np.column_stack([(points - centre) / size, np.ones(len(points))])

@@ -1,0 +1,70 @@
+"""Messages about images whose grids cannot be located on the board."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from neurocal_cli.board import Board
+from neurocal_cli.detection.grid import Grid
+from neurocal_cli.detection.identity.ends import End
+from neurocal_cli.errors import NeurocalError
+
+__all__ = ["SYMMETRIC_BOARD", "NoBoardError", "ambiguity_message", "wrong_size_message"]
+
+SYMMETRIC_BOARD = (
+    "the board looks the same after a turn, so its first corner depends on its orientation in the image; to "
+    "get the same point ids in all images, use a board with an even number of inner vertices on one side and "
+    "an odd number on the other"
+)
+
+
+class NoBoardError(NeurocalError):
+    """An image does not show the board, or not enough of it to locate its points."""
+
+
+def wrong_size_message(board: Board, grid: Grid, ends: Sequence[End]) -> str:
+    """The message about a grid that has no place on the board."""
+    wanted = _sizes(board)
+    shape = grid.shape
+    if len(board.planes) == 1:
+        plane = board.planes[0]
+        if (shape[0] < shape[1]) != (plane.cols < plane.rows):  # named as the user names them
+            shape = shape[1], shape[0]
+        if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends:
+            return f"the pattern continues beyond {wanted} inner vertices; give the size of the whole board"
+    have = "board has" if len(board.planes) == 1 else "planes of the board have"
+    return (
+        f"detected {_size(shape)} inner vertices, but the {have} {wanted}; give the size of the board in the "
+        "image"
+    )
+
+
+def ambiguity_message(board: Board, grids: Sequence[Grid], rms: float) -> str:
+    """The message about grids with several arrangements, the best one with an rms error [px]."""
+    sizes = [sorted((plane.cols, plane.rows)) for plane in board.planes]
+    part = next((grid for grid in grids if sorted(grid.shape) not in sizes), None)
+    if part is not None:
+        return (
+            f"detected {_size(part.shape)} of {_sizes(board)} inner vertices, but it is ambiguous which "
+            "ones; "
+            "show the whole board, or its outer border on more sides"
+        )
+    if len(grids) < len(board.planes):
+        return (
+            f"only {len(grids)} of the {len(board.planes)} planes detected, so their position is ambiguous; "
+            "show more of them"
+        )
+    return (
+        f"the planes fit the board in more than one way, to {rms:.2g} px; check the board's origins and "
+        "axes, "
+        "or take the image from nearer"
+    )
+
+
+def _sizes(board: Board) -> str:
+    names = [_size((plane.cols, plane.rows)) for plane in board.planes]
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _size(shape: tuple[int, int]) -> str:
+    return f"{shape[0]} x {shape[1]}"

@@ -1,0 +1,41 @@
+"""Residuals of measured points from a smooth map of their plane: a view of the noise without a camera."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Measured
+from neurocal_cli.geometry import Array
+
+__all__ = ["plane_residuals"]
+
+_POINTS_A_TERM = 6  # least number of points for each coefficient of the polynomial; for pictures only
+
+
+def plane_residuals(measured: Measured) -> Array:
+    """Measured pixels minus those of a homography and a polynomial fitted to them.
+
+    The polynomial models the distortion; its degree is five, or less for few points.
+
+    Parameters
+    ----------
+    measured : Measured
+
+    Returns
+    -------
+    residuals : (N, 2) array [px]
+        Zero for fewer than five points, which any homography fits.
+    """
+    grid = measured.index + 0.5 * np.stack([measured.kind == EDGE_H, measured.kind == EDGE_V], axis=-1)
+    if len(grid) < 5:
+        return np.zeros_like(measured.pixels)
+    H, _ = cv2.findHomography(grid, measured.pixels, 0)
+    if H is None:
+        return np.zeros_like(measured.pixels)
+    seen = np.column_stack([grid, np.ones(len(grid))]) @ H.T
+    left = measured.pixels - seen[:, :2] / seen[:, 2:]
+    degree = max((d for d in range(1, 6) if _POINTS_A_TERM * (d + 1) * (d + 2) <= 2 * len(grid)), default=0)
+    x, y = ((grid - grid.mean(axis=0)) / max(float(np.ptp(grid)), 1.0)).T
+    terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)
+    return np.asarray(left - terms @ np.linalg.lstsq(terms, left, rcond=None)[0])
