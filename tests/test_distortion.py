@@ -12,6 +12,7 @@ from support.scenes import Scene, board_midpoints, random_flat_set, table_1
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
 from neurocal_cli.bundle_adjustment.point_batches import batches_of
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks, residuals
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
@@ -151,14 +152,9 @@ def test_a_file_with_a_lens_evaluates_as_it_was_calibrated(tmp_path: Path) -> No
 
 def test_a_lens_that_could_not_have_seen_a_pixel_is_refused() -> None:
     scene, points = flat_points("k1")
-
-    class Camera:
-        intrinsics = scene.intrinsics
-        distortion_model = "k1"
-        distortion = np.array([-3.0])
-
+    camera = Camera(scene.intrinsics, Distortion("k1", [-3.0]))
     with pytest.raises(InputError, match="maps nothing to"):
-        calibrate(points, type=3, intrinsics=Camera())
+        calibrate(points, type=3, intrinsics=camera)
 
 
 def test_a_lens_that_folds_inside_the_image_is_refused() -> None:
