@@ -215,7 +215,7 @@ class _Chain:
 def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
     """Whether every view by itself fits far better than the best of the common cameras."""
     best = min(fitted, key=lambda c: c.cost)
-    return best.cost > _SHORT**2 * float(free_networks(views, best.adjusted.state).sum()) + 1e-20
+    return best.cost > _SHORT**2 * float(free_networks(views, best.adjusted.state, _STEPS).sum()) + 1e-20
 
 
 def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate | None:
