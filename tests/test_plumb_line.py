@@ -23,9 +23,9 @@ from neurocal_cli.board import Board
 from neurocal_cli.bundle_adjustment.views import noise_model
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, LinesSeen, find_lines
+from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, CollinearPoints, find_lines
 from neurocal_cli.distortion.plumb_line import PlumbLine, fit_plumb_line, lines_in_pixels
-from neurocal_cli.distortion.straightness import bent_lines
+from neurocal_cli.distortion.straightness import distorted_lines
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import write_calibration
@@ -47,7 +47,7 @@ def seen_once(world: Array) -> Correspondences:
     return Correspondences(world, world[:, :2])
 
 
-def as_sets(lines: LinesSeen) -> set[frozenset[int]]:
+def as_sets(lines: CollinearPoints) -> set[frozenset[int]]:
     return {frozenset(part.tolist()) for part in np.split(lines.row, lines.first[1:])}
 
 
@@ -129,14 +129,14 @@ def test_derivatives_are_those_of_differences() -> None:
     whitening = noise_model(weights)[1]
     seen = lines_in_pixels(points, find_lines(points), np.array([480, 390]), 900.0, whitening)
     entries, k = np.array([1.0, 0.02, 0.98, 0.03, -0.02]), np.array([-0.21, 0.08, 0.01, -0.02])
-    curves = bent_lines(seen, entries, Distortion("k1k2p1p2", k))
+    curves = distorted_lines(seen, entries, Distortion("k1k2p1p2", k))
     r, J, nu = curves.derivatives()
     assert np.hypot(*nu.T) == pytest.approx(1.0)
     for column in range(9):
         step = np.zeros(9)
         step[column] = 1e-5
         plus, minus = (
-            curves.seen_through(entries + sign * step[:5], k + sign * step[5:]).settled().errors()
+            curves.with_camera(entries + sign * step[:5], k + sign * step[5:]).fitted().errors()
             for sign in (1, -1)
         )
         # At errors that are not 0 the projection itself turns, which is of the errors' size.
@@ -144,17 +144,17 @@ def test_derivatives_are_those_of_differences() -> None:
         assert ((minus - plus) / 2e-5) @ r == pytest.approx(J[:, column] @ r, abs=1e-7)
 
 
-def test_lines_that_a_lens_bends_have_no_error() -> None:
+def test_distorted_lines_have_no_error() -> None:
     scene = lens_scene([-0.2, 0.1])
     lines = find_lines(scene.points())
     a, _, b, u0, v0 = (*scene.intrinsics.A[0, :2], scene.intrinsics.A[1, 1], *scene.intrinsics.A[:2, 2])
     seen = lines_in_pixels(scene.points(), lines, np.zeros(2), 1.0)
-    curves = bent_lines(seen, np.array([a, 0, b, u0, v0]), Distortion("k1k2", [-0.2, 0.1]))
-    assert curves.sensible
+    curves = distorted_lines(seen, np.array([a, 0, b, u0, v0]), Distortion("k1k2", [-0.2, 0.1]))
+    assert curves.valid
     assert np.abs(curves.errors()).max() < 1e-9
 
 
-# The lens from lines alone
+# The distortion from lines alone
 
 
 @pytest.mark.parametrize("centre", [(499.5, 399.5), (535.0, 370.0), (450.0, 450.0)])
@@ -166,7 +166,7 @@ def test_lines_tell_centre_and_lens_without_a_camera(k: list[float], centre: tup
     found = fit_plumb_line(square.points())
     assert found.centre == pytest.approx(centre, abs=1e-3)
     share = 900.0 / found.scale
-    assert found.lens.coefficients * [share**2, share**4] == pytest.approx(k, abs=1e-5)
+    assert found.distortion.coefficients * [share**2, share**4] == pytest.approx(k, abs=1e-5)
     assert found.rms < 1e-6 < 0.5 < found.rms_before
 
 
@@ -180,7 +180,7 @@ def test_corrected_points_lie_on_lines() -> None:
 def test_without_a_lens_the_centre_stays_in_the_middle() -> None:
     found = fit_plumb_line(lens_scene([0.0, 0.0]).points(0.2, np.random.default_rng(3)))
     assert np.abs(found.centre - [499.5, 399.5]).max() < 500
-    assert np.abs(found.lens.coefficients[0]) < 0.01
+    assert np.abs(found.distortion.coefficients[0]) < 0.01
 
 
 def monte_carlo_of_the_centre(trials: int) -> tuple[Array, Array]:

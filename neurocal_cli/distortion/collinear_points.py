@@ -1,8 +1,8 @@
 """Straight lines among known points: which points of a view are collinear in X, Y, Z.
 
-Collinear points are seen on a straight line by any pinhole camera, wherever it stands. Nothing is
-known of the target but its coordinates: rows, columns and diagonals of boards are found as any other
-line is, through pairs of points that have the direction and the offset of their line in common.
+The images of collinear points are collinear in any pinhole camera. Only the coordinates of the target are
+used. Rows, columns and diagonals of boards are found like any other line: pairs of points on one line have
+the same direction and the same offset.
 """
 
 from __future__ import annotations
@@ -16,33 +16,34 @@ from neurocal_cli.bundle_adjustment.measured_directions import unit
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["FEWEST_ON_LINE", "LinesSeen", "find_lines"]
+__all__ = ["FEWEST_ON_LINE", "CollinearPoints", "find_lines"]
 
 FEWEST_ON_LINE = 4
-_FEWEST_OF_EDGES = 3  # of points that are seen across their edges, for which only lines along these count
+_FEWEST_OF_EDGES = 3  # the same for points that are measured across edges, on lines along these edges
 
-# Points off a line by this share of the target's size are on it: 2 micrometres of a 200 mm board.
+# Rounding of coordinates, as a share of the target's size: 2 micrometres on a 200 mm board. The tests in
+# tests/test_plumb_line.py repeat that lines are found and that scattered points have none.
 _TOLERANCE = 1e-5
 _LINES_A_POINT = 4  # rows, columns and diagonals of a board
-_OF_EDGES = 8  # and more where only those along the edges count
-_ALONG = 0.25  # sine of the angle between an edge and a line that it lies on
-_ALL_PAIRS = 700  # points of a target whose pairs are all looked at
-_MOST_PAIRS = 500_000  # of larger targets: pairs of some points with all others
-_MOST_PLACES = 200_000  # places on lines; more tell nothing that these do not
+_OF_EDGES = 8  # the same where only lines along edges are used
+_ALONG = 0.25  # largest sine of the angle between an edge and the line along it
+_ALL_PAIRS = 700  # largest target of which all pairs are compared
+_MOST_PAIRS = 500_000  # pairs of some points with all others, for larger targets
+_MOST_PLACES = 200_000  # points on lines; more of them do not change the result but cost time
 
 Index = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
-class LinesSeen:
-    """Lines of the target in the views that show them.
+class CollinearPoints:
+    """Points of each view, grouped by the lines on which they are.
 
     Attributes
     ----------
     row : (M,) int array
-        Row of the points at each place on a line; a row has as many places as lines through it.
+        Row of each point on each line. A row occurs once for each line through it.
     first : (L,) int array
-        First place of each line.
+        Where each line begins in `row`.
     """
 
     row: Index
@@ -58,15 +59,15 @@ class LinesSeen:
 
     @property
     def line(self) -> Index:
-        """(M,) line of each place."""
+        """(M,) line of each entry of `row`."""
         return np.repeat(np.arange(len(self.first)), self.counts)
 
 
-def find_lines(points: Correspondences) -> LinesSeen:
+def find_lines(points: Correspondences) -> CollinearPoints:
     """Find the lines of at least `FEWEST_ON_LINE` known points in each view, or of three along edges.
 
-    Each point is used on the four longest lines through it, so rows, columns and diagonals of a board;
-    one that was measured across an edge, on lines along that edge.
+    Each point is used on the four longest lines through it: the row, the column and the diagonals of a
+    board. A point that was measured across an edge is used on lines along that edge.
     """
     ids, target = _distinct(points.world)
     fewest, most = FEWEST_ON_LINE, _LINES_A_POINT
@@ -88,7 +89,7 @@ def find_lines(points: Correspondences) -> LinesSeen:
 
 
 def _along_edges(points: Correspondences, row: Index, first: Index) -> tuple[Index, Index]:
-    """Drop lines that points were not measured across: where along its edge one lies is not its own word."""
+    """Drop lines across the edges of their points: a position along an edge is not measured."""
     if points.across is None or not first.size:
         return row, first
     counts = np.diff(first, append=len(row))
@@ -96,7 +97,7 @@ def _along_edges(points: Correspondences, row: Index, first: Index) -> tuple[Ind
     chord = pixels[row[first + counts - 1]] - pixels[row[first]]
     order = np.lexsort(((pixels[row] * chord[line]).sum(axis=1), line))
     row = row[order]
-    # The line runs from the place before each to the one after it: a lens may bend it much in all.
+    # The local direction, from the point before to the point after: distortion may curve the whole line.
     place = np.arange(len(row))
     before = np.maximum(place - 1, first[line])
     after = np.minimum(place + 1, (first + counts - 1)[line])
@@ -120,19 +121,19 @@ def _enough(row: Index, first: Index, fewest: int) -> tuple[Index, Index]:
     return row[np.repeat(keep, counts)], np.cumsum(kept) - kept
 
 
-def _thinned(row: Index, first: Index) -> LinesSeen:
-    """Some of the lines, evenly chosen, where there are very many."""
+def _thinned(row: Index, first: Index) -> CollinearPoints:
+    """An even choice of the lines where there are very many."""
     every = -(-len(row) // _MOST_PLACES)
     if every > 1:
         counts = np.diff(first, append=len(row))
         keep = np.arange(len(first)) % every == 0
         row, kept = row[np.repeat(keep, counts)], counts[keep]
         first = np.cumsum(kept) - kept
-    return LinesSeen(row, first)
+    return CollinearPoints(row, first)
 
 
 def _distinct(world: Array) -> tuple[Index, Array]:
-    """Which distinct point each row is, and these points centred and scaled to a size of about 1."""
+    """Number of the distinct point of each row, and these points, centred and scaled to a size of about 1."""
     centre = world.mean(axis=0)
     size = float(np.ptp(world, axis=0).max()) or 1.0
     local = (world - centre) / size
@@ -142,7 +143,7 @@ def _distinct(world: Array) -> tuple[Index, Array]:
 
 
 def _clusters(values: Array, gap: float) -> Index:
-    """Number groups of values that are nearer than a gap to the next one."""
+    """Number groups of values whose sorted neighbours are nearer than a gap."""
     order = np.argsort(values, kind="stable")
     labels = np.empty(len(values), dtype=np.intp)
     labels[order] = np.cumsum(np.diff(values[order], prepend=values[order[:1]]) > gap)
@@ -150,7 +151,7 @@ def _clusters(values: Array, gap: float) -> Index:
 
 
 def _lines_of(target: Array, fewest: int) -> tuple[Index, Index]:
-    """Line and point of each place on the lines of a target."""
+    """Line and point of each point on the lines of a target."""
     n = len(target)
     if n <= _ALL_PAIRS:
         a, b = np.triu_indices(n, 1)
@@ -164,14 +165,14 @@ def _lines_of(target: Array, fewest: int) -> tuple[Index, Index]:
 
 
 def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Index, Index, Array]:
-    """Lines on which some pairs of points agree: line and point of each place, direction of each line."""
+    """Lines that several pairs of points have in common: line and point of each member, directions."""
     along = target[b] - target[a]
     along /= np.linalg.norm(along, axis=1)[:, None]
     along *= _sign(along)[:, None]
     offset = target[a] - (target[a] * along).sum(axis=1)[:, None] * along
     by_direction = _clusters(along @ np.array([0.618, 0.4142, 0.2361]), _TOLERANCE)
     place = offset @ np.array([0.7321, 0.2361, 0.6458])
-    # Gaps in the offset count only among pairs of one direction.
+    # Offsets are compared only between pairs of one direction.
     labels = _clusters(4.0 * by_direction + place, _TOLERANCE)
     counts = np.bincount(labels)
     common = counts[labels] >= fewest - 1
@@ -182,7 +183,7 @@ def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Inde
 
 
 def _sign(along: Array) -> Array:
-    """Sign that makes the first component that is not 0 positive."""
+    """Sign that makes the first nonzero component positive."""
     x, y, z = along.T
     small = 1e-3
     leading = np.where(np.abs(x) > small, x, np.where(np.abs(y) > small, y, z))
@@ -192,7 +193,7 @@ def _sign(along: Array) -> Array:
 def _checked(
     line: Index, member: Index, target: Array, labels: Index, along: Array, fewest: int
 ) -> tuple[Index, Index, Array]:
-    """Keep the lines with enough points, if these are indeed collinear; number them anew."""
+    """Keep the lines with enough points that are collinear, and renumber them."""
     names, first, counts = np.unique(line, return_index=True, return_counts=True)
     given, where = np.unique(labels, return_index=True)
     direction = along[where[np.searchsorted(given, names)]]
@@ -232,7 +233,7 @@ def _parallels(target: Array, directions: Array, fewest: int) -> tuple[Index, In
 
 
 def _longest(line: Index, member: Index, n: int, most: int) -> tuple[Index, Index]:
-    """Keep the lines that are among those `most` with the most points for at least half of their points."""
+    """Keep lines that are among the `most` longest lines of at least half of their points."""
     if not line.size:
         return line, member
     counts = np.bincount(line)

@@ -1,14 +1,14 @@
 """Plumb-line calibration: the distortion that makes the images of straight lines straight (Brown 1971).
 
-No camera and no poses are needed. The distortion is radial, k1 and k2 about a centre that is estimated
-as well, in pixels of a fixed scale s:
+The method needs no camera and no poses. The distortion is radial with the coefficients k1 and k2. Its
+centre c is estimated too; s is a fixed scale:
 
     m = c + s distort(x; k1, k2),  x on straight lines
 
-Collinearity survives any homography, so lines tell nothing of the scale, the skew and the tilt of the
-undistorted image; the camera that is calibrated from the corrected points takes them up. Where hardly
-anything is distorted, nothing tells the centre either: a prior holds it near the middle of the image,
-with a standard deviation of a quarter of the image's size.
+A homography keeps points collinear. Lines therefore do not determine the scale, the skew and the tilt of
+the undistorted image; the camera that is calibrated from the undistorted points has them. Weak distortion
+does not determine the centre. A prior holds it near the middle of the image, with a standard deviation of a
+quarter of the image's size.
 """
 
 from __future__ import annotations
@@ -23,8 +23,13 @@ from neurocal_cli.bundle_adjustment.views import noise_model
 from neurocal_cli.calibration import StraightLines
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.monotonic import undistort
-from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, LinesSeen, find_lines
-from neurocal_cli.distortion.straightness import Curves, SeenLines, bent_lines, crookedness
+from neurocal_cli.distortion.collinear_points import FEWEST_ON_LINE, CollinearPoints, find_lines
+from neurocal_cli.distortion.straightness import (
+    DistortedLines,
+    LineImages,
+    distorted_lines,
+    straightness_error,
+)
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
@@ -35,15 +40,18 @@ __all__ = ["PlumbLine", "fit_plumb_line", "lines_in_pixels"]
 
 _MODEL = "k1k2"
 _CENTRE, _COEFFICIENTS = [3, 4], [5, 6]  # columns of the derivatives
-# k1 to begin with, in units of s; the strongest barrel is a fisheye whose circle is half the image wide.
+# Starting values of k1, in units of s. The strongest barrel distortion is a fisheye whose circle is half the
+# image wide. test_wide_lenses_come_close_to_the_joint_fit in tests/test_plumb_line.py needs all of them.
 _STRENGTHS = (0.0, -0.2, -0.5, -1.0, -2.0, -4.0, -8.0, 0.3, 1.0)
-_PRIOR = 0.25  # standard deviation of the centre, in units of s
-_FEWEST_EQUATIONS = 12  # places on lines, less two for each line
+_CENTRE_STD = 0.25  # of the centre, in units of s; test_the_centre_is_not_biased repeats its effect
+_FEWEST_EQUATIONS = 12  # points on lines, less two for each line
 _OPTIONS = DescentOptions(tolerance=1e-10, flat=1e-10, largest_damping=1e8, max_iterations=50)
-_FLOOR = 1e-13  # rms in units of s that rounding alone accounts for
+_FLOOR = 1e-13  # rms error of rounding alone, in units of s
 _SINGULAR = 1e-10  # eigenvalue of a normal matrix with unit diagonal
-_UNBENT = 1e-6  # share of the distortion that curves the lines: with less, all go through the centre
-_UNTOLD = (
+# Share of the distortion that curves the lines. Lines with less all pass through the centre, as in
+# test_lines_through_the_centre_only_are_refused.
+_LEAST_CURVATURE = 1e-6
+_UNDETERMINED = (
     "the straight lines do not determine the distortion; give points on lines all over the image, or use "
     "--distortion none"
 )
@@ -51,46 +59,46 @@ _UNTOLD = (
 
 @dataclass(frozen=True, eq=False)
 class PlumbLine:
-    """A lens from lines alone.
+    """A distortion that was estimated from lines alone.
 
     Attributes
     ----------
-    lines : LinesSeen
+    lines : CollinearPoints
     centre : (2,) array [px]
-        Of distortion.
+        Of the distortion.
     scale : float [px]
         The unit s of its radii.
-    lens : Distortion
+    distortion : Distortion
     rms_before, rms : float [px]
-        Distance of the points from straight lines, as seen, and from these lines seen through the lens:
-        root of the sum of squares over equations less unknowns, all points alike.
+        Rms distance of the observed points from straight lines, and from the distorted lines, over
+        equations less unknowns. All points have the same weight.
     """
 
-    lines: LinesSeen
+    lines: CollinearPoints
     centre: Array
     scale: float
-    lens: Distortion
+    distortion: Distortion
     rms_before: float
     rms: float
 
     @property
     def record(self) -> StraightLines:
-        """What is kept with the calibration."""
+        """Summary that is stored with the calibration."""
         u, v = self.centre.tolist()
         on_lines = len(np.unique(self.lines.row))
         return StraightLines(len(self.lines), on_lines, (u, v), self.rms_before, self.rms)
 
     def corrected(self, points: Correspondences) -> Correspondences:
-        """Points where a camera without this lens sees them.
+        """Undistort points.
 
         Raises
         ------
         DegenerateGeometryError
-            A pixel that the lens cannot see.
+            A pixel that the distortion does not reach.
         """
         x, y = ((points.pixels - self.centre) / self.scale).T
-        straight = np.column_stack(undistort(self.lens, x, y))
-        lost = ~np.isfinite(straight[:, 0])
+        undistorted = np.column_stack(undistort(self.distortion, x, y))
+        lost = ~np.isfinite(undistorted[:, 0])
         if lost.any():
             row = int(np.argmax(lost))
             raise DegenerateGeometryError(
@@ -98,22 +106,22 @@ class PlumbLine:
                 f"({points.pixels[row, 0]:g}, {points.pixels[row, 1]:g}); check this point, or use another "
                 "--distortion"
             )
-        return replace(points, pixels=straight * self.scale + self.centre)
+        return replace(points, pixels=undistorted * self.scale + self.centre)
 
 
 def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> PlumbLine:
-    """Estimate the lens from all lines of collinear known points.
+    """Estimate the distortion from all lines of collinear known points.
 
     Parameters
     ----------
     points : Correspondences
     centre : (2,) array, optional [px]
-        Of distortion, where it is known.
+        Of the distortion, where it is known.
 
     Raises
     ------
     DegenerateGeometryError
-        Too few lines, or lines that do not tell the lens.
+        Too few lines, or lines that do not determine the distortion.
     """
     lines = find_lines(points)
     equations = len(lines.row) - 2 * len(lines)
@@ -126,49 +134,52 @@ def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> Plum
     start = (np.asarray(centre) - middle) / scale if centre is not None else np.zeros(2)
     whitening = noise_model(points.covariance, points.across)[1]
     whitening = None if whitening is None else rounded(whitening, points.across)
-    seen = lines_in_pixels(points, lines, middle, scale, whitening)
-    curves = bent_lines(seen, np.array([1.0, 0.0, 1.0, *start]), Distortion(_MODEL))
+    images = lines_in_pixels(points, lines, middle, scale, whitening)
+    curves = distorted_lines(images, np.array([1.0, 0.0, 1.0, *start]), Distortion(_MODEL))
     free = _COEFFICIENTS if centre is not None else _CENTRE + _COEFFICIENTS
     spare = equations - len(free)
     _check_lines(curves)
-    found = _fit(bent_lines(seen, curves.entries, _start(curves)), np.array(free), spare)
+    found = _fit(distorted_lines(images, curves.entries, _start(curves)), np.array(free), spare)
     before, after = _rms(curves, equations) * scale, _rms(found, spare) * scale
-    return PlumbLine(lines, found.entries[3:] * scale + middle, scale, found.lens, before, after)
+    return PlumbLine(lines, found.entries[3:] * scale + middle, scale, found.distortion, before, after)
 
 
 def lines_in_pixels(
-    points: Correspondences, lines: LinesSeen, centre: Array, scale: float, whitening: Array | None = None
-) -> SeenLines:
-    """Where the places on lines were seen, in pixels from a centre in units of a scale.
+    points: Correspondences,
+    lines: CollinearPoints,
+    centre: Array,
+    scale: float,
+    whitening: Array | None = None,
+) -> LineImages:
+    """Images of the points on lines, relative to a centre and in units of a scale.
 
     Parameters
     ----------
     points : Correspondences
-    lines : LinesSeen
+    lines : CollinearPoints
     centre : (2,) array [px]
     scale : float [px]
     whitening : (N, 3) array, optional
-        Factors of the points, as from `views.noise_model`.
+        Whitening factors of the points, as from `views.noise_model`.
     """
     pixels = (points.pixels[lines.row] - centre) / scale
-    return SeenLines(lines, pixels, None if whitening is None else whitening[lines.row])
+    return LineImages(lines, pixels, None if whitening is None else whitening[lines.row])
 
 
-def _start(curves: Curves) -> Distortion:
-    """The lens of some, of no fold, that makes the lines straightest: descent may not reach a strong one."""
-    lenses = [Distortion(_MODEL, np.array([k1, max(-k1, 0.0) ** 2 / 2])) for k1 in _STRENGTHS]
-    crooked = [crookedness(curves.seen, curves.entries, lens) for lens in lenses]
-    return lenses[int(np.argmin(crooked))]
+def _start(curves: DistortedLines) -> Distortion:
+    """The best starting value: from no distortion, the descent may not reach a strong one."""
+    candidates = [Distortion(_MODEL, np.array([k1, max(-k1, 0.0) ** 2 / 2])) for k1 in _STRENGTHS]
+    return min(candidates, key=lambda candidate: straightness_error(curves.images, curves.entries, candidate))
 
 
-def _rms(curves: Curves, spare: int) -> float:
+def _rms(curves: DistortedLines, spare: int) -> float:
     """Root mean square error in the image itself, not whitened."""
-    plain = replace(curves, seen=replace(curves.seen, whitening=None)).settled()
+    plain = replace(curves, images=replace(curves.images, whitening=None)).fitted()
     return float(np.sqrt((plain.errors() ** 2).sum() / spare))
 
 
 def _frame(points: Correspondences) -> tuple[Array, float]:
-    """Middle and largest side of the image, or of what is seen in it."""
+    """Middle and longest side of the image, or of the area that the points cover."""
     if points.image_size is not None:
         size = np.array(points.image_size, dtype=float)
         return (size - 1) / 2, float(size.max())
@@ -176,44 +187,44 @@ def _frame(points: Correspondences) -> tuple[Array, float]:
     return (low + high) / 2, float((high - low).max()) or 1.0
 
 
-def _fit(curves: Curves, free: NDArray[np.intp], spare: int) -> Curves:
+def _fit(curves: DistortedLines, free: NDArray[np.intp], spare: int) -> DistortedLines:
     """Least squares over some columns of the derivatives.
 
     Parameters
     ----------
-    curves : Curves
-        That are `sensible`.
+    curves : DistortedLines
+        All of them `valid`.
     free : (n,) int array
-        Columns of A's entries and the coefficients to move; the centre has its prior.
+        Free columns of A's entries and the coefficients. The centre has its prior.
     spare : int
         Equations less unknowns.
 
     Raises
     ------
     DegenerateGeometryError
-        The lines do not tell what is to move.
+        The lines do not determine the free parameters.
     """
-    problem = _Crookedness(curves, free, spare)
+    problem = _LineDistances(curves, free, spare)
     minimise(problem, _OPTIONS, len(curves.feet) * _FLOOR**2)
     return problem.curves
 
 
-class _Crookedness:
-    """The distances from straight lines as `least_squares` sees them: one group.
+class _LineDistances:
+    """The distances from straight lines as a problem of `least_squares` with one group.
 
-    The centre's prior counts as one more residual of the noise's size, and the noise is what is left of
-    the distances. With the noise eliminated from the likelihood of r and c, whose logarithm is
-    -(n log r.r + |c|^2 / prior^2) / 2, what is to be as small as possible is
+    The prior of the centre counts as one more residual of the size of the noise, and the noise is estimated
+    from the distances. With the noise eliminated, the log-likelihood of r and c is
+    -(n log r.r + |c|^2 / prior^2) / 2. Its maximum is the minimum of
 
         E = r.r exp(|c|^2 / (n prior^2))
 
-    and its slope that of r.r + |c|^2 (r.r / n) / prior^2, but for the factor.
+    The gradient of E is that of r.r + |c|^2 (r.r / n) / prior^2, up to a factor.
     """
 
-    def __init__(self, curves: Curves, free: NDArray[np.intp], spare: int) -> None:
+    def __init__(self, curves: DistortedLines, free: NDArray[np.intp], spare: int) -> None:
         self.free = free
-        self.share = np.zeros(5 + len(curves.lens.coefficients))
-        self.share[_CENTRE] = _PRIOR**-2 / spare
+        self.share = np.zeros(5 + len(curves.distortion.coefficients))
+        self.share[_CENTRE] = _CENTRE_STD**-2 / spare
         self.curves = curves
         self.r, self.J, _ = curves.derivatives()
 
@@ -222,17 +233,17 @@ class _Crookedness:
         """(1,) E."""
         return self._cost(self.curves)
 
-    def _values(self, curves: Curves) -> Array:
-        return np.concatenate([curves.entries, curves.lens.coefficients])
+    def _values(self, curves: DistortedLines) -> Array:
+        return np.concatenate([curves.entries, curves.distortion.coefficients])
 
-    def _factor(self, curves: Curves) -> float:
+    def _factor(self, curves: DistortedLines) -> float:
         return float(np.exp(self.share @ self._values(curves) ** 2))
 
-    def _cost(self, curves: Curves) -> Array:
+    def _cost(self, curves: DistortedLines) -> Array:
         return np.array([(curves.errors() ** 2).sum() * self._factor(curves)])
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Damped step of what moves, and what it promises."""
+        """Damped step of the free parameters, and the predicted gain."""
         weight, free = self.share * (self.r @ self.r), self.free
         H = (self.J.T @ self.J + np.diag(weight))[free[:, None], free]
         g = (self.J.T @ self.r - weight * self._values(self.curves))[free]
@@ -240,33 +251,33 @@ class _Crookedness:
         step, promised = damped_step(H[None], g[None], damping)
         return step[0], promised * self._factor(self.curves)
 
-    def move(self, step: Array, active: NDArray[np.intp]) -> tuple[Curves, Array, NDArray[np.bool_]]:
-        """The lines through another lens, all of them straight and none folded back."""
+    def move(self, step: Array, active: NDArray[np.intp]) -> tuple[DistortedLines, Array, NDArray[np.bool_]]:
+        """The lines after a step of the distortion, which must remain monotonic."""
         values = self._values(self.curves)
         values[self.free] += step
-        trial = self.curves.seen_through(values[:5], values[5:]).settled()
-        return trial, self._cost(trial), np.array([trial.sensible])
+        trial = self.curves.with_camera(values[:5], values[5:]).fitted()
+        return trial, self._cost(trial), np.array([trial.valid])
 
-    def accept(self, trial: Curves, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Take it over."""
+    def accept(self, trial: DistortedLines, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
+        """Accept the trial."""
         if better[0]:
             self.curves = trial
             self.r, self.J, _ = trial.derivatives()
 
 
-def _check_lines(curves: Curves) -> None:
-    """Refuse lines on which no lens shows."""
-    if not curves.sensible:
+def _check_lines(curves: DistortedLines) -> None:
+    """Refuse lines that no distortion curves."""
+    if not curves.valid:
         raise DegenerateGeometryError(
             "all points of a straight line are seen at one pixel; check the columns u,v"
         )
     _, J, _ = curves.derivatives()
-    moved = ((curves.seen.pixels - curves.entries[3:]) ** 2).sum(axis=1) ** 3  # by k1, squared
-    if (J[:, 5] ** 2).sum() < _UNBENT**2 * moved.sum():
-        raise DegenerateGeometryError(_UNTOLD)
+    moved = ((curves.images.pixels - curves.entries[3:]) ** 2).sum(axis=1) ** 3  # squared shift by k1
+    if (J[:, 5] ** 2).sum() < _LEAST_CURVATURE**2 * moved.sum():
+        raise DegenerateGeometryError(_UNDETERMINED)
 
 
 def _check(H: Array) -> None:
-    """Refuse lines on which the lens does not show, all through its centre or in one place."""
+    """Refuse lines that do not determine the distortion: all through its centre, or in one place."""
     if not (np.diagonal(H) > 0).all() or np.linalg.eigvalsh(unit_diagonal(H)[0])[0] < _SINGULAR:
-        raise DegenerateGeometryError(_UNTOLD)
+        raise DegenerateGeometryError(_UNDETERMINED)

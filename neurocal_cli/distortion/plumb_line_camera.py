@@ -1,27 +1,29 @@
-"""Newton's method on two sets of equations that are not the slope of one cost, so no descent does it.
+"""The last step of plumb-line: Newton's method on two sets of equations.
 
-The distortion comes from straight lines, and camera and poses from everything else: the last step of
-plumb-line. Once the network has found the camera from corrected points, the distortion is written in the
-camera's own terms, coefficients k of `MODEL` in coordinates that A normalises, and both are made to agree
-on the pixels as they were seen:
+The two sets are not the gradient of one cost, so `least_squares` cannot solve them. The distortion is
+determined by straight lines, the camera and the poses by the points. The network finds the camera from
+undistorted points. The distortion is then expressed in the camera's normalised coordinates, with the
+coefficients k of `MODEL`, and both are solved on the observed pixels:
 
     lines   sum r dr/dk = 0      the distortion, given A: no pose and no shape of the target enters
-    points  sum e . J = 0        camera and poses: e are the errors of the pixels, J the derivatives of the
-                                 pixels by the poses and by the A that moves the corrected points, while
-                                 the distortion stays where it is in the image
+    points  sum e . J = 0        camera and poses: e are the pixel errors, J the derivatives of the pixels
+                                 by the poses and by the A of the undistorted points; the distortion is
+                                 fixed in the image
 
-with r and its derivatives from `straightness`. Both sets of equations are solved for A and k, A moving its
-distortion along, with the poses eliminated.
+r and its derivatives come from `straightness`. Both sets of equations are solved for A and k together, with
+the poses eliminated.
 
 Covariance, to first order and in whitened pixels of noise. The lines' equations H_kk dk + H_kA dA = s
 have the variance M = sum_i G_i^T G_i, with G_i = sum nu dr/dk over the lines through a point i. The points'
-equations, reduced to A, are Q_AA dA + Q_Ak dk = g, and g has the variance S = J^T J, reduced. What A and
-the poses move through a fixed distortion leaves straight lines straight, so s and g are independent, and with
+equations, reduced to A, are Q_AA dA + Q_Ak dk = g, and g has the variance S = J^T J, reduced. A and the
+poses move points along images of straight lines while the distortion is fixed, so s and g are independent.
+With
 B = [[Q_AA, Q_Ak], [H_kA, H_kk]],
 
     cov(A, k) = B^-1 [[S, 0], [0, M]] B^-T.
 
-The poses' follows as in `bundle_adjustment.covariance`. The noise is that of each set's own residuals.
+The poses' follows as in `bundle_adjustment.covariance`. Each set
+estimates the noise from its own residuals.
 """
 
 from __future__ import annotations
@@ -44,7 +46,7 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort_with_jacobian
 from neurocal_cli.camera.projection import normalised_points
 from neurocal_cli.distortion.plumb_line import PlumbLine, lines_in_pixels
-from neurocal_cli.distortion.straightness import CAMERA, Curves, bent_lines
+from neurocal_cli.distortion.straightness import CAMERA, DistortedLines, distorted_lines
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
@@ -55,37 +57,37 @@ __all__ = ["MODEL", "distortion_and_camera"]
 MODEL = "k1k2p1p2"
 
 _ITERATIONS = 50
-_TOLERANCE = 1e-10  # step in normalised units that is none any more
+_TOLERANCE = 1e-10  # a step below this, in normalised units, ends the iteration
 _HALVINGS = 8
-_SINGULAR = 1e-13  # reciprocal condition below which a scaled matrix is rounding
+_SINGULAR = 1e-13  # reciprocal condition number of a scaled matrix that is singular but for rounding
 _K = len(coefficient_names(MODEL))
 _BY_K = CAMERA + np.arange(_K)  # columns of the lines' derivatives
 
 
 def distortion_and_camera(solution: Solution, plumb: PlumbLine, points: Correspondences) -> Solution:
-    """Make distortion and camera agree, from the result of the corrected points.
+    """Solve for distortion and camera, starting from the result of the undistorted points.
 
     Parameters
     ----------
     solution : Solution
-        Of the corrected points, without a lens.
+        Of the undistorted points, without distortion.
     plumb : PlumbLine
     points : Correspondences
-        As they were seen.
+        As observed.
 
     Returns
     -------
     Solution
-        Of the points as they were seen, with the lens; `Solution.shared` is its covariance.
+        Of the observed points, with distortion; `Solution.shared` is its covariance.
 
     Raises
     ------
     DegenerateGeometryError
-        Lines and points do not tell lens and camera.
+        Lines and points do not determine distortion and camera.
     """
     problem, views = solution.problem, solution.problem.views
     order = slice(None) if views.order is None else views.order
-    seen = replace(views, pixels=(points.pixels[order] - views.pixel_centre) / views.pixel_scale)
+    observed = replace(views, pixels=(points.pixels[order] - views.pixel_centre) / views.pixel_scale)
     weighed = whitening = views.whitening
     if weighed is not None:
         rows = np.arange(len(points)) if views.order is None else views.order
@@ -93,11 +95,11 @@ def distortion_and_camera(solution: Solution, plumb: PlumbLine, points: Correspo
         whitening[rows] = rounded(weighed, views.across)
     lines = lines_in_pixels(points, plumb.lines, views.pixel_centre, views.pixel_scale, whitening)
     start = solution.adjusted.state
-    start = replace(start, model=MODEL, k=_same_lens(start.entries[0], seen.pixels, views.pixels))
+    start = replace(start, model=MODEL, k=_in_camera_terms(start.entries[0], observed.pixels, views.pixels))
     problem = replace(
-        problem, points=points, views=seen, distortion=Distortion(MODEL, start.k), free_distortion=True
+        problem, points=points, views=observed, distortion=Distortion(MODEL, start.k), free_distortion=True
     )
-    together = _Together(problem, bent_lines(lines, start.entries[0], Distortion(MODEL, start.k)))
+    together = _JointEquations(problem, distorted_lines(lines, start.entries[0], Distortion(MODEL, start.k)))
     adjusted = together.solved(start)
     done = solution.adjusted.iterations + adjusted.iterations
     return replace(
@@ -108,13 +110,13 @@ def distortion_and_camera(solution: Solution, plumb: PlumbLine, points: Correspo
     )
 
 
-def _same_lens(entries: Array, seen: Array, corrected: Array) -> Array:
-    """Coefficients that take corrected pixels to the seen ones, in the terms of a camera."""
-    x, y = normalised_points(entries, *corrected.T)
-    bent_x, bent_y = normalised_points(entries, *seen.T)
+def _in_camera_terms(entries: Array, observed: Array, undistorted: Array) -> Array:
+    """Coefficients in normalised coordinates that distort undistorted pixels to the observed ones."""
+    x, y = normalised_points(entries, *undistorted.T)
+    distorted_x, distorted_y = normalised_points(entries, *observed.T)
     _, _, by = distort_with_jacobian(MODEL, np.zeros(_K), x, y)
     columns = np.column_stack([np.concatenate(pair) for pair in by])
-    return np.linalg.lstsq(columns, np.concatenate([bent_x - x, bent_y - y]), rcond=None)[0]
+    return np.linalg.lstsq(columns, np.concatenate([distorted_x - x, distorted_y - y]), rcond=None)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +128,12 @@ class _PointEquations:
     by_own : (f, f + K) array
         Q: derivatives by A's free entries and k.
     square : (f, f) array
-        S, their variance but for that of the noise.
+        S, their variance for noise of variance 1.
     right : (f,) array
     gain : (V, 6, f + K) array
-        How the poses of a view follow A and k; empty where poses are given.
+        Change of a view's pose with A and k; empty where poses are given.
     pose_step : (V, 6) array
-        Of the poses alone.
+        Step of the poses with A and k fixed.
     """
 
     by_own: Array
@@ -141,19 +143,19 @@ class _PointEquations:
     pose_step: Array
 
 
-class _Together:
+class _JointEquations:
     """The lines' and the points' equations of one problem."""
 
-    def __init__(self, problem: Problem, curves: Curves) -> None:
+    def __init__(self, problem: Problem, curves: DistortedLines) -> None:
         self.problem, self.curves = problem, curves
         self.free = np.flatnonzero(problem.free)
         self.columns = np.concatenate([self.free, _BY_K])  # of A and k among the lines' derivatives
 
     def solved(self, start: CameraState) -> Adjusted:
-        """Newton's method from a state that is already near."""
+        """Newton's method from a state near the solution."""
         state, settled, iterations = start, False, 0
-        if not self.curves.sensible:
-            raise DegenerateGeometryError(_UNTOLD)
+        if not self.curves.valid:
+            raise DegenerateGeometryError(_UNDETERMINED)
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             while iterations < _ITERATIONS and not settled:
                 points = self._points(state)
@@ -174,7 +176,7 @@ class _Together:
         return np.concatenate([points.by_own, by_k @ J[:, self.columns]]), by_k @ r
 
     def _moved(self, state: CameraState, points: _PointEquations, step: Array) -> tuple[CameraState, float]:
-        """Take the step, or as much of it as keeps the points in front and the distortion monotonic."""
+        """Take the step, halved until all points are in front and the distortion is monotonic."""
         by_camera = np.zeros((1, 5 + _K))
         by_camera[0, self.columns] = step
         by_pose = np.zeros((self.problem.views.n_views, 6))
@@ -184,8 +186,8 @@ class _Together:
         for _ in range(_HALVINGS):
             trial = state.moved(length * by_camera, length * by_pose)
             if (trial.entries[0, [0, 2]] > 0).all() and np.isfinite(trial.k).all():
-                curves = self.curves.seen_through(trial.entries[0], trial.k).settled()
-                if curves.sensible and normal_blocks(self.problem.views.batches, trial)[1].all():
+                curves = self.curves.with_camera(trial.entries[0], trial.k).fitted()
+                if curves.valid and normal_blocks(self.problem.views.batches, trial)[1].all():
                     self.curves = curves
                     return trial, length
             length *= 0.5
@@ -202,12 +204,12 @@ class _Together:
             buffer = np.zeros((len(view), width + 5, 2, batches.local.shape[2]))
             derivatives(batches, chunk, state, buffer[:, :width])
             Xc = state.R[view] @ batches.local[chunk] + state.t[view][:, :, None]
-            _through_fixed_lens(buffer, state.entries[0], Xc)
+            _fixed_distortion_columns(buffer, state.entries[0], Xc)
             flat = buffer.reshape(len(view), width + 5, -1)
-            # Not the whole square: it is larger than what OpenBLAS keeps to one thread, and more in all.
+            # Only these rows: the whole product is more work, and so large that OpenBLAS starts threads.
             blocks.append(flat[:, taken] @ np.swapaxes(flat, 1, 2))
         N = batches.sum_by_view(np.concatenate(blocks))
-        wanted = np.array([*own, *fixed[self.free], width - 1])  # and the residual
+        wanted = np.array([*own, *fixed[self.free], width - 1])  # the residual is last
         rows, poses = N[:, 6 + self.free][:, :, wanted], N[:, :6]
         solved = np.zeros((0, 6, len(wanted)))
         if self.problem.free_poses:
@@ -222,7 +224,7 @@ class _Together:
         points = self._points(adjusted.state)
         B, _ = self._matrix(points)
         r, J, nu = self.curves.derivatives()
-        by_k, lines = J[:, _BY_K], self.curves.seen.lines
+        by_k, lines = J[:, _BY_K], self.curves.images.lines
         G = np.zeros((int(lines.row.max()) + 1, 2, _K))
         np.add.at(G, lines.row, nu[:, :, None] * by_k[:, None, :])
         M = np.tensordot(G, G, axes=((0, 1), (0, 1)))
@@ -235,11 +237,10 @@ class _Together:
         return _solve(B, _solve(B, noise).T)
 
 
-def _through_fixed_lens(buffer: Array, entries: Array, Xc: Array) -> None:
-    """Fill the last five columns: derivatives by A's entries when A moves points and the lens stays.
+def _fixed_distortion_columns(buffer: Array, entries: Array, Xc: Array) -> None:
+    """Fill the last five columns: derivatives by A's entries while the distortion is fixed in the image.
 
-    Moves of the normalised point, as the image shows them, are those of the pose's first two
-    translations times the depth.
+    The derivatives by a normalised point are those by the pose's first two translations times the depth.
     """
     a, s, b, _, _ = entries
     depth = Xc[:, None, 2]
@@ -250,7 +251,7 @@ def _through_fixed_lens(buffer: Array, entries: Array, Xc: Array) -> None:
         buffer[:, column] = values
 
 
-_UNTOLD = (
+_UNDETERMINED = (
     "the straight lines and points do not determine the camera; give more views of the board from "
     "different angles and over more of the image, or use another --distortion"
 )
@@ -266,5 +267,5 @@ def _solve(matrix: Array, right: Array) -> Array:
     """
     scaled, _ = unit_diagonal(matrix)
     if not np.isfinite(scaled).all() or np.linalg.cond(scaled).max(initial=0.0) > 1 / _SINGULAR:
-        raise DegenerateGeometryError(_UNTOLD)
+        raise DegenerateGeometryError(_UNDETERMINED)
     return solve_scaled(matrix, right)

@@ -1,4 +1,4 @@
-"""Undistorted images: each pixel is taken from where the distorted image shows it."""
+"""Undistortion of images: each pixel is interpolated at its source in the distorted image."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ INTERPOLATIONS = {
     "lanczos": cv2.INTER_LANCZOS4,
 }
 
-_AT_ONCE = 1 << 20  # pixels whose sources are computed together
-_KEPT = 1 << 25  # pixels of images whose sources are kept for the next image, 8 bytes each
+_AT_ONCE = 1 << 20  # pixels whose sources are computed at a time: memory
+_KEPT = 1 << 25  # largest image whose sources are kept for the next one, at 8 bytes a pixel
 _LONGEST = 32767  # px; OpenCV's remap counts a side in 16 bits
-_NOWHERE = -1e6  # a source outside of any image, so black
+_NOWHERE = -1e6  # a source outside every image, which gives black
 
 Sources = tuple[slice, NDArray[np.float32], NDArray[np.float32]]
 
@@ -64,7 +64,7 @@ class Remapping:
     def __call__(
         self, image: NDArray[np.uint8] | NDArray[np.uint16]
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Corrected image of the same size and kind; black where nothing was seen.
+        """Undistorted image of the same size and type; black where it has no source.
 
         Parameters
         ----------
@@ -82,14 +82,14 @@ class Remapping:
                 "original images of this camera"
             )
         whole: NDArray[Any] = np.ascontiguousarray(image)
-        corrected = np.empty_like(image, order="C")
+        undistorted = np.empty_like(image, order="C")
         for rows, u, v in self._sources():
             part = cv2.remap(whole, u, v, self._how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-            corrected[rows] = part.reshape(corrected[rows].shape)
-        return corrected
+            undistorted[rows] = part.reshape(undistorted[rows].shape)
+        return undistorted
 
     def _sources(self) -> Iterator[Sources]:
-        """Places in the image as seen, block by block of rows."""
+        """Source pixels in the distorted image, for one block of rows after the other."""
         if self._kept:
             yield from self._kept
             return
@@ -117,7 +117,7 @@ def undistort_image(
     alpha: float | None = None,
     interpolation: str = "cubic",
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-    """Image as a camera without distortion would have seen it.
+    """Undistort an image.
 
     Parameters
     ----------
@@ -129,8 +129,8 @@ def undistort_image(
 
     Returns
     -------
-    corrected : array like the image
-        Black where nothing was seen.
+    undistorted : array like the image
+        Black where it has no source.
 
     Raises
     ------

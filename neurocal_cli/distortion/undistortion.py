@@ -1,4 +1,4 @@
-"""Undistortion: points, and the places from which undistorted images take their pixels.
+"""Undistortion of points, and the source pixels of undistorted images.
 
 A pixel m of a camera A with distortion becomes the pixel m' of a camera A' without:
 
@@ -27,10 +27,10 @@ from neurocal_cli.points import Correspondences
 __all__ = ["new_matrix", "sources", "undistort_pixels", "undistort_points", "undistorted_camera"]
 
 # With these, no pixel at alpha 0 comes from more than 0.02 px outside; tests/test_undistortion.py repeats it.
-_BORDER = 401  # pixels looked at along each side of the image
-_GRID = 41  # and inside, along each axis
+_BORDER = 401  # samples along each side of the image
+_GRID = 41  # samples along each axis inside it
 _HALF_PIXEL = 0.5
-_WIDEST = 5.0  # 79 degrees to a side; a plane picture of more shows next to nothing
+_WIDEST = 5.0  # tangent of 79 degrees: the widest angle from the axis in an undistorted image
 
 
 def undistorted_camera(
@@ -64,12 +64,12 @@ def undistorted_camera(
 
 
 def undistort_pixels(camera: Camera, new: Camera, pixels: Array) -> Array:
-    """Undistorted pixels, (N, 2); ``nan`` where the camera cannot have seen any."""
+    """Undistorted pixels, (N, 2); ``nan`` where the distortion does not reach a pixel."""
     return np.column_stack(new.image_points(*camera.normalised_points(*pixels.T)))
 
 
 def sources(camera: Camera, new: Camera, u: Array, v: Array) -> tuple[Array, Array]:
-    """Where pixels (u, v) of an undistorted image come from; ``nan`` where the camera sees nothing.
+    """Source pixels of pixels (u, v) of an undistorted image; ``nan`` where there are none.
 
     Parameters
     ----------
@@ -82,31 +82,31 @@ def sources(camera: Camera, new: Camera, u: Array, v: Array) -> tuple[Array, Arr
         u, v, _, _, (ux, uy, vx, vy), _ = image_points_with_jacobian(
             camera.entries, camera.model, camera.distortion.coefficients, x, y
         )
-        seen = (x * x + y * y < monotonic_radius(camera.distortion) ** 2) & (ux * vy > uy * vx)
-    return np.where(seen, u, np.nan), np.where(seen, v, np.nan)
+        valid = (x * x + y * y < monotonic_radius(camera.distortion) ** 2) & (ux * vy > uy * vx)
+    return np.where(valid, u, np.nan), np.where(valid, v, np.nan)
 
 
 def _distorted_by_undistorted(camera: Camera, new: Camera, pixels: Array) -> Array:
-    """(N, 2, 2) derivative of the pixels as seen by the undistorted ones (N, 2)."""
+    """(N, 2, 2) derivative of the distorted pixels by the undistorted ones (N, 2)."""
     x, y = new.normalised_points(*pixels.T)
     return np.asarray(camera.image_jacobian(x, y) @ np.linalg.inv(new.A[:2, :2]))
 
 
 def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsics:
-    """Camera matrix for undistorted images of the same size, as OpenCV's getOptimalNewCameraMatrix means it.
+    """Camera matrix for undistorted images of the same size, as in OpenCV's getOptimalNewCameraMatrix.
 
     Parameters
     ----------
     camera : Camera
     size : (width, height) [px]
     alpha : float
-        0: the largest rectangle of which every pixel was seen fills the image; 1: all pixels that were
-        seen are shown, the rest is black; in between, the matrices are mixed.
+        0: the largest rectangle of valid pixels fills the image. 1: the image shows all pixels of the
+        distorted one, and the rest is black. Values in between interpolate the two matrices.
 
     Returns
     -------
     intrinsics : Intrinsics
-        Without skew. Its two scale factors differ as the rectangle's sides do.
+        Without skew. The ratio of its scale factors is that of the rectangle's sides.
 
     Raises
     ------
@@ -135,28 +135,28 @@ def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsic
 
 
 def _inner(camera: Camera, corner: Array) -> tuple[Array, Array]:
-    """Lower and upper corner of the rectangle of undistorted points that are all seen."""
+    """Lower and upper corner of the largest rectangle of valid undistorted points."""
     share, zero = np.linspace(0, 1, _BORDER), np.zeros(_BORDER)
-    # What lies beyond the monotonic radius binds nothing, but the rectangle must stay within it.
+    # Borders beyond the monotonic radius set no limit, but the rectangle must stay within this radius.
     most = min(_WIDEST, monotonic_radius(camera.distortion) / np.sqrt(2))
     low, high = np.full(2, -most), np.full(2, most)
     for axis in (0, 1):
         for end in (0.0, 1.0):
             side = [zero + end, share] if axis == 0 else [share, zero + end]
-            straight = camera.normalised_points(side[0] * corner[0], side[1] * corner[1])[axis]
-            straight = straight[np.isfinite(straight)]
+            border = camera.normalised_points(side[0] * corner[0], side[1] * corner[1])[axis]
+            border = border[np.isfinite(border)]
             if end == 0:
-                low[axis] = max(low[axis], straight.max(initial=-most))
+                low[axis] = max(low[axis], border.max(initial=-most))
             else:
-                high[axis] = min(high[axis], straight.min(initial=most))
+                high[axis] = min(high[axis], border.min(initial=most))
     return low, high
 
 
 def _is_inside(camera: Camera, corner: Array, low: Array, high: Array) -> bool:
-    """Whether the border of a rectangle of undistorted points was seen within the image."""
+    """Whether the border of a rectangle of undistorted points is inside the distorted image."""
     x, y = (low + _along_border() * (high - low)).T
-    seen = np.column_stack(camera.image_points(x, y))
-    return bool((seen > -_HALF_PIXEL).all() and (seen < corner + _HALF_PIXEL).all())
+    pixels = np.column_stack(camera.image_points(x, y))
+    return bool((pixels > -_HALF_PIXEL).all() and (pixels < corner + _HALF_PIXEL).all())
 
 
 def _along_border() -> Array:
@@ -167,23 +167,23 @@ def _along_border() -> Array:
 
 
 def _outer(camera: Camera, corner: Array) -> tuple[Array, Array]:
-    """Lower and upper corner of the rectangle around all undistorted points that are seen."""
+    """Lower and upper corner of the bounding rectangle of all undistorted points."""
     u, v = np.meshgrid(np.linspace(0, 1, _GRID), np.linspace(0, 1, _GRID))
     pixels = np.concatenate([np.column_stack([u.ravel(), v.ravel()]), _along_border()]) * corner
-    straight = np.column_stack(camera.normalised_points(*pixels.T))
-    straight = straight[np.isfinite(straight[:, 0])].clip(-_WIDEST, _WIDEST)
-    return straight.min(axis=0, initial=np.inf), straight.max(axis=0, initial=-np.inf)
+    points = np.column_stack(camera.normalised_points(*pixels.T))
+    points = points[np.isfinite(points[:, 0])].clip(-_WIDEST, _WIDEST)
+    return points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
 
 
 def undistort_points(
     points: Correspondences, camera: Camera | Calibration, alpha: float | None = None
 ) -> Correspondences:
-    """Points as a camera without distortion would have seen them.
+    """Undistort points.
 
     Parameters
     ----------
     points : Correspondences
-        Covariances, and the image centre if there is one, are carried over.
+        Their covariances and the image centre, where given, are transformed as well.
     camera : Camera or Calibration
     alpha : float, optional
         See `new_matrix`; None keeps the camera's own matrix.
@@ -191,7 +191,7 @@ def undistort_points(
     Raises
     ------
     InputError
-        A pixel that the lens cannot have seen, named by its place.
+        A pixel that the distortion does not reach, named by its file and line.
     """
     camera = camera_of(camera)
     new = undistorted_camera(camera, alpha, points.image_size)
@@ -206,13 +206,13 @@ def undistort_points(
         )
     undistorted = replace(points, pixels=pixels)
     if points.covariance is not None:
-        # To first order C' = M C M^T, with M the derivative of the undistorted pixel by the seen one.
+        # To first order C' = M C M^T, with M the derivative of the undistorted pixel by the distorted one.
         M = np.linalg.inv(_distorted_by_undistorted(camera, new, pixels))
         C = points.covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
         C = (M @ C @ np.swapaxes(M, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
         undistorted = replace(undistorted, covariance=C)
     if points.across is not None:
-        # What is known of a pixel m is n . m, and so of the undistorted one n^T M^-1 m'.
+        # Only n . m is measured of a pixel m, so n^T M^-1 m' of the undistorted one.
         n = (points.across[:, None, :] @ _distorted_by_undistorted(camera, new, pixels))[:, 0]
         undistorted = replace(undistorted, across=unit(n))
     if points.image_center is not None:
