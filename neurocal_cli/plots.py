@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from io import BytesIO
 from typing import TYPE_CHECKING
 
@@ -14,11 +15,11 @@ from neurocal_cli.geometry import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import FigureBase
+    from matplotlib.figure import Figure, FigureBase
 
     from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["check_available", "draw_calibration", "draw_rig"]
+__all__ = ["check_available", "draw_calibration", "draw_rig", "picture", "style"]
 
 _MOST_ARROWS = 500  # more cannot be told apart
 _MANY_DOTS = 2000  # from here on they overlap, and an .svg of them grows large
@@ -62,16 +63,27 @@ def draw_calibration(calibration: Calibration, kind: str = "png") -> bytes:
     NeurocalError
         matplotlib is not installed.
     """
-    return _picture([calibration], kind)
+    return _cameras([calibration], kind)
 
 
 def draw_rig(rig: Rig, kind: str = "png") -> bytes:
     """Draw both cameras of a rig side by side; see `draw_calibration`."""
-    return _picture([rig.left, rig.right], kind)
+    return _cameras([rig.left, rig.right], kind)
 
 
-def _picture(calibrations: list[Calibration], kind: str) -> bytes:
+def _cameras(calibrations: list[Calibration], kind: str) -> bytes:
     """One or several cameras, four panels each, next to each other."""
+
+    def draw(figure: Figure) -> None:
+        parts = [figure] if len(calibrations) == 1 else list(figure.subfigures(1, len(calibrations)))  # type: ignore[arg-type]
+        for part, calibration in zip(parts, calibrations, strict=True):
+            _draw_camera(part, calibration)
+
+    return picture(draw, (11 * len(calibrations), 8), 0.12, kind)
+
+
+def picture(draw: Callable[[Figure], None], size: tuple[float, float], pad: float, kind: str) -> bytes:
+    """Draw a figure of a size and with panels a distance apart [inches], as the bytes of a file."""
     check_available()
     from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -79,12 +91,10 @@ def _picture(calibrations: list[Calibration], kind: str) -> bytes:
 
     # A figure of its own, not pyplot's: no global state, no window, no choice of a backend.
     with rc_context({"font.size": 9, "axes.titlesize": 10, "svg.hashsalt": "neurocal"}):
-        figure = Figure(figsize=(11 * len(calibrations), 8))
-        figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12)
+        figure = Figure(figsize=size)
+        figure.set_layout_engine("constrained", w_pad=pad, h_pad=pad)
         FigureCanvasAgg(figure)
-        parts = [figure] if len(calibrations) == 1 else list(figure.subfigures(1, len(calibrations)))  # type: ignore[arg-type]
-        for part, calibration in zip(parts, calibrations, strict=True):
-            _draw_camera(part, calibration)
+        draw(figure)
         buffer = BytesIO()
         # A date would make each picture differ from the last.
         undated = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
@@ -112,7 +122,8 @@ def _plain(text: str) -> str:
     return (text if text.isprintable() else ascii(text)[1:-1]).replace("$", r"\$")
 
 
-def _style(axes: Axes, title: str) -> None:
+def style(axes: Axes, title: str) -> None:
+    """Title, grid and frame of a panel."""
     axes.set_title(title)
     axes.grid(True, color="0.9", linewidth=0.6)
     axes.set_axisbelow(True)
@@ -152,7 +163,7 @@ def _draw_arrows(axes: Axes, calibration: Calibration, evaluation: CameraEvaluat
     )
     axes.plot(calibration.intrinsics.u0, calibration.intrinsics.v0, "+", color=_ACCENT, markersize=11)
     some = "" if len(shown) == len(seen) else f", {len(shown)} of {len(seen)} points"
-    _style(axes, f"Residuals, predicted minus observed, enlarged {scale:,.10g} times{some}")
+    style(axes, f"Residuals, predicted minus observed, enlarged {scale:,.10g} times{some}")
     axes.set(
         xlim=(left, right),
         ylim=(bottom, top),
@@ -175,7 +186,7 @@ def _draw_scatter(axes: Axes, evaluation: CameraEvaluation) -> None:
     axes.plot(*circle, color=_ACCENT, linewidth=1.2, label=f"rms {evaluation.rmse_px:.4g} px")
     axes.plot(evaluation.bias_u, evaluation.bias_v, "+", color=_ACCENT, markersize=9, label="mean")
     limit = 1.1 * max(evaluation.max_px, 1e-12) if np.isfinite(evaluation.max_px) else 1.0
-    _style(axes, "Residuals of all points")
+    style(axes, "Residuals of all points")
     axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="du [px]", ylabel="dv [px]")
     axes.legend(loc="upper right", frameon=False)
 
@@ -189,7 +200,7 @@ def _draw_views(axes: Axes, evaluation: CameraEvaluation) -> None:
         edges = np.arange(len(errors) + 1) - 0.5
         axes.stairs(np.nan_to_num(errors), edges, fill=True, color=_INK)
     axes.axhline(evaluation.rmse_px, color=_ACCENT, linewidth=1.2, label="all points")
-    _style(axes, "Error of each view")
+    style(axes, "Error of each view")
     axes.set(xlabel="view", ylabel="rms [px]", xlim=(-0.6, len(errors) - 0.4))
     if len(errors) <= _MOST_BARS:
         names = [_plain(name[-20:]) for name in evaluation.views]
@@ -201,7 +212,7 @@ def _draw_views(axes: Axes, evaluation: CameraEvaluation) -> None:
 
 def _draw_curve(axes: Axes, calibration: Calibration) -> None:
     """Loss of the network along its training, and the error after the last steps."""
-    _style(axes, "Learning curve of the best start")
+    style(axes, "Learning curve of the best start")
     network = calibration.network
     if network is None or not network.curve:
         axes.text(0.5, 0.5, "no training was recorded", ha="center", va="center", transform=axes.transAxes)

@@ -22,6 +22,9 @@ __all__ = [
     "evaluation_json",
     "evaluation_report",
     "evaluation_tables",
+    "number_or_none",
+    "plural",
+    "printable",
     "rounded",
 ]
 
@@ -102,7 +105,7 @@ def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], li
     views = [["view", "points", "behind", "rms [px]", "max [px]", "pose"]]
     for name, view in e.views.items():
         numbers = [str(view.n_points), str(view.n_behind), _pixels(view.rmse_px), _pixels(view.max_px)]
-        views.append([_name(name), *numbers, "fitted" if view.fitted else "calibrated"])
+        views.append([printable(name), *numbers, "fitted" if view.fitted else "calibrated"])
     return overall, views
 
 
@@ -112,14 +115,15 @@ def evaluation_json(evaluation: CameraEvaluation, verdict: Verdict | None = None
     return {
         "n_points": evaluation.n_points,
         "n_behind": evaluation.n_behind,
-        **{name: _number(getattr(evaluation, name)) for name in names},
-        "views": {name: _number(view.rmse_px) for name, view in evaluation.views.items()},
+        **{name: number_or_none(getattr(evaluation, name)) for name in names},
+        "views": {name: number_or_none(view.rmse_px) for name, view in evaluation.views.items()},
         "fitted_views": list(evaluation.fitted_views),
         **({} if verdict is None else {"verdict": verdict_json(verdict)}),
     }
 
 
-def _number(value: float) -> float | None:
+def number_or_none(value: float) -> float | None:
+    """The number, or None if it is not finite, as JSON has no such numbers."""
     return value if math.isfinite(value) else None
 
 
@@ -144,20 +148,21 @@ def _pixels(value: float) -> str:
     return f"{value:.{max(0, 5 - whole)}f}"
 
 
-def _name(name: str) -> str:
-    """Show a name on one line, whatever characters a file put in it."""
+def printable(name: str) -> str:
+    """The name on one line, whatever characters a file put in it."""
     return name if name.isprintable() else ascii(name)[1:-1]
 
 
-def _plural(count: int, noun: str) -> str:
+def plural(count: int, noun: str) -> str:
+    """A number with its noun."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def _headline(calibration: Calibration) -> str:
     size = calibration.image_size
     parts = [
-        f"{_name(calibration.camera_name)}: type {calibration.type} ({_GIVEN[calibration.type]})",
-        f"{_plural(len(calibration.points), 'point')} in {_plural(len(calibration.views), 'view')}",
+        f"{printable(calibration.camera_name)}: type {calibration.type} ({_GIVEN[calibration.type]})",
+        f"{plural(len(calibration.points), 'point')} in {plural(len(calibration.views), 'view')}",
         "image size unknown" if size is None else f"{size[0]} x {size[1]} px",
     ]
     return ", ".join(parts)
@@ -179,7 +184,7 @@ def _parameter_rows(calibration: Calibration) -> list[list[str]]:
         values = [*view.pose.euler, *view.pose.t]
         for name, value in zip(POSE_NAMES, values, strict=True):
             unit = "rad" if name.startswith("R") else calibration.unit
-            rows.append(_parameter_row(name, _name(unit), float(value), view.std[name], view.fixed))
+            rows.append(_parameter_row(name, printable(unit), float(value), view.std[name], view.fixed))
     return rows
 
 
@@ -199,7 +204,7 @@ def _view_lines(views: Any) -> list[str]:
     if len(shown) > _MOST_VIEWS:
         shown = sorted(shown, key=lambda item: -item[1].rmse_px)[:_MOST_VIEWS]
     rows = [["view", "points", "rms [px]"]]
-    rows += [[_name(name), str(view.n_points), _pixels(view.rmse_px)] for name, view in shown]
+    rows += [[printable(name), str(view.n_points), _pixels(view.rmse_px)] for name, view in shown]
     lines = align(rows)
     if len(views) > _MOST_VIEWS:
         lines.append(f"the {_MOST_VIEWS} views with the largest error, of {len(views)} views")
@@ -211,7 +216,7 @@ def _training_lines(calibration: Calibration) -> list[str]:
         f"reprojection error: rms {_pixels(calibration.rmse_px)} px, maximum {_pixels(calibration.max_px)} px"
     )
     if calibration.n_rejected:
-        fit += f", {_plural(calibration.n_rejected, 'outlier')} rejected"
+        fit += f", {plural(calibration.n_rejected, 'outlier')} rejected"
     training = [] if calibration.network is None else _network_lines(calibration.network)
     if calibration.straight_lines is not None:
         training.insert(0, _lens_line(calibration.straight_lines))
@@ -234,7 +239,7 @@ def _lens_lines(calibration: Calibration) -> list[str]:
 def _lens_line(found: StraightLines) -> str:
     u, v = found.centre
     return (
-        f"straight lines: {_plural(found.n_points, 'point')} on {_plural(found.n_lines, 'line')}, rms "
+        f"straight lines: {plural(found.n_points, 'point')} on {plural(found.n_lines, 'line')}, rms "
         "distance "
         f"{_pixels(found.rms_before)} px before undistortion, {_pixels(found.rms_after)} px after; centre of "
         f"distortion ({u:.1f}, {v:.1f})"
@@ -242,14 +247,14 @@ def _lens_line(found: StraightLines) -> str:
 
 
 def _network_lines(network: NetworkRecord) -> list[str]:
-    agreed = f"network: {network.agreed} of {_plural(network.starts, 'random start')} agreed"
+    agreed = f"network: {network.agreed} of {plural(network.starts, 'random start')} agreed"
     if len(network.V) > 1:
-        starts = _plural(network.starts, "random start")
+        starts = plural(network.starts, "random start")
         agreed = (
             f"networks: {starts} for {len(network.V)} views, at least {network.agreed} agreed in each view"
         )
     return [
-        f"{agreed}, {_plural(network.iterations, 'iteration')}, loss {_pixels(network.loss)} px",
+        f"{agreed}, {plural(network.iterations, 'iteration')}, loss {_pixels(network.loss)} px",
         f"bundle adjustment: rms {_pixels(network.rmse_before)} px before, {_pixels(network.rmse_after)} px "
-        f"after {_plural(network.refine_iterations, 'iteration')}",
+        f"after {plural(network.refine_iterations, 'iteration')}",
     ]

@@ -212,7 +212,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
     columns = Columns.of(state)
     free = np.ones(columns.n_shared, dtype=bool)
     free[[1, 6]] = False
-    state = adjust_rig(problem.frames, problem.sightings, state, free).state
+    state = adjust_rig(problem.frames, problem.observations, state, free).state
     V, step = len(problem.frames.scale), 1e-7
     rows = []
     for n in np.flatnonzero(np.concatenate([free, np.ones(6 * V, dtype=bool)])):
@@ -227,7 +227,7 @@ def test_the_bound_is_the_inverse_of_the_fisher_information() -> None:
         rows.append((moves[0] - moves[1]) / (2 * step))
     J = np.array(rows)
     # Whitened residuals of variance 1 are 1e-5 px, up to what the sample says of it.
-    weight = np.sqrt(np.mean([s.weight / s.pixel_scale**2 for s in problem.sightings]))
+    weight = np.sqrt(np.mean([s.weight / s.pixel_scale**2 for s in problem.observations]))
     covariance = np.linalg.inv(J @ J.T) * weight**2
     place = np.flatnonzero(np.flatnonzero(free) == columns.rig[3])[0]
     t_x = np.sqrt(covariance[place, place]) * problem.frames.unit

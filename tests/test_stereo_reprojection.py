@@ -30,7 +30,7 @@ def made_problem(lens: str = "none", sigma: float = 0.3) -> tuple[RigScene, RigP
 def test_derivatives_are_those_of_finite_differences(lens: str) -> None:
     _, problem, state = made_problem(lens)
     columns = Columns.of(state)
-    normal, sensible = rig_normal_blocks(problem.frames, problem.sightings, state, columns)
+    normal, sensible = rig_normal_blocks(problem.frames, problem.observations, state, columns)
     assert sensible
     V = len(problem.frames.scale)
     r = all_residuals(problem, state)
@@ -77,7 +77,7 @@ def test_the_minimum_is_that_of_an_independent_optimiser(lens: str) -> None:
     columns = Columns.of(state)
     free = np.ones(columns.n_shared, dtype=bool)
     free[[1, columns.right[1]]] = False  # no skew
-    adjusted = adjust_rig(problem.frames, problem.sightings, state, free)
+    adjusted = adjust_rig(problem.frames, problem.observations, state, free)
     assert adjusted.converged
     V, places = len(problem.frames.scale), np.flatnonzero(free)
 
@@ -94,6 +94,6 @@ def test_without_noise_the_truth_is_found_exactly() -> None:
     scene, problem, state = made_problem(sigma=0.0)
     free = np.ones(Columns.of(state).n_shared, dtype=bool)
     free[[1, 6]] = False
-    found = adjust_rig(problem.frames, problem.sightings, state, free).state
+    found = adjust_rig(problem.frames, problem.observations, state, free).state
     assert pytest.approx(scene.rig.R, abs=1e-10) == found.R
     assert found.t * problem.frames.unit == pytest.approx(scene.rig.t, abs=1e-7)

@@ -15,10 +15,10 @@ from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.points import Correspondences
 from neurocal_cli.simulation.zoom_lens import SimulatedZoom
-from neurocal_cli.zoom_lens.baseline_models import rivals_of
+from neurocal_cli.zoom_lens.baseline_models import baselines_of
 from neurocal_cli.zoom_lens.camera_at import camera_at
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.evaluation import _rival_error, _rms, _squares, evaluate_lens
+from neurocal_cli.zoom_lens.evaluation import _baseline_error, _rms, _squares, evaluate_lens
 from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
 from neurocal_cli.zoom_lens.fit_points import fit_lens
 from neurocal_cli.zoom_lens.interpolation import (
@@ -47,7 +47,7 @@ def columns(lens: LensPoints) -> dict[str, np.ndarray]:
 def test_a_smooth_lens_is_known_between_its_settings() -> None:
     evaluation = evaluate_lens(smooth(), seen("c", between(5, 3), seed=2))
     assert evaluation.rmse_px < 1.12 * FLOOR  # 15 settings are few
-    assert evaluation.rmse_px < 0.5 * evaluation.rivals["lookup_joint"]
+    assert evaluation.rmse_px < 0.5 * evaluation.baselines["lookup_joint"]
     assert smooth().converged
     assert smooth().rmse_px == pytest.approx(FLOOR, rel=0.05)
     assert not smooth().rejected
@@ -78,7 +78,7 @@ def test_a_lens_of_one_control() -> None:
     middle = settings[:-1] + 0.5 * np.diff(settings, axis=0)
     evaluation = evaluate_lens(lens, seen("c", middle, seed=5))
     assert evaluation.rmse_px < 1.05 * FLOOR
-    assert "thin_plate" not in evaluation.rivals
+    assert "thin_plate" not in evaluation.baselines
     camera = camera_at(lens, np.array([700.0]))
     assert camera.std["alpha_u"] > 0
 
@@ -90,8 +90,8 @@ def test_settings_need_no_grid() -> None:
     lens = fit_lens(seen("c", settings, seed=7), distortion="none", topologies=FEW)
     evaluation = evaluate_lens(lens, seen("c", between(4, 4), seed=8))
     assert evaluation.rmse_px < 1.05 * FLOOR
-    assert "lookup" not in evaluation.rivals
-    assert evaluation.rmse_px < evaluation.rivals["thin_plate_joint"]
+    assert "lookup" not in evaluation.baselines
+    assert evaluation.rmse_px < evaluation.baselines["thin_plate_joint"]
 
 
 def test_distortion_is_chosen_and_follows_the_zoom() -> None:
@@ -200,7 +200,7 @@ def test_a_lens_of_a_moving_board() -> None:
     assert not camera.views
     evaluation = evaluate_lens(lens, LensPoints.grouped(points, {"zoom": np.array(zoom)}))
     assert evaluation.rmse_px < 1.1 * 0.1 * np.sqrt(2)
-    assert np.isfinite(evaluation.rivals["spline_joint"])
+    assert np.isfinite(evaluation.baselines["spline_joint"])
 
 
 def board_view(alpha: float, u0: float, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -343,7 +343,7 @@ class Held:
     networks: dict[str, float] = field(default_factory=dict)
     alone: dict[str, float] = field(default_factory=dict)
     alternating: dict[str, float] = field(default_factory=dict)
-    rivals: dict[str, dict[str, float]] = field(default_factory=dict)
+    baselines: dict[str, dict[str, float]] = field(default_factory=dict)
     cover: dict[str, float] = field(default_factory=dict)
 
     def take(self, law: str, bends: bool) -> None:
@@ -360,8 +360,8 @@ class Held:
             )
             errors.setdefault("cover", []).append(covered(lens, law, between(9, 5)))
             for scale in {"log", lens.members[0].nets.scale}:
-                for name, rival in rivals_of(lens, scale).items():
-                    error = _rival_error(lens, held_out, *rival(x), lens.tables.constants)
+                for name, baseline in baselines_of(lens, scale).items():
+                    error = _baseline_error(lens, held_out, *baseline(x), lens.tables.constants)
                     errors.setdefault(f"{name} {'log' if scale == 'log' else 'own'}", []).append(
                         error / FLOOR
                     )
@@ -372,7 +372,7 @@ class Held:
             into[law] = mean.pop(name)
         # On a logarithmic scale the networks' own is not another one.
         own = {name.replace("log", "own"): error for name, error in mean.items()}
-        self.rivals[law] = own | mean
+        self.baselines[law] = own | mean
 
 
 def one_at_a_time(lens: ZoomLens, x: np.ndarray) -> np.ndarray:
@@ -390,21 +390,21 @@ MOST = {"a": 1.04, "b": 1.01, "c": 1.01, "d": 1.02}  # what is reached, and a li
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bends", [False, True], ids=["straight", "bends"])
-def test_networks_beat_every_rival_between_45_settings(bends: bool) -> None:
-    """Means over five seeds at 32 settings; rivals on a logarithmic scale and on the networks' own."""
+def test_networks_beat_every_baseline_between_45_settings(bends: bool) -> None:
+    """Means over five seeds at 32 settings; baselines on a logarithmic scale and on the networks' own."""
     held = Held()
     for law in LAWS:
         held.take(law, bends)
     for law in LAWS:
         assert held.networks[law] < MOST[law]
         assert held.networks[law] < held.alone[law]
-        assert all(held.networks[law] <= error for error in held.rivals[law].values())
+        assert all(held.networks[law] <= error for error in held.baselines[law].values())
         assert held.alternating[law] == pytest.approx(1, abs=0.1)
         assert held.cover[law] > 0.9
     assert np.mean(list(held.cover.values())) < 0.99
     networks = np.mean(list(held.networks.values()))
-    for name in held.rivals["a"]:
-        assert networks < 0.8 * np.mean([held.rivals[law][name] for law in LAWS])
+    for name in held.baselines["a"]:
+        assert networks < 0.8 * np.mean([held.baselines[law][name] for law in LAWS])
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from support.zoom_laws import grid, seen
 
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.alternating_training import train_alternating
+from neurocal_cli.zoom_lens.alternating_training import take_turns
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.joint_training import JointLearner, train_joint
 from neurocal_cli.zoom_lens.mlfn import Topology, respond, respond_with_jacobian
@@ -26,7 +26,7 @@ from neurocal_cli.zoom_lens.parameter_networks import (
     outputs_to_local,
     to_scale,
 )
-from neurocal_cli.zoom_lens.quadratic_error import loosened
+from neurocal_cli.zoom_lens.quadratic_error import with_scatter
 from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData
 from neurocal_cli.zoom_lens.settings import LensPoints, scaled_controls
 from neurocal_cli.zoom_lens.static_calibration import (
@@ -100,8 +100,8 @@ def test_products_are_of_different_controls() -> None:
     topology = Topology(2, 1, 1)
     x = np.random.default_rng(0).uniform(-1, 1, (7, 2))
     m = np.array([0.3, -0.7, 1.1, 0.4])
-    bow = 1 - x * x
-    z = np.column_stack([x, bow])
+    rational = 1 - x * x
+    z = np.column_stack([x, rational])
     assert {tuple(sorted(pair)) for pair in zip(*topology.pairs, strict=True)} == {
         (0, 1),
         (0, 3),
@@ -284,7 +284,7 @@ def test_scatter_loosens_the_normal_matrices_as_an_offset_that_is_fitted() -> No
     local, constants = begun(lens, data)
     normal, _ = data.linearise(local, constants)
     scatter = np.array([4.0, 0.0, 1.0, 0.0, 9.0])
-    loose = loosened(normal, scatter, 0.02)
+    loose = with_scatter(normal, scatter, 0.02)
     some = np.flatnonzero(scatter)
     d = np.random.default_rng(8).normal(size=11) * 1e-3
     # By hand: the offset that makes the sum of both errors least.
@@ -324,7 +324,7 @@ def test_alternating_ends_where_joint_training_ends() -> None:
         0
     ]
     arguments = (data, x, nets, tables.constants, 0.0225, np.zeros(5))
-    together, turns = train_joint(*arguments), train_alternating(*arguments)
+    together, turns = train_joint(*arguments), train_joint(*arguments, descend=take_turns)
     probe = np.random.default_rng(9).uniform(-1, 1, (20, 2))
     ends = [joint.nets.local(probe) for joint in (together, turns)]
     # The two differ by far less than they move: alpha by less than a hundredth of a percent.

@@ -1,4 +1,4 @@
-"""Known cameras at many lens settings: a CSV of their parameters, or one that names calibration files."""
+"""Known cameras at many settings of a zoom lens: a CSV of parameters, or one that names calibration files."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class _Rows:
         Settings, `_PARAMETERS` and perhaps t_z.
     theta : (n,) array [rad]
     models : list of str
-        Lens model of each.
+        Distortion model of each.
     coefficients : list of arrays
     sizes : set of (width, height)
     """
@@ -67,7 +67,7 @@ def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> Len
     Raises
     ------
     FormatError, InputError
-        A file that cannot be read, without the setting's column, or cameras that are not of one lens.
+        An unreadable file, a missing setting, or cameras that are not of one lens.
     """
     tables = [parse_table(data, source, _schema(data)) for data, source in contents]
     for table in tables:
@@ -117,7 +117,7 @@ def _listed(table: Table) -> _Rows:
 
 
 def _common_model(parts: Sequence[_Rows], source: str) -> tuple[str, Array]:
-    """The simplest lens model that holds all cameras', and its coefficients (S, K)."""
+    """The simplest distortion model that includes those of all cameras, and its coefficients (S, K)."""
     models = [model for part in parts for model in part.models]
     rows = [row for part in parts for row in part.coefficients]
     if "fisheye" in models:
@@ -140,7 +140,7 @@ def require_setting(tables: Sequence[Table]) -> tuple[str, ...]:
     Raises
     ------
     FormatError
-        None, or other ones in another file.
+        There are none, or the files differ.
     """
     names = [set(table.numbers) & set(CONTROLS) for table in tables]
     for found, table in zip(names, tables, strict=True):

@@ -1,4 +1,4 @@
-"""Points at many lens settings from CSV."""
+"""Points at many settings of a zoom lens as CSV."""
 
 from __future__ import annotations
 
@@ -26,19 +26,19 @@ __all__ = ["read_lens_data", "read_lens_points", "write_lens_points"]
 def read_lens_data(
     paths: str | Path | Sequence[str | Path], *, notes: list[str] | None = None
 ) -> LensPoints | LensCameras:
-    """Read points at many settings, or known cameras, whichever the header names.
+    """Read points at many settings, or known cameras, depending on the header.
 
     Parameters
     ----------
     paths : str, Path or a sequence of them
         ``-`` is stdin.
     notes : list of str, optional
-        Remarks about what was left out are appended.
+        Remarks about ignored columns are appended.
 
     Raises
     ------
     FormatError, InputError
-        A file that cannot be read, without the setting's column, or with what does not fit together.
+        An unreadable file, a missing setting, or inconsistent data.
     """
     several = [paths] if isinstance(paths, (str, Path)) else list(paths)
     if not several:
@@ -85,7 +85,7 @@ def _points(tables: list[Table], notes: list[str]) -> LensPoints:
 
 
 def _images(table: Table, controls: tuple[str, ...], setting: Array, several: bool) -> NDArray[Any]:
-    """A view for each image: the file's own label, made different where it occurs at several settings."""
+    """View names: the file's label, with the setting added where a label occurs at several settings."""
     distinct, index = np.unique(setting, axis=0, return_inverse=True)
     index = index.ravel()
     texts = np.array([describe(controls, row) for row in distinct])[index]

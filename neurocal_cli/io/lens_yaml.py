@@ -1,4 +1,4 @@
-"""Lens files: an active lens as YAML, its networks and what they learnt from; numbers read back exactly."""
+"""Lens files: a zoom lens as YAML, with its networks and tables. Numbers read back exactly."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import read_yaml
 from neurocal_cli.zoom_lens.mlfn import Topology
 from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, ParameterNet
-from neurocal_cli.zoom_lens.setting_normals import Constants, Normal
+from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables
 from neurocal_cli.zoom_lens.settings import CONTROLS
-from neurocal_cli.zoom_lens.zoom_lens import Member, Rejected, TableRecord, ZoomLens
+from neurocal_cli.zoom_lens.zoom_lens import Member, RejectedSetting, ZoomLens
 
 __all__ = ["format_lens", "read_lens", "write_lens"]
 
@@ -36,7 +36,7 @@ def format_lens(lens: ZoomLens) -> str:
     Raises
     ------
     InputError
-        A unit or reason that UTF-8 cannot hold.
+        A unit or reason that is not valid UTF-8.
     """
     lines = [f"{_BLOCK}:"]
     for part in (_record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)):
@@ -206,7 +206,7 @@ def _positive(field: Field) -> float:
 
 
 def _parameter_names(block: Field, camera: str) -> tuple[tuple[str, ...], str]:
-    """Names of the local parameters, which the camera and the lens model leave no choice of."""
+    """Names of the local parameters, which the kind of camera and the distortion model determine."""
     model = block["distortion"].text()
     try:
         coefficients = coefficient_names(model)
@@ -255,11 +255,11 @@ def _read_constants(field: Field) -> Constants:
     return Constants(field["theta"].number(), field["R"].array(3, 3), field["t"].array(2))
 
 
-def _rejected(field: Field, D: int) -> Rejected:
-    return Rejected(tuple(field["setting"].array(D).tolist()), field["reason"].text())
+def _rejected(field: Field, D: int) -> RejectedSetting:
+    return RejectedSetting(tuple(field["setting"].array(D).tolist()), field["reason"].text())
 
 
-def _table(field: Field, S: int, L: int, Q: int) -> TableRecord:
+def _table(field: Field, S: int, L: int, Q: int) -> Tables:
     size = L + Q
     upper = np.triu_indices(size)
     flat = field["H"].array(S, len(upper[0]))
@@ -267,4 +267,4 @@ def _table(field: Field, S: int, L: int, Q: int) -> TableRecord:
     H[:, upper[0], upper[1]] = flat
     H[:, upper[1], upper[0]] = flat
     normal = Normal(H, field["g"].array(S, size), field["cost"].array(S), True)
-    return TableRecord(field["local"].array(S, L), _read_constants(field["constants"]), normal)
+    return Tables(field["local"].array(S, L), _read_constants(field["constants"]), normal)

@@ -1,1 +1,1 @@
-"""Two cameras: which of their views and points belong together, their rig, points through both."""
+"""Two cameras: pairing of their views and points, calibration of their rig, triangulation."""

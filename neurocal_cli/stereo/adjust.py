@@ -1,4 +1,4 @@
-"""Bundle adjustment of two cameras: both, the rig and all poses on the whitened reprojection error."""
+"""Bundle adjustment of both cameras, the rig and all poses on the whitened reprojection error."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from neurocal_cli.bundle_adjustment.adjust import FLOOR, OPTIONS
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import minimise
 from neurocal_cli.least_squares.schur_complement import schur_step
-from neurocal_cli.stereo.reprojection import Columns, Frames, RigState, Sightings, rig_normal_blocks
+from neurocal_cli.stereo.reprojection import Columns, Frames, Observations, RigState, rig_normal_blocks
 
 __all__ = ["AdjustedRig", "adjust_rig"]
 
-_DAMPING = 1e-6  # each camera comes from its own adjustment, so the first step may be nearly undamped
+_DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,48 +44,48 @@ class AdjustedRig:
 
 def adjust_rig(
     frames: Frames,
-    sightings: tuple[Sightings, Sightings],
+    observations: tuple[Observations, Observations],
     start: RigState,
     free: NDArray[np.bool_],
     max_iterations: int = 200,
 ) -> AdjustedRig:
-    """Minimise the reprojection error of both cameras from a start that is already near.
+    """Minimise the reprojection error of both cameras from a start near the minimum.
 
     Parameters
     ----------
     frames : Frames
-    sightings : two of Sightings
+    observations : two of Observations
     start : RigState
         With all points in front of their cameras.
     free : (n_shared,) bool array
-        Which of the cameras' and the rig's unknowns move; the poses of the views always do.
+        Which parameters of the cameras and the rig are free; the poses always are.
     max_iterations : int
     """
-    problem = _RigReprojection(frames, sightings, start, free)
+    problem = _RigReprojection(frames, observations, start, free)
     options = replace(OPTIONS, damping=_DAMPING, max_iterations=max_iterations)
-    floor = FLOOR**2 * sum(seen.n_equations * seen.weight for seen in sightings)
+    floor = FLOOR**2 * sum(observed.n_equations * observed.weight for observed in observations)
     outcome = minimise(problem, options, floor)
     settled = bool(outcome.settled[0])
-    return AdjustedRig(problem.state.settled(), problem.normal, int(outcome.iterations[0]), settled)
+    return AdjustedRig(problem.state.orthonormalised(), problem.normal, int(outcome.iterations[0]), settled)
 
 
-_Step = tuple[Array, Array]  # of what is shared (n_shared,) and of the views' poses (V, 6)
+_Step = tuple[Array, Array]  # of the shared parameters (n_shared,) and of the poses (V, 6)
 _Trial = tuple[RigState, Array]  # a state and its normal matrices
 
 
 class _RigReprojection:
-    """The reprojection error of both cameras as `least_squares` sees it: one group."""
+    """The reprojection error of both cameras as a problem of `least_squares` with one group."""
 
     def __init__(
         self,
         frames: Frames,
-        sightings: tuple[Sightings, Sightings],
+        observations: tuple[Observations, Observations],
         start: RigState,
         free: NDArray[np.bool_],
     ) -> None:
-        self.frames, self.sightings, self.state = frames, sightings, start
+        self.frames, self.observations, self.state = frames, observations, start
         self.columns, self.shared = Columns.of(start), np.flatnonzero(free)
-        self.normal, _ = rig_normal_blocks(frames, sightings, start, self.columns)
+        self.normal, _ = rig_normal_blocks(frames, observations, start, self.columns)
 
     @property
     def cost(self) -> Array:
@@ -93,7 +93,7 @@ class _RigReprojection:
         return self.normal[:, -1, -1].sum(keepdims=True)
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
-        """Steps of what is shared and of the poses, and the gain that they promise."""
+        """Steps of the shared parameters and of the poses, and the predicted gain."""
         by_shared, by_own, promised = schur_step(
             self.normal, self.shared, self.columns.pose, float(damping[0])
         )
@@ -102,13 +102,13 @@ class _RigReprojection:
         return (step, by_own), np.array([promised])
 
     def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
-        """The state after a step, with all points in front of both cameras and none folded back."""
+        """The state after a step; valid if all points are in front and the distortion is monotonic."""
         trial = self.state.moved(self.columns, *step)
-        normal, sensible = rig_normal_blocks(self.frames, self.sightings, trial, self.columns)
+        normal, sensible = rig_normal_blocks(self.frames, self.observations, trial, self.columns)
         sensible = sensible and all(camera.entries[0, [0, 2]].min() > 0 for camera in trial.cameras)
         return (trial, normal), normal[:, -1, -1].sum(keepdims=True), np.array([sensible])
 
     def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Take it over."""
+        """Accept the trial."""
         if better[0]:
             self.state, self.normal = trial

@@ -1,4 +1,4 @@
-"""`calibrate_stereo`: points of two cameras in, a calibrated rig out."""
+"""`calibrate_stereo`: calibration of a rig from the points of two cameras."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["calibrate_stereo"]
 Progress = Callable[[str, float], None]
 
 _SIDES = ("left", "right")
-_OF_LEAST_SQUARES = ("neuro", "nonlinear")  # other methods' cameras stay as they are: that is their result
+_OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
 
 
 def calibrate_stereo(
@@ -31,23 +31,23 @@ def calibrate_stereo(
     progress: Progress | None = None,
     **options: Any,
 ) -> Rig:
-    """Calibrate two cameras and the rig that holds them, from random weights.
+    """Calibrate two cameras and their rig from random weights.
 
-    Each camera's network learns by itself, as in `calibrate`. The views that both saw, paired by name, then
-    agree on a rig, and both cameras, the rig and all poses are adjusted together. Views of one camera alone
-    help that camera.
+    Each camera is calibrated alone, as by `calibrate`. The rig is then found from the views of both cameras,
+    which are paired by name. A common bundle adjustment refines both cameras, the rig and all poses. Views of
+    one camera alone contribute to that camera.
 
     Parameters
     ----------
     left, right : Correspondences
-        In one world unit; views pair by name, points by id, else by X, Y, Z (see `stereo.pairing`).
+        In one world unit. Views are paired by name, points by id, else by X, Y, Z (see `stereo.pairing`).
     left_options, right_options : dict, optional
-        Arguments of `calibrate` for one camera, such as ``type=3, intrinsics=camera`` for one that is known.
+        Arguments of `calibrate` for one camera, such as ``type=3, intrinsics=camera`` for a known one.
     progress : callable, optional
-        Called with a stage's name and the share of it that is done.
+        Called with the name of a stage and the share of it that is done.
     **options
-        Arguments of `calibrate` for both cameras; `outliers` also says what to do with pairs of views that
-        contradict the others.
+        Arguments of `calibrate` for both cameras. `outliers` also applies to pairs of views that contradict
+        the others.
 
     Returns
     -------
@@ -57,9 +57,9 @@ def calibrate_stereo(
     Raises
     ------
     UsageError
-        As `calibrate`; type 4, as there is no rig to find when all poses are known.
+        As `calibrate`; type 4, where all poses are known.
     InputError, DegenerateGeometryError
-        Points that cannot give an answer, with the reason.
+        The points do not determine the rig; the message says why.
     """
     sides = [dict(options) | dict(extra or {}) for extra in (left_options, right_options)]
     if any(side.get("type", 1) == 4 for side in sides):
@@ -67,24 +67,20 @@ def calibrate_stereo(
             "with type 4 the poses of all views are known, so there is no rig to estimate; calibrate each "
             "camera"
         )
-    # What does not fit together is told before anything is trained.
+    # Errors of pairing are reported before the training.
     pair_points(left, right, pair_views(left.view_names, right.view_names))
     cameras: list[Calibration] = []
     for name, points, side in zip(_SIDES, (left, right), sides, strict=True):
         side = {"camera_name": name} | side
         cameras.append(calibrate(points, **side, progress=_named(progress, name)))
     best = all(camera.method in _OF_LEAST_SQUARES for camera in cameras)
-    rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, **_agreement(options))
+    rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, outliers=options.get("outliers", "reject"))
     warnings = [
         f"{name}: {text}"
         for name, camera in zip(_SIDES, (rig.left, rig.right), strict=True)
         for text in camera.warnings
     ]
     return replace(rig, warnings=(*rig.warnings, *warnings))
-
-
-def _agreement(options: Mapping[str, Any]) -> dict[str, Any]:
-    return {"outliers": options["outliers"]} if "outliers" in options else {}
 
 
 def _named(progress: Progress | None, name: str) -> Progress | None:

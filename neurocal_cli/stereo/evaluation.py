@@ -1,7 +1,7 @@
-"""How well two cameras tell where points are: triangulated against true positions (paper, section 5.2).
+"""Errors of triangulated points of known position (paper, section 5.2).
 
-True positions are those of the target, put into the left camera's frame by the view's pose; all errors are
-in that frame, z along the optical axis.
+The true positions are those of the target, transformed to the left camera's frame by the pose of the view.
+All errors are in that frame, with z along the optical axis.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["StereoEvaluation", "evaluate_rig", "evaluate_stereo"]
 
 @dataclass(frozen=True, eq=False)
 class StereoEvaluation:
-    """Two cameras judged by points of known position.
+    """Errors of two cameras at points of known position.
 
     Attributes
     ----------
@@ -34,15 +34,15 @@ class StereoEvaluation:
     by_view : SpaceError
         Triangulated with each view's own poses of the two cameras.
     rig : SpaceError or None
-        Triangulated through one rig for all views, as points of unknown position will be; None where the
-        views have none in common.
+        Triangulated through one rig for all views, as for points of unknown position; None where no rig
+        fits all views.
     baseline : float [world unit]
-        Of the rig; nan without one.
+        Of the rig; nan without a rig.
     pairs : tuple of (left name, right name)
     alone : two tuples of str
-        Views of the left and of the right camera without a pair, which are in nothing here.
+        Views of the left and of the right camera without a pair, which are not used.
     fitted : tuple of str
-        Left camera's views whose poses were estimated from these very points.
+        Views of the left camera whose poses were estimated from the same points.
     warnings : tuple of str
     """
 
@@ -63,21 +63,21 @@ def evaluate_stereo(
     *,
     method: str = "optimal",
 ) -> StereoEvaluation:
-    """Judge two calibrated cameras by the points that both saw.
+    """Evaluate two calibrated cameras by the points of both.
 
     Parameters
     ----------
     left, right : Calibration
     points : two of Correspondences, optional
-        Default: those that the cameras were calibrated from, which flatters them. The poses of views that
-        the calibrations do not know are fitted, with the cameras held fixed.
+        Default: those of the calibration, which gives smaller errors than new points. The poses of new views
+        are fitted with fixed cameras.
     method : {"optimal", "linear", "midpoint"}
         Of triangulation.
 
     Raises
     ------
     InputError
-        No common view or point, other image sizes or units.
+        No common view or point, or different image sizes or units.
     DegenerateGeometryError
         Cameras at one place, or points that cannot be triangulated.
     """
@@ -90,20 +90,20 @@ def evaluate_stereo(
     except DegenerateGeometryError as error:
         rig = None
         warnings.append(f"no rig fits all views: {error}")
-    return _Judge((left, right), rig, points, method, warnings).evaluation()
+    return _Evaluator((left, right), rig, points, method, warnings).evaluation()
 
 
 def evaluate_rig(
     rig: Rig, points: tuple[Correspondences, Correspondences] | None = None, *, method: str = "optimal"
 ) -> StereoEvaluation:
-    """Judge a rig by the points that both cameras saw; see `evaluate_stereo`.
+    """Evaluate a rig by the points of both cameras; see `evaluate_stereo`.
 
-    The rig's views have one pose for both cameras, so both ways to judge it are the same.
+    The views of a rig have one pose for both cameras, so `by_view` and `rig` are equal.
     """
-    return _Judge((rig.left, rig.right), rig, points, method, list(rig.warnings)).evaluation()
+    return _Evaluator((rig.left, rig.right), rig, points, method, list(rig.warnings)).evaluation()
 
 
-class _Judge:
+class _Evaluator:
     def __init__(
         self,
         cameras: tuple[Calibration, Calibration],
@@ -147,8 +147,8 @@ class _Judge:
         )
 
     def _fit_new(self) -> tuple[Calibration, Calibration]:
-        """Each camera in the views that it does not know, by itself (type 3)."""
-        from neurocal_cli.methods import calibrate  # the trainers: only when there is something to train
+        """Poses of the new views in each camera alone (type 3)."""
+        from neurocal_cli.methods import calibrate  # only needed for new views
 
         fits = []
         for side, (camera, points) in enumerate(zip(self.cameras, self.points, strict=True)):
@@ -162,7 +162,7 @@ class _Judge:
         return fits[0], fits[1]
 
     def _by_view(self, fitted: tuple[Calibration, Calibration] | None) -> SpaceError:
-        """Each view with its own two poses."""
+        """Errors with the two poses of each view."""
         new = set(self.new)
         poses = []
         for pair in self.views.both:
@@ -175,7 +175,7 @@ class _Judge:
         return self._error([first for first, _ in poses], rigs, np.ones(len(poses), dtype=bool))
 
     def _through_rig(self, rig: Rig, fitted: tuple[Calibration, Calibration] | None) -> SpaceError | None:
-        """All views through one rig, each with the one pose that fits both cameras best."""
+        """Errors through one rig, with the pose of each view that fits both cameras best."""
         poses = {name: view.pose for name, view in rig.left.views.items()}
         if fitted is not None:
             poses.update(poses_on_rig(rig.pose, fitted, ViewPairs(tuple(self.new), (), ())))
@@ -187,7 +187,7 @@ class _Judge:
     def _error(self, poses: list[Pose], rigs: list[Pose], used: NDArray[np.bool_]) -> SpaceError:
         """Triangulate the points of the used views and compare them with the target."""
         chosen = used[self.pairs.view]
-        pairs = Pairs(self.pairs.left[chosen], self.pairs.right[chosen], self.pairs.view[chosen], 0)
+        pairs = Pairs(self.pairs.left[chosen], self.pairs.right[chosen], self.pairs.view[chosen])
         found = triangulate(
             *self.cameras,
             rigs,
@@ -200,9 +200,9 @@ class _Judge:
         t = np.stack([pose.t for pose in poses])[pairs.view]
         true = (R @ self.points[0].world[pairs.left][..., None])[..., 0] + t
         names = [a for a, _ in self.views.both]
-        seen = np.where(found.behind[:, None], np.nan, found.points)
+        triangulated = np.where(found.behind[:, None], np.nan, found.points)
         K = self.cameras[0].intrinsics
-        return space_error(seen, true, found.epipolar, pairs.view, names, K.alpha_u, K.alpha_v)
+        return space_error(triangulated, true, found.epipolar, pairs.view, names, K.alpha_u, K.alpha_v)
 
 
 def _refuse_other(camera: Calibration, points: Correspondences) -> None:

@@ -1,4 +1,4 @@
-"""The rig of two calibrated cameras: which views agree on it, and the common refinement."""
+"""The rig of two calibrated cameras: outlier views and the common bundle adjustment."""
 
 from __future__ import annotations
 
@@ -16,35 +16,35 @@ from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views
 from neurocal_cli.stereo.problem import RigProblem, free_parameters, rig_problem
 from neurocal_cli.stereo.reprojection import Columns
-from neurocal_cli.stereo.result import assemble_rig, folding_sides
+from neurocal_cli.stereo.result import assemble_rig, non_monotonic_sides
 from neurocal_cli.stereo.rig import Rig
 
 __all__ = ["fit_rig", "poses_on_rig"]
 
-# A pair of views has 6 parameters less on the rig than apart: what its error grows by is chi-squared of 6
-# degrees if the pair is sound, 5.35 in the median. Cameras are no exact pinholes with exact lenses, so the
-# median of all pairs is the yard-stick where it is larger.
+# A pair of views has 6 parameters fewer on the rig than alone. The cost of a sound pair grows by a
+# chi-squared variable of 6 degrees of freedom, whose median is 5.35. Real cameras deviate from their models,
+# so the median growth of all pairs replaces it where it is larger. The limit of 60 has the probability 5e-11;
+# test_a_pair_not_taken_at_the_same_moment_is_named has pairs on both sides.
 _MEDIAN_GROWTH = 5.35
 _SUSPECT = 60.0
-_OWN_SHARE = 2.0  # of its error in both cameras alone, and the pair must have grown by more than this
-_TOLD_APART = 3.0  # standard deviations of the baseline
+_OWN_SHARE = 2.0  # the growth must also exceed this multiple of the cost in both cameras alone
+_BASELINE_SIGMAS = 3.0  # a baseline below so many standard deviations is none
 _SHOWN = 5  # names in a message
 
 
 def fit_rig(
     left: Calibration, right: Calibration, *, refine_cameras: bool = False, outliers: str = "reject"
 ) -> Rig:
-    """Find how the right camera stands to the left one, from the views that both saw.
+    """Find the pose of the right camera relative to the left one from the views of both.
 
     Parameters
     ----------
     left, right : Calibration
     refine_cameras : bool
-        Whether the intrinsic parameters and lenses that were estimated are estimated again together with
-        the rig and all poses; otherwise the rig and the poses alone are.
+        Whether the bundle adjustment also refines the intrinsic parameters and distortions that were
+        estimated. Otherwise it refines the rig and the poses alone.
     outliers : {"reject", "keep"}
-        What to do with pairs of views that contradict most others: leave them out of the rig with a
-        warning, or raise.
+        Whether pairs of views that contradict most others are left out of the rig with a warning, or raise.
 
     Returns
     -------
@@ -59,7 +59,7 @@ def fit_rig(
     CoincidentCamerasError
         Cameras at one place.
     UsageError
-        An option that does not exist.
+        An unknown option.
     """
     if outliers not in ("reject", "keep"):
         raise UsageError(f"outliers must be reject or keep, not {outliers!r}")
@@ -67,8 +67,8 @@ def fit_rig(
     pair_points(left.points, right.points, views)
     moving = [refine_cameras, refine_cameras]
     problem, adjusted, free, left_out = _agreed(left, right, views, moving)
-    while folding := folding_sides(problem, (left, right), adjusted, free):
-        for side in folding:
+    while not_monotonic := non_monotonic_sides(problem, (left, right), adjusted, free):
+        for side in not_monotonic:
             moving[side] = False
         problem, adjusted, free, left_out = _agreed(left, right, views, moving)
     if left_out and (outliers == "keep" or 2 * len(left_out) >= len(views.both)):
@@ -92,43 +92,36 @@ def _kept_warning(name: str) -> str:
 def _agreed(
     left: Calibration, right: Calibration, views: ViewPairs, moving: Sequence[bool]
 ) -> tuple[RigProblem, AdjustedRig, NDArray[np.bool_], dict[tuple[str, str], str]]:
-    """Refine on the pairs that agree; pairs that the result contradicts leave, the worst first."""
+    """Adjust on the pairs that agree; reject pairs that contradict the result, the worst first."""
     problem = rig_problem(left, right, views)
     consensus = find_consensus(problem)
-    in_order = [_pair(problem, k) for k in range(len(problem.paired))]
-    left_out = {pair: reason for pair, reason in zip(in_order, consensus.reasons, strict=True) if reason}
+    reasons = zip(problem.pairs, consensus.reasons, strict=True)
+    left_out = {pair: reason for pair, reason in reasons if reason}
     if 2 * len(left_out) >= len(views.both):
         raise DegenerateGeometryError(_contradiction(left_out, len(views.both), "reject"))
     while True:
         if left_out:
-            problem = rig_problem(left, right, _without(views, left_out))
+            kept = tuple(pair for pair in views.both if pair not in left_out)
+            problem = rig_problem(left, right, ViewPairs(kept, (), ()))
         start = problem.start(consensus.rig)
         free = np.concatenate(
             [free_parameters(c) & moves for c, moves in zip((left, right), moving, strict=True)]
             + [np.ones(6, dtype=bool)]
         )
-        adjusted = adjust_rig(problem.frames, problem.sightings, start, free)
+        adjusted = adjust_rig(problem.frames, problem.observations, start, free)
         alone = problem.own_cost[0][problem.paired] + problem.own_cost[1][problem.paired_right]
         growth = adjusted.normal[problem.paired, -1, -1] - alone
         limit = _SUSPECT * max(1.0, float(np.median(growth)) / _MEDIAN_GROWTH)
         suspect = (growth > limit) & (growth > _OWN_SHARE * alone)
         if not suspect.any() or len(growth) < 2 or 2 * len(left_out) >= len(views.both):
             return problem, adjusted, free, left_out
-        # Sound pairs suffer from the worst ones: only what stands out among them leaves at once.
+        # The worst pairs raise the cost of sound ones, so only the worst are rejected at once.
         for k in np.flatnonzero(suspect & (growth > 0.3 * growth.max())):
-            left_out[_pair(problem, int(k))] = UNSYNCHRONISED
-
-
-def _pair(problem: RigProblem, k: int) -> tuple[str, str]:
-    return problem.names[0][problem.paired[k]], problem.names[1][problem.paired_right[k]]
-
-
-def _without(views: ViewPairs, left_out: dict[tuple[str, str], str]) -> ViewPairs:
-    return ViewPairs(tuple(pair for pair in views.both if pair not in left_out), (), ())
+            left_out[problem.pairs[k]] = UNSYNCHRONISED
 
 
 def _contradiction(left_out: dict[tuple[str, str], str], n_pairs: int, outliers: str) -> str:
-    """Name the pairs of views, and what is wrong with them."""
+    """Message with the pairs of views and their faults."""
     by_reason: dict[str, list[str]] = {}
     for (a, b), reason in left_out.items():
         by_reason.setdefault(reason, []).append(a if a == b else f"{a}/{b}")
@@ -145,7 +138,7 @@ def _contradiction(left_out: dict[tuple[str, str], str], n_pairs: int, outliers:
 
 
 def _refuse_one_place(rig: Rig) -> None:
-    if rig.baseline > _TOLD_APART * rig.std["baseline"]:
+    if rig.baseline > _BASELINE_SIGMAS * rig.std["baseline"]:
         return
     raise CoincidentCamerasError(
         f"both cameras are at the same place: the baseline is {rig.baseline:.3g} +- "
@@ -170,13 +163,13 @@ def _warnings(rig: Rig) -> tuple[str, ...]:
 
 
 def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: ViewPairs) -> dict[str, Pose]:
-    """Poses of views, in the left camera's frame, that fit both cameras of a known rig best.
+    """Poses of views in the left camera's frame that fit both cameras of a known rig best.
 
     Parameters
     ----------
     rig : Pose
     cameras : two of Calibration
-        With the views' poses in each camera alone.
+        With the poses of the views in each camera alone.
     views : ViewPairs
 
     Returns
@@ -186,7 +179,7 @@ def poses_on_rig(rig: Pose, cameras: tuple[Calibration, Calibration], views: Vie
     problem = rig_problem(*cameras, views)
     start = problem.start(rig)
     free = np.zeros(Columns.of(start).n_shared, dtype=bool)
-    state = adjust_rig(problem.frames, problem.sightings, start, free).state
+    state = adjust_rig(problem.frames, problem.observations, start, free).state
     frames = problem.frames
     return {
         name: Pose(state.view_R[k], state.view_t[k] * frames.scale[k] - state.view_R[k] @ frames.centre[k])

@@ -1,12 +1,11 @@
-"""Which views of two cameras were taken together, and which points they share.
+"""Pairing of the views and the points of two cameras.
 
-Views pair by name. Equal names are a pair. Only where the cameras have no name in common do names pair
-that are equal without the word for the side: ``left``, ``l`` or ``cam0`` in the left camera's names,
-``right``, ``r`` or ``cam1`` in the right one's, in letters of any case, between anything but letters
-(``left01`` and ``right01``, ``IMG_L_07`` and ``IMG_R_07``, ``cam0-3`` and ``cam1-3``). Nothing ever pairs
-by its order.
+Views with equal names are a pair. If the cameras have no name in common, names are compared without the word
+for the side: ``left``, ``l`` or ``cam0`` in names of the left camera, ``right``, ``r`` or ``cam1`` in names
+of the right one. The word may have any case and must not be next to other letters (``left01`` and
+``right01``, ``IMG_L_07`` and ``IMG_R_07``, ``cam0-3`` and ``cam1-3``). The order of the views never matters.
 
-Within a pair of views, points pair by their ids or, where one of the files has none, by X, Y, Z.
+The points of a pair of views are paired by their ids or, if one of the files has none, by X, Y, Z.
 """
 
 from __future__ import annotations
@@ -29,18 +28,18 @@ _SIDES = (
     re.compile(r"(?<![a-z])(?:right|r(?![a-z])|cam(?:era)?[ _-]?1(?![0-9]))(?![a-z])", re.IGNORECASE),
 )
 _SHOWN = 5  # names in a message
-_FEW = 0.1  # share of the points at the same places below which it is chance
-_SAME_PLACE = 1e-6  # of the target's size: how far apart one point's X, Y, Z may be in two files
+_LEAST_COMMON = 0.1  # share of the points; fewer common X, Y, Z are a coincidence
+_SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z in two files, as a share of the target's size
 
 
 @dataclass(frozen=True)
 class ViewPairs:
-    """Names of the views.
+    """Names of paired and of single views.
 
     Attributes
     ----------
     both : tuple of (left name, right name)
-        In the left camera's order.
+        In the order of the left camera.
     left_only, right_only : tuple of str
     """
 
@@ -51,22 +50,19 @@ class ViewPairs:
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Points that both cameras saw.
+    """Points of both cameras.
 
     Attributes
     ----------
     left, right : (N,) int arrays
-        Rows in each camera's points.
+        Rows of each camera's points.
     view : (N,) int array
-        Pair of views of each, sorted.
-    n_unpaired : int
-        Points in paired views that only one camera has.
+        Number of the pair of views of each, sorted.
     """
 
     left: NDArray[np.intp]
     right: NDArray[np.intp]
     view: NDArray[np.intp]
-    n_unpaired: int
 
 
 def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
@@ -75,7 +71,7 @@ def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
     Raises
     ------
     InputError
-        No pair, names that would pair with several, or names that say the cameras are swapped.
+        No pair, ambiguous names, or names that show that the cameras are swapped.
     """
     if not set(left).isdisjoint(right):
         keys = dict(zip(left, left, strict=True)), dict(zip(right, right, strict=True))
@@ -97,7 +93,7 @@ def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
 
 
 def _keys(names: Sequence[str], side: re.Pattern[str]) -> dict[str, str]:
-    """Names by what is left of them without the side; names that do not say it are left out."""
+    """Names by their rest without the word for the side; names without such a word are left out."""
     keys: dict[str, str] = {}
     for name in names:
         key, found = side.subn("", name)
@@ -134,7 +130,7 @@ def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs)
     Raises
     ------
     InputError
-        Different units, no common point, ids that name different places, or several points at one place.
+        Different units, no common point, ids of different places, or several points at one place.
     """
     if left.unit != right.unit:
         raise InputError(
@@ -154,22 +150,20 @@ def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs)
     for points, row, key in zip((left, right), rows, keys, strict=True):
         _refuse_repeated(points, row, key, by_id)
     common, first, second = np.intersect1d(keys[0], keys[1], assume_unique=True, return_indices=True)
-    if not common.size or (not by_id and len(common) < _FEW * min(map(len, rows))):
+    if not common.size or (not by_id and len(common) < _LEAST_COMMON * min(map(len, rows))):
         what, few = "id" if by_id else "X, Y, Z", f"{len(common)} points" if common.size else "no point"
         raise InputError(
             f"{left.source} and {right.source}: the paired views have {few} in common, by {what}; measure "
             "the same target in both, in the same coordinates and unit"
         )
-    pairs = Pairs(
-        rows[0][first], rows[1][second], common // n_codes, len(rows[0]) + len(rows[1]) - 2 * len(common)
-    )
+    pairs = Pairs(rows[0][first], rows[1][second], common // n_codes)
     if by_id:
         _refuse_moved(left, right, pairs)
     return pairs
 
 
 def _in_pairs(points: Correspondences, names: list[str]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of paired views and the pair of each."""
+    """Rows of paired views, and the number of the pair of each."""
     place = {name: k for k, name in enumerate(names)}
     pair = np.array([place.get(name, -1) for name in points.view_names])[points.view_index]
     rows = np.flatnonzero(pair >= 0)
@@ -177,23 +171,23 @@ def _in_pairs(points: Correspondences, names: list[str]) -> tuple[NDArray[np.int
 
 
 def _codes(left: NDArray[np.str_], right: NDArray[np.str_]) -> list[NDArray[np.intp]]:
-    """A whole number for each label, the same for the same label."""
+    """An integer for each label, equal for equal labels."""
     _, inverse = np.unique(np.concatenate([left, right]), return_inverse=True)
     inverse = inverse.reshape(-1)
     return [inverse[: len(left)], inverse[len(left) :]]
 
 
 def _place_codes(left: Array, right: Array) -> list[NDArray[np.intp]]:
-    """A whole number for each place in the world, the same for places that differ by rounding only."""
+    """An integer for each place in the world, equal for places that differ by rounding only."""
     world = np.concatenate([left, right])
     size = float(np.ptp(world, axis=0).max(initial=0.0)) or 1.0
     codes = np.zeros(len(world), dtype=np.intp)
     for column in world.T:
         values = np.sort(column)
-        # A new value begins after every gap that is more than rounding.
+        # A new value begins after every gap larger than rounding.
         starts = values[np.concatenate([[True], np.diff(values) > _SAME_PLACE * size])]
         codes = codes * len(starts) + np.searchsorted(starts, column, side="right") - 1
-        codes = np.unique(codes, return_inverse=True)[1].reshape(-1)  # kept small: no product overflows
+        codes = np.unique(codes, return_inverse=True)[1].reshape(-1)  # small, so no product overflows
     return [codes[: len(left)], codes[len(left) :]]
 
 
@@ -213,7 +207,7 @@ def _refuse_repeated(
 
 
 def _refuse_moved(left: Correspondences, right: Correspondences, pairs: Pairs) -> None:
-    """Refuse ids that stand for another place in the other file."""
+    """Refuse ids of different places in the two files."""
     a, b = left.world[pairs.left], right.world[pairs.right]
     apart = np.abs(a - b).max(axis=1)
     size = max(float(np.ptp(a, axis=0).max()), float(np.ptp(b, axis=0).max()))

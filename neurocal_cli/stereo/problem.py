@@ -1,4 +1,4 @@
-"""Two calibrations as one problem: common frames for the views of both, normalised, with a start."""
+"""Two calibrations as one normalised problem, with common frames of the views and a start."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.pairing import ViewPairs
-from neurocal_cli.stereo.reprojection import Frames, RigState, Sightings
+from neurocal_cli.stereo.reprojection import Frames, Observations, RigState
 
 __all__ = ["RigProblem", "free_parameters", "rig_problem"]
 
-# Noise of one camera as a share of the other's, and in normalised pixels, that is taken for real:
-# below, it is rounding in data without noise.
+# Smaller noise, as a share of the other camera's and in normalised pixels, is rounding in data without noise;
+# test_without_noise_the_truth_comes_back repeats it.
 _LEAST_SHARE = 1e-3
 _LEAST_NOISE = 1e-12
-# Names of what each entry A11, A12, A22, A13, A23 moves.
+# Parameters that the entries A11, A12, A22, A13, A23 determine.
 _ENTRY_NAMES = ("alpha_u", "theta", "alpha_v", "u0", "v0")
 
 
 @dataclass(frozen=True, eq=False)
 class RigProblem:
-    """What the cameras saw, in common frames, and where each camera alone put the views.
+    """Observations of both cameras in common frames, and the poses in each camera alone.
 
     Attributes
     ----------
     names : two tuples of str
-        Each camera's views, in its sightings' order.
+        Views of each camera, in the order of its observations.
     frames : Frames
-        Those of the left camera's views, in their order, then those of views that only the right one saw.
-    sightings : two of Sightings
+        Of the left camera's views, in their order, then of the views of the right camera alone.
+    observations : two of Observations
     cameras : two of CameraState
-        As calibrated alone, with the poses of its views.
+        As calibrated alone, with the poses of the views.
     own_cost : two (V_c,) arrays
         Whitened squared residuals of each view in its camera alone.
     paired : (P,) int array
-        Frames that both cameras saw.
+        Frames of both cameras.
     paired_right : (P,) int array
-        Their places among the right camera's views.
+        Their indices among the right camera's views.
     spread : (P, 5, 3) array
-        Of each paired target, in local coordinates: its centre, and one rms extent to both sides along
-        its longest two axes.
+        Of each paired target, in local coordinates: its centre, and points one rms extent from it in both
+        directions along its two longest axes.
     axes : (P, 3, 3) array
-        The target's principal axes, longest first, as columns.
+        Principal axes of the target as columns, the longest first.
     flat : (P,) bool array
     """
 
     names: tuple[tuple[str, ...], tuple[str, ...]]
     frames: Frames
-    sightings: tuple[Sightings, Sightings]
+    observations: tuple[Observations, Observations]
     cameras: tuple[CameraState, CameraState]
     own_cost: tuple[Array, Array]
     paired: NDArray[np.intp]
@@ -67,22 +67,28 @@ class RigProblem:
     axes: Array
     flat: NDArray[np.bool_]
 
+    @property
+    def pairs(self) -> list[tuple[str, str]]:
+        """Left and right names of the paired views."""
+        left, right = self.names
+        return [(left[a], right[b]) for a, b in zip(self.paired, self.paired_right, strict=True)]
+
     def start(self, rig: Pose) -> RigState:
-        """The cameras as calibrated, with the left one's poses, and the right one's where it is alone."""
+        """The calibrated cameras with the left one's poses, and the right one's for its single views."""
         left, right = self.cameras
         R = np.concatenate([left.R, np.zeros((len(self.frames.scale) - len(left.R), 3, 3))])
         t = np.concatenate([left.t, np.zeros((len(R) - len(left.t), 3))])
-        alone = np.flatnonzero(~self.frames.through_rig[self.sightings[1].view])
-        frame = self.sightings[1].view[alone]
+        alone = np.flatnonzero(~self.frames.in_both[self.observations[1].view])
+        frame = self.observations[1].view[alone]
         R[frame], t[frame] = right.R[alone], right.t[alone]
         return RigState(self.cameras, rig.R.copy(), rig.t / self.frames.unit, R, t)
 
 
 def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) which of A's entries and the lens's coefficients points may change.
+    """(5 + K,) which of A's entries and the distortion coefficients are free.
 
-    Not those that were given, and none of a camera whose lens is from straight lines: the two belong
-    together.
+    Given parameters are not. With a distortion from straight lines none is, as camera and distortion
+    belong together.
     """
     names = (*_ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
     held = calibration.straight_lines is not None
@@ -90,8 +96,9 @@ def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
 
 
 def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigProblem:
-    """Bring two calibrations of one world unit together."""
-    arranged = _arranged(left), _arranged(right)
+    """Combine two calibrations with one world unit."""
+    # Covariances of the points count as far as the residuals confirm them.
+    arranged = [weighed(camera.points, evaluate_camera(camera).residuals) for camera in (left, right)]
     names = arranged[0].names, arranged[1].names
     place = {b: names[0].index(a) for a, b in views.both}
     n_left = len(names[0])
@@ -113,30 +120,25 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
         )
     ]
     noise = [max(side[3], _LEAST_NOISE) for side in sides]
-    real = [seen.pixel_scale * s for (seen, *_), s in zip(sides, noise, strict=True)]
-    sightings, costs = [], []
-    for (seen, _, cost, _), s, own in zip(sides, noise, real, strict=True):
+    real = [observed.pixel_scale * s for (observed, *_), s in zip(sides, noise, strict=True)]
+    observations, costs = [], []
+    for (observed, _, cost, _), s, own in zip(sides, noise, real, strict=True):
         weight = 1.0 / (s * max(1.0, _LEAST_SHARE * max(real) / own)) ** 2
-        sightings.append(replace(seen, weight=weight))
+        observations.append(replace(observed, weight=weight))
         costs.append(weight * cost)
     paired_right = np.flatnonzero(through[frame] & (frame < n_left))
     paired = frame[paired_right]
     return RigProblem(
-        names, frames, (sightings[0], sightings[1]), (sides[0][1], sides[1][1]), (costs[0], costs[1]),
+        names, frames, (observations[0], observations[1]), (sides[0][1], sides[1][1]), (costs[0], costs[1]),
         paired, paired_right, _spread(arranged[0], paired), arranged[0].basis[paired],
         arranged[0].nearly_flat[paired],
     )  # fmt: skip
 
 
-def _arranged(calibration: Calibration) -> Views:
-    """A camera's points, their covariances as far as its residuals bear them out."""
-    return weighed(calibration.points, evaluate_camera(calibration).residuals)
-
-
 def _side(
     calibration: Calibration, views: Views, frames: Frames, frame: NDArray[np.intp]
-) -> tuple[Sightings, CameraState, Array, float]:
-    """One camera's sightings (without weight), its own state, squares by view and noise, normalised."""
+) -> tuple[Observations, CameraState, Array, float]:
+    """Normalised observations of one camera (without weight), its state, cost by view and noise."""
     centre, scale = frames.centre[frame], frames.scale[frame]
     local = views.local * np.repeat(views.scale / scale, views.counts)[:, None]
     local += np.repeat((views.centre - centre) / scale[:, None], views.counts, axis=0)
@@ -155,10 +157,10 @@ def _side(
     cost = normal_blocks(batches, state)[0][:, -1, -1]
     spare = views.n_equations - int(free_parameters(calibration).sum()) - 6 * views.n_views
     noise = float(np.sqrt(cost.sum() / max(spare, 1)))
-    seen = Sightings(
+    observed = Observations(
         batches, frame, views.pixel_centre, views.pixel_scale, 1.0, len(views.index), views.n_equations
     )
-    return seen, state, cost, noise
+    return observed, state, cost, noise
 
 
 def _spread(views: Views, which: NDArray[np.intp]) -> Array:

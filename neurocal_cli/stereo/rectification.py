@@ -1,8 +1,8 @@
 """Rectification: two virtual cameras, side by side, whose rows (or columns) correspond.
 
-The meaning of R1, R2, P1, P2 and Q, and which of the possible pairs is taken, are those of OpenCV's
-``stereoRectify`` with zero disparity at infinity: each camera is turned by half of the rig's rotation, then
-both together so that the baseline lies along the longer of its axes (Bouguet).
+R1, R2, P1, P2 and Q are those of OpenCV's ``stereoRectify`` (Bouguet), with zero disparity at infinity. Each
+camera is turned by half of the rig's rotation. Both are then turned together until the baseline is
+parallel to an axis, the one along its longer component.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from neurocal_cli.stereo.rig import Rig
 
 __all__ = ["Rectification", "rectify"]
 
-_GRID = 9  # points along each side of the image at which the rectified image's shape is looked at
+_GRID = 9  # samples along each side of the image, as in OpenCV
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,8 @@ def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
     ----------
     rig : Rig
     alpha : float, optional
-        0: the rectified images are scaled so that all their pixels have been seen; 1: so that all pixels
-        that were seen are in them; between: between; None: not scaled.
+        Scale of the rectified images. 0: all their pixels are valid. 1: they contain all pixels of the
+        original images. Values in between interpolate; None does not scale.
 
     Returns
     -------
@@ -93,8 +93,8 @@ def _shortest_turn(a: Array, b: Array) -> Array:
     return np.asarray(np.eye(3) + K + K @ K / (1.0 + a @ b))
 
 
-def _seen(camera: Calibration, R: Array, pixels: Array) -> Array:
-    """Normalised rectified points of pixels, (N, 2); nan where no ray belongs to a pixel."""
+def _rectified(camera: Calibration, R: Array, pixels: Array) -> Array:
+    """Normalised rectified points of pixels, (N, 2); nan where the distortion does not reach a pixel."""
     x, y = camera.camera.normalised_points(*pixels.T)
     rays = np.column_stack([x, y, np.ones_like(x)]) @ R.T
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -102,11 +102,11 @@ def _seen(camera: Calibration, R: Array, pixels: Array) -> Array:
 
 
 def _centre(camera: Calibration, R: Array, f: float, size: tuple[int, int]) -> Array:
-    """Principal point that puts the image's corners around the middle of the rectified image."""
+    """Principal point that centres the image's corners in the rectified image."""
     last = np.array(size, dtype=float) - 1
-    corners = _seen(camera, R, np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * last)
-    if not np.isfinite(corners).all():  # a lens that sees no straight line there: the sides' middles do
-        corners = _seen(camera, R, np.array([[0.5, 0], [0.5, 1], [0, 0.5], [1, 0.5]]) * last)
+    corners = _rectified(camera, R, np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * last)
+    if not np.isfinite(corners).all():  # beyond the distortion: the middles of the sides
+        corners = _rectified(camera, R, np.array([[0.5, 0], [0.5, 1], [0, 0.5], [1, 0.5]]) * last)
     middle = corners.mean(axis=0) if np.isfinite(corners).all() else np.zeros(2)
     return np.asarray(0.5 * last - f * middle)
 
@@ -114,21 +114,23 @@ def _centre(camera: Calibration, R: Array, f: float, size: tuple[int, int]) -> A
 def _scale(
     cameras: list[tuple[Calibration, Array]], f: float, centre: Array, size: tuple[int, int], alpha: float
 ) -> float:
-    """By how much the focal length is to be multiplied."""
+    """Factor of the focal length."""
     grid = np.linspace(0.0, 1.0, _GRID)
     last = np.array(size, dtype=float) - 1
     room = np.array([centre, last - centre])  # to the left and top, to the right and bottom
     fill, hold = [], []
     for camera, R in cameras:
         u, v = np.meshgrid(grid, grid)
-        seen = f * _seen(camera, R, np.column_stack([u.ravel(), v.ravel()]) * last).reshape(_GRID, _GRID, 2)
+        image = f * _rectified(camera, R, np.column_stack([u.ravel(), v.ravel()]) * last).reshape(
+            _GRID, _GRID, 2
+        )
         inner = np.array(
             [
-                [np.nanmax(seen[:, 0, 0]), np.nanmax(seen[0, :, 1])],
-                [np.nanmin(seen[:, -1, 0]), np.nanmin(seen[-1, :, 1])],
+                [np.nanmax(image[:, 0, 0]), np.nanmax(image[0, :, 1])],
+                [np.nanmin(image[:, -1, 0]), np.nanmin(image[-1, :, 1])],
             ]
         )
-        outer = np.array([np.nanmin(seen, axis=(0, 1)), np.nanmax(seen, axis=(0, 1))])
+        outer = np.array([np.nanmin(image, axis=(0, 1)), np.nanmax(image, axis=(0, 1))])
         signs = np.array([[-1.0], [1.0]])
         fill.append((room / (signs * inner)).max())
         hold.append((room / (signs * outer)).min())

@@ -1,4 +1,4 @@
-"""Results for two cameras as tables and as JSON."""
+"""Reports of rigs and their evaluations as text, tables and JSON."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
-from neurocal_cli.report import align, rounded
+from neurocal_cli.report import align, number_or_none, plural, printable, rounded
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError
@@ -21,7 +21,7 @@ __all__ = [
     "views_alone",
 ]
 
-_NAMED = 10  # views in a remark
+_NAMED = 10  # views named in a remark
 _MOST_VIEWS = 20  # rows of a table that still fit on a screen
 _ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
 
@@ -32,13 +32,13 @@ def stereo_evaluation_report(evaluation: StereoEvaluation) -> str:
 
 
 def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[str]], ...]:
-    """Rows, the heading first, of the tables of all points, of the depths and of the views."""
+    """Rows of the tables of all points, of the depths and of the views, each with its heading."""
     unit = evaluation.unit
     ways, heads = [evaluation.by_view], ["poses of each view"]
     if evaluation.rig is not None and math.isclose(
         evaluation.rig.rmse, evaluation.by_view.rmse, rel_tol=1e-4
     ):
-        ways, heads = [evaluation.rig], ["one rig"]  # a rig's views, or a single one: both ways are one
+        ways, heads = [evaluation.rig], ["one rig"]  # both are equal for a rig or a single view
     elif evaluation.rig is not None:
         ways, heads = [*ways, evaluation.rig], [*heads, "one rig"]
     overall = [[f"[{unit}]", *heads]]
@@ -65,16 +65,16 @@ def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[st
     for name, (count, _) in ways[0].views.items():
         label = name if right_names[name] == name else f"{name} / {right_names[name]}"
         errors = [_figure(way.views.get(name, (0, math.nan))[1]) for way in ways]
-        views.append([_shown(label), str(count), *errors])
+        views.append([printable(label), str(count), *errors])
     return (overall, depths, views) if len(views) > 2 else (overall, depths)
 
 
 def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
-    """Turn an evaluation into values that JSON can hold; a number that does not exist is None."""
+    """An evaluation as JSON values; None for numbers that do not exist."""
     return {
         **_error_json(evaluation.by_view),
         "unit": evaluation.unit,
-        "baseline": _number(evaluation.baseline),
+        "baseline": number_or_none(evaluation.baseline),
         "pairs": [list(pair) for pair in evaluation.pairs],
         "fitted_views": list(evaluation.fitted),
         "rig": None if evaluation.rig is None else _error_json(evaluation.rig),
@@ -85,8 +85,8 @@ def _error_json(error: SpaceError) -> dict[str, Any]:
     return {
         "n_points": error.n_points,
         "n_behind": error.n_behind,
-        **{name: _number(getattr(error, name)) for name in _ERRORS},
-        "views": {name: _number(rmse) for name, (_, rmse) in error.views.items()},
+        **{name: number_or_none(getattr(error, name)) for name in _ERRORS},
+        "views": {name: number_or_none(rmse) for name, (_, rmse) in error.views.items()},
         "depths": [
             {
                 "from": part.nearest,
@@ -98,10 +98,6 @@ def _error_json(error: SpaceError) -> dict[str, Any]:
             for part in error.depths
         ],
     }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _figure(value: float) -> str:
@@ -117,22 +113,17 @@ def _share(value: float) -> str:
     return f"{100 * value:.2g} %" if math.isfinite(value) else "-"
 
 
-def _shown(name: str) -> str:
-    """Show a name on one line, whatever characters a file put in it."""
-    return name if name.isprintable() else ascii(name)[1:-1]
-
-
 def rig_report(rig: Rig) -> str:
-    """Summary of a calibrated rig: both cameras, the rig, the fit. Warnings are not in it."""
+    """Summary of a calibrated rig: both cameras, the rig and the fit, without the warnings."""
     blocks = [[_headline(rig)], align(_camera_rows(rig)), align(_rig_rows(rig)), _view_lines(rig)]
     blocks.append(_fit_lines(rig))
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
 def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
-    """Remarks that name the views which one camera alone saw."""
+    """Remarks that name the views of one camera alone."""
     return [
-        f"only the {side} camera saw {', '.join(map(_shown, names[:_NAMED]))}"
+        f"only the {side} camera saw {', '.join(map(printable, names[:_NAMED]))}"
         + (f" and {len(names) - _NAMED} more views" if len(names) > _NAMED else "")
         for side, names in zip(("left", "right"), alone, strict=True)
         if names
@@ -140,27 +131,25 @@ def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:
 
 
 def _headline(rig: Rig) -> str:
-    parts = [f"rig: {_counted(len(rig.pairs), 'pair')} of views"]
+    parts = [f"rig: {plural(len(rig.pairs), 'pair')} of views"]
     for name, camera in (("left", rig.left), ("right", rig.right)):
-        parts.append(
-            f"{name} {_counted(len(camera.points), 'point')} in {_counted(len(camera.views), 'view')}"
-        )
+        parts.append(f"{name} {plural(len(camera.points), 'point')} in {plural(len(camera.views), 'view')}")
     return ", ".join(parts)
-
-
-def _counted(count: int, noun: str) -> str:
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def _camera_rows(rig: Rig) -> list[list[str]]:
     """Both cameras' parameters side by side."""
     rows = [["parameter", "left", "std", "right", "std"]]
-    lenses = [coefficient_names(camera.distortion_model) for camera in (rig.left, rig.right)]
-    longest = max(lenses, key=len)
-    for name in (*INTRINSIC_NAMES, *longest, *(n for names in lenses for n in names if n not in longest)):
+    models = [coefficient_names(camera.distortion_model) for camera in (rig.left, rig.right)]
+    longest = max(models, key=len)
+    for name in (
+        *INTRINSIC_NAMES,
+        *longest,
+        *(n for names in models for n in names if n not in longest),
+    ):
         unit = {"theta": " [rad]"}.get(name, " [px]" if name in INTRINSIC_NAMES else "")
         row = [name + unit]
-        for camera, names in zip((rig.left, rig.right), lenses, strict=True):
+        for camera, names in zip((rig.left, rig.right), models, strict=True):
             if name in INTRINSIC_NAMES:
                 row += _estimate(float(getattr(camera.intrinsics, name)), name, camera)
             elif name in names:
@@ -178,21 +167,21 @@ def _estimate(value: float, name: str, camera: Calibration) -> list[str]:
 def _rig_rows(rig: Rig) -> list[list[str]]:
     rows = [["X_right = R X_left + t", "value", "std"]]
     for name, value in zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True):
-        unit = "rad" if name.startswith("R") else _shown(rig.unit)
+        unit = "rad" if name.startswith("R") else printable(rig.unit)
         rows.append([f"{name} [{unit}]", *rounded(value, rig.std[name])])
-    rows.append([f"baseline [{_shown(rig.unit)}]", *rounded(rig.baseline, rig.std["baseline"])])
+    rows.append([f"baseline [{printable(rig.unit)}]", *rounded(rig.baseline, rig.std["baseline"])])
     return rows
 
 
 def _view_lines(rig: Rig) -> list[str]:
-    """Both cameras' error in each pair of views, the worst ones when there are many."""
+    """Errors of both cameras in each pair of views, or in the worst ones if there are many."""
     if len(rig.pairs) == 1:
         return []
     rows = []
     for a, b in rig.pairs:
         left, right = rig.left.views[a], rig.right.views[b]
         errors = left.rmse_px, right.rmse_px
-        label = _shown(a if a == b else f"{a} / {b}")
+        label = printable(a if a == b else f"{a} / {b}")
         rows.append((max(errors), [label, str(left.n_points), *map(_figure, errors[:1]),
                                    str(right.n_points), _figure(errors[1])]))  # fmt: skip
     hidden = len(rows) - _MOST_VIEWS
@@ -212,9 +201,9 @@ def _fit_lines(rig: Rig) -> list[str]:
         record = camera.network
         if record is not None:
             lines.append(
-                f"{name}: {_counted(record.starts, 'random start')} for {_counted(len(record.V), 'view')}, "
+                f"{name}: {plural(record.starts, 'random start')} for {plural(len(record.V), 'view')}, "
                 f"at least {record.agreed} agreed in each view; rms {_figure(camera.rmse_px)} px"
             )
     lines.append(f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
-                 f"{_counted(rig.iterations, 'iteration')}")  # fmt: skip
+                 f"{plural(rig.iterations, 'iteration')}")  # fmt: skip
     return [*lines, rig.stop_reason]

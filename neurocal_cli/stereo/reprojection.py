@@ -1,9 +1,9 @@
-"""The pixel error (3) of two cameras on one rig: derivatives and normal matrices of both at once.
+"""The reprojection error (3) of two cameras on one rig: derivatives and normal matrices.
 
-A view that both cameras saw has one pose, in the left camera's frame; the right camera's follows
-through the rig, R'_k = R R_k and t'_k = R t_k + t. A view that only one camera saw has that camera's
-pose and tells nothing of the rig, but as much of its camera as it ever did. Each camera's derivatives
-are those of `neurocal_cli.bundle_adjustment.reprojection`; the right camera's are led through the rig:
+A view of both cameras has one pose, in the left camera's frame. Its pose in the right camera is R'_k = R R_k
+and t'_k = R t_k + t. A view of one camera alone has the pose in that camera and does not determine the rig.
+The derivatives of each camera are those of `neurocal_cli.bundle_adjustment.reprojection`. Those of the right
+camera are transformed by the chain rule:
 
     R -> exp(w) R,  t -> t + tau,  R_k -> exp(w_k) R_k,  t_k -> t_k + tau_k   give
     w' = w + R w_k,  tau' = w x (R t_k) + R tau_k + tau
@@ -21,48 +21,48 @@ from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
 
-__all__ = ["Columns", "Frames", "RigState", "Sightings", "rig_normal_blocks", "through_rig"]
+__all__ = ["Columns", "Frames", "Observations", "RigState", "rig_jacobian", "rig_normal_blocks"]
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """The views of both cameras, each with one normalised frame for its target.
+    """The views of both cameras, each with a normalised frame of its target.
 
     Attributes
     ----------
     centre : (V, 3) array
     scale : (V,) array
         World = centre + scale * local.
-    through_rig : (V,) bool array
-        Whether both cameras saw the view.
+    in_both : (V,) bool array
+        Whether the view is of both cameras.
     unit : float
-        Of the rig's translation [world unit].
+        Unit of the rig's translation [world unit].
     """
 
     centre: Array
     scale: Array
-    through_rig: NDArray[np.bool_]
+    in_both: NDArray[np.bool_]
     unit: float
 
 
 @dataclass(frozen=True, eq=False)
-class Sightings:
-    """What one camera saw.
+class Observations:
+    """Observations of one camera.
 
     Attributes
     ----------
     batches : PointBatches
-        Of its own views, in the frames' local coordinates, its own normalised pixels.
+        Its views in local coordinates of the frames, with normalised pixels.
     view : (V_c,) int array
-        Place of each of its views among the frames.
+        Frame of each of its views.
     pixel_centre : (2,) array
     pixel_scale : float
         S1 [px].
     weight : float
-        Of a squared normalised residual: whitened pixels, (pixel_scale / sigma)^2.
+        Of a squared normalised residual, (pixel_scale / sigma)^2, so that residuals are whitened.
     n_points : int
     n_equations : float
-        Two of most points; see `directions`.
+        Two for most points; see `measured_directions`.
     """
 
     batches: PointBatches
@@ -81,12 +81,12 @@ class RigState:
     Attributes
     ----------
     cameras : two of CameraState
-        Of which entries and lens count; their poses follow from the rest.
+        Only their entries and distortion are used; the poses are those below.
     R, t : (3, 3), (3,) arrays
         The rig, X_right = R X_left + t, t in `Frames.unit`.
     view_R, view_t : (V, 3, 3), (V, 3) arrays
-        Of each frame's local coordinates: Xc / scale = R local + t, in the left camera's frame, or in
-        the right camera's for views that it alone saw.
+        Of each frame's local coordinates, Xc / scale = R local + t, in the left camera's frame, or in the
+        right camera's for its single views.
     """
 
     cameras: tuple[CameraState, CameraState]
@@ -114,16 +114,16 @@ class RigState:
             self.view_t + own[:, 3:],
         )
 
-    def settled(self) -> RigState:
-        """The same, rounding taken off the rotations."""
+    def orthonormalised(self) -> RigState:
+        """The same with rotations that are orthonormal in spite of rounding."""
         return replace(self, R=orthonormalised(self.R), view_R=orthonormalised(self.view_R))
 
-    def seen_by(self, side: int, frames: Frames, sightings: Sightings) -> CameraState:
+    def camera_with_poses(self, side: int, frames: Frames, observations: Observations) -> CameraState:
         """One camera with the poses of its own views."""
-        view = sightings.view
+        view = observations.view
         R, t = self.view_R[view], self.view_t[view]
         if side == 1:
-            through = frames.through_rig[view][:, None]
+            through = frames.in_both[view][:, None]
             baseline = self.t * (frames.unit / frames.scale[view])[:, None]
             R, t = (
                 np.where(through[..., None], self.R @ R, R),
@@ -134,12 +134,12 @@ class RigState:
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """Places of the unknowns among the columns of the normal matrices.
+    """Columns of the unknowns in the normal matrices.
 
     Attributes
     ----------
     left, right : (5 + K,) int arrays
-        Entries of A and coefficients of the lens of each camera.
+        Entries of A and distortion coefficients of each camera.
     rig, pose : (6,) int arrays
         w and tau.
     """
@@ -151,7 +151,7 @@ class Columns:
 
     @classmethod
     def of(cls, state: RigState) -> Columns:
-        """Lay out the columns for two cameras' lenses."""
+        """Columns for the distortion models of a state."""
         ends = np.cumsum([0, *(5 + len(camera.k) for camera in state.cameras), 6, 6])
         return cls(*(np.arange(a, b) for a, b in pairwise(ends.tolist())))
 
@@ -167,42 +167,44 @@ class Columns:
 
 
 def rig_normal_blocks(
-    frames: Frames, sightings: tuple[Sightings, Sightings], state: RigState, columns: Columns
+    frames: Frames, observations: tuple[Observations, Observations], state: RigState, columns: Columns
 ) -> tuple[Array, bool]:
-    """Products of derivatives and residuals summed over each view's points in both cameras.
+    """Products of derivatives and residuals, summed over the points of each view in both cameras.
 
     Returns
     -------
     normal : (V, D, D) array
-        In the columns' order, whitened: squared residuals of variance 1.
+        In the order of the columns, for residuals of variance 1.
     sensible : bool
-        Whether all points are in front of their cameras and no lens folds any of them back.
+        Whether all points are in front of their cameras and the distortions are monotonic there.
     """
     normal = np.zeros((len(frames.scale), columns.width, columns.width))
     sensible = True
-    for side, seen in enumerate(sightings):
-        camera = state.seen_by(side, frames, seen)
-        blocks, fine = normal_blocks(seen.batches, camera)
-        T = through_rig(frames, seen, state, columns, side)
-        normal[seen.view] += seen.weight * (np.swapaxes(T, 1, 2) @ blocks @ T)
+    for side, observed in enumerate(observations):
+        camera = state.camera_with_poses(side, frames, observed)
+        blocks, fine = normal_blocks(observed.batches, camera)
+        T = rig_jacobian(frames, observed, state, columns, side)
+        normal[observed.view] += observed.weight * (np.swapaxes(T, 1, 2) @ blocks @ T)
         sensible = sensible and bool(fine.all())
     return normal, sensible
 
 
-def through_rig(frames: Frames, seen: Sightings, state: RigState, columns: Columns, side: int) -> Array:
-    """Derivatives of one camera's own columns by the rig's columns, (V_c, 12 + K, D)."""
+def rig_jacobian(
+    frames: Frames, observed: Observations, state: RigState, columns: Columns, side: int
+) -> Array:
+    """Derivatives of the columns of one camera by the columns of the rig, (V_c, 12 + K, D)."""
     place = (columns.left, columns.right)[side]
     own = camera_columns(len(place) - 5)
-    T = np.zeros((len(seen.view), len(own) + 7, columns.width))
+    T = np.zeros((len(observed.view), len(own) + 7, columns.width))
     T[:, own, place] = 1.0
     T[:, -1, -1] = 1.0
     pose = np.arange(POSE.start, POSE.stop)
-    through = frames.through_rig[seen.view] if side == 1 else np.zeros(len(seen.view), dtype=bool)
+    through = frames.in_both[observed.view] if side == 1 else np.zeros(len(observed.view), dtype=bool)
     alone = np.flatnonzero(~through)
     T[alone[:, None], pose, columns.pose] = 1.0
     which = np.flatnonzero(through)
     if which.size:
-        view = seen.view[which]
+        view = observed.view[which]
         by_rig, by_pose = np.zeros((len(which), 6, 6)), np.zeros((6, 6))
         by_rig[:, :3, :3] = np.eye(3)
         by_rig[:, 3:, :3] = -cross_matrix(state.view_t[view] @ state.R.T)

@@ -1,4 +1,4 @@
-"""From the adjusted, normalised rig to a `Rig` in pixels and world units, with its covariance."""
+"""Assembly of a `Rig` in pixels and world units from the adjusted, normalised one, with its covariance."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, euler_jacobian
-from neurocal_cli.least_squares.schur_complement import SchurCovariance, schur_covariance
+from neurocal_cli.least_squares.schur_complement import schur_covariance
 from neurocal_cli.stereo.adjust import AdjustedRig
 from neurocal_cli.stereo.problem import RigProblem
-from neurocal_cli.stereo.reprojection import Columns, Sightings, through_rig
+from neurocal_cli.stereo.reprojection import Columns, Observations, rig_jacobian
 from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["assemble_rig", "folding_sides"]
+__all__ = ["assemble_rig", "non_monotonic_sides"]
 
-_SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which rounding rules
+_SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal is rounding
 
 
 def assemble_rig(
@@ -41,31 +41,31 @@ def assemble_rig(
     free: NDArray[np.bool_],
     left_out: Mapping[tuple[str, str], str],
 ) -> Rig:
-    """Put a adjusted rig into the user's units.
+    """Convert an adjusted rig to the user's units.
 
     Raises
     ------
     DegenerateGeometryError
-        The points leave the answer open.
+        The points do not determine the parameters.
     """
     return _RigAssembly(problem, calibrations, adjusted, free).rig(left_out)
 
 
-def folding_sides(
+def non_monotonic_sides(
     problem: RigProblem,
     calibrations: tuple[Calibration, Calibration],
     adjusted: AdjustedRig,
     free: NDArray[np.bool_],
 ) -> list[int]:
-    """Cameras whose lens, as the common refinement has it, folds back inside the image."""
+    """Cameras whose distortion is not monotonic inside the image after the common bundle adjustment."""
     columns, shared = Columns.of(adjusted.state), np.flatnonzero(free)
     found = []
     for side, own in enumerate((columns.left, columns.right)):
-        camera, seen, given = adjusted.state.cameras[side], problem.sightings[side], calibrations[side]
+        camera, observed, given = adjusted.state.cameras[side], problem.observations[side], calibrations[side]
         estimated = np.isin(own, shared)
         if not estimated.any():
             continue
-        A = _intrinsics(given, camera, seen, estimated[:5]).A if estimated[:5].any() else given.K
+        A = _intrinsics(given, camera, observed, estimated[:5]).A if estimated[:5].any() else given.K
         if where_not_monotonic(camera.distortion, A, given.points) is not None:
             found.append(side)
     return found
@@ -89,20 +89,25 @@ class _RigAssembly:
                 "spread them in depth, or give known parameters (--no-skew, --left-intrinsics, "
                 "--right-intrinsics)"
             )
-        n_equations = sum(seen.n_equations for seen in problem.sightings)
+        n_equations = sum(observed.n_equations for observed in problem.observations)
         unknowns = len(self.shared) + 6 * len(problem.frames.scale)
         variance = adjusted.cost / max(n_equations - unknowns, 1)
-        self.covariance = _scaled(inverse, variance)
+        self.covariance = replace(
+            inverse,
+            shared=variance * inverse.shared,
+            own=variance * inverse.own,
+            cross=variance * inverse.cross,
+        )
 
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
         state, frames = self.adjusted.state, self.problem.frames
         errors = [
-            _squared_errors(seen, state.seen_by(side, frames, seen))
-            for side, seen in enumerate(self.problem.sightings)
+            _squared_errors(observed, state.camera_with_poses(side, frames, observed))
+            for side, observed in enumerate(self.problem.observations)
         ]
         sums = [
-            seen.batches.sum_by_view(e.sum(axis=1))
-            for seen, e in zip(self.problem.sightings, errors, strict=True)
+            observed.batches.sum_by_view(e.sum(axis=1))
+            for observed, e in zip(self.problem.observations, errors, strict=True)
         ]
         reason = self._stop_reason()
         left, right = (
@@ -110,19 +115,14 @@ class _RigAssembly:
         )
         pose = Pose(state.R, state.t * frames.unit)
         block, std = self._rig_covariance(pose)
-        n_points = sum(seen.n_points for seen in self.problem.sightings)
+        n_points = sum(observed.n_points for observed in self.problem.observations)
         return Rig(
             left,
             right,
             pose,
             std,
             block,
-            tuple(
-                (self.problem.names[0][a], self.problem.names[1][b])
-                for a, b in sorted(
-                    zip(self.problem.paired.tolist(), self.problem.paired_right.tolist(), strict=True)
-                )
-            ),
+            tuple(self.problem.pairs[k] for k in np.argsort(self.problem.paired)),
             dict(left_out),
             rmse_px=float(np.sqrt(sum(s.sum() for s in sums) / n_points)),
             max_px=float(np.sqrt(max(e.max() for e in errors))),
@@ -138,7 +138,7 @@ class _RigAssembly:
         return (StopReason.CONVERGED if self.adjusted.converged else StopReason.MAX_ITERATIONS).value
 
     def _rig_covariance(self, pose: Pose) -> tuple[Array, dict[str, float]]:
-        """Covariance of the rig's angles and translation, and their std with the baseline's."""
+        """Covariance of the rig's angles and translation, and standard deviations, also of the baseline."""
         J = np.zeros((7, 6))
         J[:3, :3] = euler_jacobian(pose.R)
         J[3:6, 3:] = np.eye(3) * self.problem.frames.unit
@@ -149,7 +149,7 @@ class _RigAssembly:
         return block[:6, :6], dict(zip((*POSE_NAMES, "baseline"), std, strict=True))
 
     def _shared_block(self, columns: NDArray[np.intp]) -> Array:
-        """Covariance of some of the shared unknowns, 0 for those that were given."""
+        """Covariance of some of the shared parameters, 0 for given ones."""
         place = {int(column): k for k, column in enumerate(self.shared)}
         known = [k for k, column in enumerate(columns.tolist()) if column in place]
         block = np.zeros((len(columns), len(columns)))
@@ -158,28 +158,28 @@ class _RigAssembly:
         return block
 
     def _calibration(self, side: int, squares: Array, largest: float, reason: str) -> Calibration:
-        """One camera, as it is after the common refinement."""
-        given, seen = self.calibrations[side], self.problem.sightings[side]
+        """One camera after the common bundle adjustment."""
+        given, observed = self.calibrations[side], self.problem.observations[side]
         camera = self.adjusted.state.cameras[side]
         columns = (self.columns.left, self.columns.right)[side]
         estimated = np.isin(columns, self.shared)
         intrinsics = given.intrinsics
         if estimated[:5].any():
-            intrinsics = _intrinsics(given, camera, seen, estimated[:5])
+            intrinsics = _intrinsics(given, camera, observed, estimated[:5])
         changes: dict[str, Any] = {}
         if estimated.any():
-            changes = self._intrinsic_changes(given, intrinsics, camera, seen, columns)
-        rms = np.sqrt(squares / seen.batches.counts)
+            changes = self._intrinsic_changes(given, intrinsics, camera, observed, columns)
+        rms = np.sqrt(squares / observed.batches.counts)
         R, t = self._world_poses(side)
         stds = self._pose_stds(side, R)
         R.setflags(write=False)
         t.setflags(write=False)
         views = {
             name: ViewResult(Pose.exact(R[k], t[k]), dict(zip(POSE_NAMES, stds[k].tolist(), strict=True)),
-                             int(seen.batches.counts[k]), float(rms[k]))
+                             int(observed.batches.counts[k]), float(rms[k]))
             for k, name in enumerate(self.problem.names[side])
         }  # fmt: skip
-        rmse = float(np.sqrt(squares.sum() / seen.n_points))
+        rmse = float(np.sqrt(squares.sum() / observed.n_points))
         return replace(
             given,
             views=views,
@@ -197,11 +197,11 @@ class _RigAssembly:
         given: Calibration,
         intrinsics: Intrinsics,
         camera: CameraState,
-        seen: Sightings,
+        observed: Observations,
         columns: NDArray[np.intp],
     ) -> dict[str, Any]:
         block, std = parameter_covariance(
-            intrinsics, camera.model, self._shared_block(columns), seen.pixel_scale, given.fixed
+            intrinsics, camera.model, self._shared_block(columns), observed.pixel_scale, given.fixed
         )
         names = list(std)
         free = [k for k, name in enumerate(names) if name not in given.fixed]
@@ -221,41 +221,35 @@ class _RigAssembly:
         }
 
     def _world_poses(self, side: int) -> tuple[Array, Array]:
-        """Each view's pose in its camera, in world units."""
-        frames, seen = self.problem.frames, self.problem.sightings[side]
-        state = self.adjusted.state.seen_by(side, frames, seen)
-        scale, centre = frames.scale[seen.view][:, None], frames.centre[seen.view]
+        """Poses of the views in their camera, in world units."""
+        frames, observed = self.problem.frames, self.problem.observations[side]
+        state = self.adjusted.state.camera_with_poses(side, frames, observed)
+        scale, centre = frames.scale[observed.view][:, None], frames.centre[observed.view]
         return state.R, state.t * scale - (state.R @ centre[..., None])[..., 0]
 
     def _pose_stds(self, side: int, R: Array) -> Array:
-        """Standard deviations of each view's angles and translation, (V_c, 6)."""
-        frames, seen, columns = self.problem.frames, self.problem.sightings[side], self.columns
-        T = through_rig(frames, seen, self.adjusted.state, columns, side)[:, POSE]
+        """Standard deviations of the angles and translations of the views, (V_c, 6)."""
+        frames, observed, columns = self.problem.frames, self.problem.observations[side], self.columns
+        T = rig_jacobian(frames, observed, self.adjusted.state, columns, side)[:, POSE]
         by_rig, by_pose = T[:, :, columns.rig], T[:, :, columns.pose]
-        own = self.covariance.own[seen.view]
+        own = self.covariance.own[observed.view]
         places = np.flatnonzero(np.isin(self.shared, columns.rig))
         cross = np.zeros((len(own), 6, 6))
         if len(places) == 6:
-            cross = self.covariance.cross[seen.view][:, places]
+            cross = self.covariance.cross[observed.view][:, places]
         mixed = by_rig @ cross @ np.swapaxes(by_pose, 1, 2)
         covariance = by_pose @ own @ np.swapaxes(by_pose, 1, 2) + mixed + np.swapaxes(mixed, 1, 2)
         covariance += by_rig @ self._shared_block(columns.rig) @ np.swapaxes(by_rig, 1, 2)
-        centre = (R @ frames.centre[seen.view][..., None])[..., 0]
-        return pose_std(R, centre, frames.scale[seen.view], covariance)
-
-
-def _scaled(inverse: SchurCovariance, variance: float) -> SchurCovariance:
-    return SchurCovariance(
-        variance * inverse.shared, variance * inverse.own, variance * inverse.cross, inverse.smallest
-    )
+        centre = (R @ frames.centre[observed.view][..., None])[..., 0]
+        return pose_std(R, centre, frames.scale[observed.view], covariance)
 
 
 def _intrinsics(
-    given: Calibration, camera: CameraState, seen: Sightings, estimated: NDArray[np.bool_]
+    given: Calibration, camera: CameraState, observed: Observations, estimated: NDArray[np.bool_]
 ) -> Intrinsics:
-    """Intrinsic parameters [px]; given entries of A stay exactly as they were."""
-    entries = camera.entries[0] * seen.pixel_scale
-    entries[3:] += seen.pixel_centre
+    """Intrinsic parameters [px]; given entries of A keep their exact values."""
+    entries = camera.entries[0] * observed.pixel_scale
+    entries[3:] += observed.pixel_centre
     A = intrinsic_matrix(np.where(estimated, entries, given.K[ENTRIES]))
     if not estimated[1] and not given.intrinsics.skewed:
         return Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
@@ -269,7 +263,7 @@ def _network(
     rmse: float,
     iterations: int,
 ) -> NetworkRecord | None:
-    """The network's weights for the camera as it is now, so that P = S1 W V S2 still."""
+    """The network's weights for the refined camera, so that P = S1 W V S2 holds."""
     if record is None or not views.keys() <= record.S2.keys():
         return record
     V = {}
@@ -286,10 +280,10 @@ def _network(
     )
 
 
-def _squared_errors(seen: Sightings, camera: CameraState) -> Array:
+def _squared_errors(observed: Observations, camera: CameraState) -> Array:
     """Squared pixel errors, (T, n) [px^2]; 0 for padding."""
-    batches: PointBatches = seen.batches
-    squares = (residuals(batches, camera) ** 2).sum(axis=1) * seen.pixel_scale**2
+    batches: PointBatches = observed.batches
+    squares = (residuals(batches, camera) ** 2).sum(axis=1) * observed.pixel_scale**2
     if batches.whitening is not None:
         squares = np.where(batches.whitening[:, 0] > 0, squares, 0.0)
     return np.asarray(squares)

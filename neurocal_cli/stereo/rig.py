@@ -1,4 +1,4 @@
-"""A stereo rig: two cameras and how the right one stands to the left, ``X_right = R X_left + t``."""
+"""A stereo rig: two cameras and their relative pose, ``X_right = R X_left + t``."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ class Rig:
     Attributes
     ----------
     left, right : Calibration
-        The pose of every view that both cameras saw is one pose: the right camera's is the left one's
-        led through the rig.
+        A view of both cameras has one pose: that in the right camera is that in the left one, transformed by
+        the rig.
     pose : Pose
         R and t, ``X_right = R X_left + t``.
     std : dict
@@ -30,16 +30,16 @@ class Rig:
     covariance : (6, 6) array
         Of R_x, R_y, R_z, t_x, t_y, t_z.
     pairs : tuple of (left name, right name)
-        The views that made the rig.
+        The views that determine the rig.
     left_out : dict of str by (left name, right name)
-        Views of both cameras that contradict the rig, with the reason; each still helps its camera.
+        Views that contradict the rig, with the reason; each contributes to its own camera.
     rmse_px : float [px]
         ``sqrt(mean(du^2 + dv^2))`` over all points of both cameras.
     max_px : float [px]
     converged : bool
     stop_reason : str
     iterations : int
-        Steps of the last, common refinement.
+        Iterations of the common bundle adjustment.
     warnings : tuple of str
     """
 
@@ -64,12 +64,12 @@ class Rig:
 
     @property
     def t(self) -> Array:
-        """(3,) where the left camera stands in the right one's frame [world unit]."""
+        """(3,) centre of the left camera in the right one's frame [world unit]."""
         return self.pose.t
 
     @property
     def alone(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Views that the left, and that the right camera alone saw."""
+        """Views of the left camera alone and of the right camera alone."""
         both = [*self.pairs, *self.left_out]
         return (
             tuple(name for name in self.left.views if name not in {a for a, _ in both}),
@@ -88,12 +88,12 @@ class Rig:
 
     @property
     def F(self) -> Array:
-        """(3, 3) fundamental matrix of pixels without the lenses, of unit norm."""
+        """(3, 3) fundamental matrix of undistorted pixels, of unit norm."""
         return fundamental_matrix(self.left.intrinsics, self.right.intrinsics, self.pose)
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the pixels that the rig was found from, in u and in v [px]."""
+        """Standard deviation of the pixels of the calibration, in u and in v [px]."""
         return self.rmse_px / float(np.sqrt(2.0))
 
     @property

@@ -1,7 +1,7 @@
-"""Errors of points in space: averages over all, by view and by depth, and NSCE.
+"""Errors of points in space: over all points, by view and by depth, and NSCE.
 
-The normalised stereo calibration error of Weng, Cohen and Herniou (1992) compares the error across the line
-of sight with the size of a pixel at the point's depth.
+The normalised stereo calibration error (NSCE) of Weng, Cohen and Herniou (1992) compares the error across the
+line of sight with the size of a pixel at the depth of the point.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _POINTS_PER_DEPTH = 20
 
 @dataclass(frozen=True)
 class DepthError:
-    """Errors of the points at some depths.
+    """Errors of the points in an interval of depths.
 
     Attributes
     ----------
@@ -48,22 +48,22 @@ class SpaceError:
     Attributes
     ----------
     n_points, n_behind : int
-        Points in the averages; those that came out behind a camera are in none.
+        Points in the averages; points that are triangulated behind a camera are in none.
     rmse : float [world unit]
         ``sqrt(mean(dX^2 + dY^2 + dZ^2))``.
     rmse_x, rmse_y, rmse_z : float [world unit]
-        Of each axis; their squares add up to that of `rmse`.
+        Of each axis; their squares add up to the square of `rmse`.
     max : float [world unit]
         Longest error.
     nsce : float
-        Normalised stereo calibration error: 1 is a pixel's rounding.
+        Normalised stereo calibration error: 1 is the rounding to whole pixels.
     epipolar_px : float [px]
-        Rms of the smallest shift of both pixels that makes their rays meet.
+        Rms of the smallest shift of both pixels that makes their rays intersect.
     relative : float
         Rms of the error over the depth.
     views : dict of (n_points, rmse) by the left camera's view name
     depths : tuple of DepthError
-        Nearest first, about as many points in each.
+        The nearest first, with about the same number of points.
     errors : (N, 3) array
         Triangulated minus true; nan for points behind a camera.
     """
@@ -84,7 +84,7 @@ class SpaceError:
 
 
 def space_error(
-    seen: Array,
+    triangulated: Array,
     true: Array,
     epipolar: Array,
     view: NDArray[np.intp],
@@ -92,15 +92,15 @@ def space_error(
     alpha_u: float,
     alpha_v: float,
 ) -> SpaceError:
-    """Compare points with where they are.
+    """Compare triangulated points with their true positions.
 
     Parameters
     ----------
-    seen, true : (N, 3) arrays
-        In the left camera's frame; rows of `seen` that are nan count as behind.
+    triangulated, true : (N, 3) arrays
+        In the left camera's frame; rows of `triangulated` that are nan count as behind.
     epipolar : (N,) array [px]
     view : (N,) int array
-        Places in `names`.
+        Indices into `names`.
     names : list of str
     alpha_u, alpha_v : float [px]
         Of the left camera, for NSCE.
@@ -110,17 +110,17 @@ def space_error(
     DegenerateGeometryError
         All points are behind.
     """
-    errors = seen - true
+    errors = triangulated - true
     fine = np.isfinite(errors).all(axis=1)
     if not fine.any():
         raise DegenerateGeometryError(
             "every triangulated point is behind a camera; check which file is of the left camera and which "
             "of the right one"
         )
-    e, depth = errors[fine], seen[fine, 2]
+    e, depth = errors[fine], triangulated[fine, 2]
     squares = (e**2).sum(axis=1)
     axes = np.sqrt((e**2).mean(axis=0))
-    # Half a pixel's rounding at the point's depth, rms: Z / (alpha sqrt(12)).
+    # Rms of the rounding to whole pixels at the depth of the point: Z / (alpha sqrt(12)).
     rounding = depth**2 * (alpha_u**-2 + alpha_v**-2) / 12
     counts = np.bincount(view[fine], minlength=len(names))
     sums = np.bincount(view[fine], weights=squares, minlength=len(names))
@@ -146,7 +146,7 @@ def space_error(
     )
 
 
-def _by_depth(squares: Array, true: Array, seen: Array) -> tuple[DepthError, ...]:
+def _by_depth(squares: Array, true: Array, triangulated: Array) -> tuple[DepthError, ...]:
     order = np.argsort(true, kind="stable")
     parts = np.array_split(order, max(1, min(_MOST_DEPTHS, len(order) // _POINTS_PER_DEPTH)))
     return tuple(
@@ -155,7 +155,7 @@ def _by_depth(squares: Array, true: Array, seen: Array) -> tuple[DepthError, ...
             float(true[part[-1]]),
             len(part),
             float(np.sqrt(squares[part].mean())),
-            float(np.sqrt((squares[part] / seen[part] ** 2).mean())),
+            float(np.sqrt((squares[part] / triangulated[part] ** 2).mean())),
         )
         for part in parts
     )

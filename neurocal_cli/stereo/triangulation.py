@@ -1,10 +1,10 @@
 """Points in space from their pixels in both cameras, in the left camera's frame.
 
-`optimal` minimises the squared pixel errors of both images over the point, lenses included: the
-maximum-likelihood point for Gaussian noise.
+`optimal` minimises the squared pixel errors of both images, with distortion. It is the maximum-likelihood
+point for Gaussian noise.
 
-`linear` takes the smallest singular vector of the four image equations and `midpoint` the middle of the
-shortest segment between both rays, each on pixels that the lenses were taken off (Hartley and Sturm 1997).
+`linear` takes the smallest singular vector of the four image equations, and `midpoint` the middle of the
+shortest segment between both rays. Both use undistorted pixels (Hartley and Sturm 1997).
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ __all__ = ["METHODS", "Triangulated", "epipolar_limit", "triangulate"]
 
 METHODS = ("optimal", "linear", "midpoint")
 
-_AT_ONCE = 4096  # points whose arrays stay in the processor's cache
-_OFF = 5.0  # standard deviations of the epipolar error
+_BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache
+_EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,16 +37,16 @@ class Triangulated:
     Attributes
     ----------
     points : (N, 3) array [unit of t]
-        X, Y, Z; infinite or nan where the rays are parallel or no ray belongs to a pixel.
+        X, Y, Z; infinite or nan where the rays are parallel or the distortion does not reach a pixel.
     covariance : (N, 6) array or None
         XX, XY, XZ, YY, YZ, ZZ for pixels of covariance 1 px^2 (or of the given shape); times sigma^2 it is
         the points'. None unless the method is optimal.
     epipolar : (N,) array [px]
-        Length of the shift of both pixels, as one vector of four, to the images of the point. For the
-        optimal method this is the smallest that makes the rays meet, of one degree of freedom: its rms
-        is the pixels' standard deviation.
+        Length of the vector of four from both pixels to the images of the point. For the optimal method it
+        is the smallest shift that makes the rays intersect. It has one degree of freedom, so its rms is the
+        standard deviation of the pixels.
     behind : (N,) bool array
-        Points that are not in front of both cameras, or nowhere.
+        Points that are not in front of both cameras, or not finite.
     """
 
     points: Array
@@ -55,13 +55,13 @@ class Triangulated:
     behind: NDArray[np.bool_]
 
     def off(self, limit: float) -> NDArray[np.bool_]:
-        """(N,) which pixels are further than a limit [px] from each other's epipolar lines."""
+        """(N,) which epipolar errors exceed a limit [px]."""
         return np.asarray(~(self.epipolar <= limit))
 
 
 def epipolar_limit(sigma: float) -> float:
-    """Epipolar error [px] that pixels of a standard deviation [px] hardly ever exceed."""
-    return _OFF * sigma
+    """Epipolar error [px] of outliers, for pixels of a standard deviation [px]."""
+    return _EPIPOLAR_SIGMAS * sigma
 
 
 def triangulate(
@@ -75,7 +75,7 @@ def triangulate(
     method: str = "optimal",
     whitening: tuple[Array, Array] | None = None,
 ) -> Triangulated:
-    """Triangulate.
+    """Triangulate points from their pixels in two cameras.
 
     Parameters
     ----------
@@ -83,9 +83,9 @@ def triangulate(
     pose : Pose, or a sequence of them
         The rig, ``X_right = R X_left + t``, or several.
     left_pixels, right_pixels : (N, 2) arrays [px]
-        As they were seen, lenses included.
+        Observed, so with distortion.
     which : (N,) int array, optional
-        Place of each point's rig among several.
+        Index of each point's rig among several.
     method : {"optimal", "linear", "midpoint"}
     whitening : two of (N, 3) array, optional
         Upper triangular factors of the pixels' inverse covariances: entries (0, 0), (0, 1), (1, 1). For
@@ -96,7 +96,7 @@ def triangulate(
     UsageError
         An unknown method.
     InputError
-        Arrays that do not fit together.
+        Arrays of different lengths.
     """
     if method not in METHODS:
         raise UsageError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
@@ -109,8 +109,8 @@ def triangulate(
     points, epipolar, behind = np.empty((n, 3)), np.empty(n), np.empty(n, dtype=bool)
     covariance = np.empty((n, 6)) if method == "optimal" else None
     with np.errstate(all="ignore"):
-        for start in range(0, n, _AT_ONCE):
-            rows = slice(start, start + _AT_ONCE)
+        for start in range(0, n, _BLOCK):
+            rows = slice(start, start + _BLOCK)
             factors = None if whitening is None else (whitening[0][rows].T, whitening[1][rows].T)
             batch = PointBatch(cameras, rigs.of_points(rows), pixels[0][rows].T, pixels[1][rows].T, factors)
             if covariance is None:
@@ -130,7 +130,7 @@ def _pixels(values: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Rigs:
-    """R (V, 3, 3) and t (V, 3) of one or several rigs, and the one of each point."""
+    """R (V, 3, 3) and t (V, 3) of one or several rigs, and the rig of each point."""
 
     R: Array
     t: Array
@@ -144,6 +144,6 @@ class _Rigs:
         return cls(R, t, None if len(poses) == 1 else which)
 
     def of_points(self, rows: slice) -> Array:
-        """[R | t] with points along the last axis, (3, 4, n), or (3, 4, 1) for one that all share."""
+        """[R | t] with points along the last axis, (3, 4, n), or (3, 4, 1) for a common rig."""
         P = np.concatenate([self.R, self.t[..., None]], axis=2)
         return np.moveaxis(P if self.which is None else P[self.which[rows]], 0, -1)

@@ -1,7 +1,9 @@
-"""Some thousand points at a time in two images: the point of least squares, and simpler ones.
+"""Triangulation of some thousand points at a time, by least squares and by simpler methods.
 
-The point of least squares is sought as (x, y, 1) / w, by Gauss and Newton. Its left image depends on x and
-y alone and its right one is nearly linear in w, at any distance up to infinity, so two or three steps do.
+Gauss-Newton estimates the point as (x, y, 1) / w. Its left image depends on x and y alone, and its right
+image is nearly linear in w at any distance up to infinity, so two or three steps are enough. The iteration is
+not that of `least_squares`: each point has three unknowns, and their equations are written out over all
+points.
 """
 
 from __future__ import annotations
@@ -17,9 +19,12 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["PointBatch"]
 
-_MOST_STEPS = 30
-_SETTLED = 1e-9  # px: a step that moves no image by more is the last
-_RISE, _ROUNDING = 1 + 1e-9, 1e-18  # of a squared error, and px^2: what is no rise but rounding
+_MAX_STEPS = 30
+_SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
+_RISE, _ROUNDING = (
+    1 + 1e-9,
+    1e-18,
+)  # a rise of the squared error by less, as a factor and in px^2, is rounding
 
 
 class PointBatch:
@@ -44,13 +49,13 @@ class PointBatch:
     ) -> None:
         self.cameras, self.pixels, self.whitening = cameras, (left, right), whitening
         self.P = rig
-        # Of a rig that all share, plain numbers: quicker than arrays of one.
+        # Plain numbers for a common rig are faster than arrays of one element.
         entries = rig[..., 0].tolist() if rig.shape[2] == 1 else rig
         self.R, self.t = [row[:3] for row in entries], [row[3] for row in entries]
 
     def _rays(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        (left, right), (seen_left, seen_right) = self.cameras, self.pixels
-        return left.normalised_points(*seen_left), right.normalised_points(*seen_right)
+        (left, right), (left_pixels, right_pixels) = self.cameras, self.pixels
+        return left.normalised_points(*left_pixels), right.normalised_points(*right_pixels)
 
     def _image(self, side: int, x: Array, y: Array) -> tuple[Array, Array, tuple[Any, Any, Any, Any]]:
         """Pixels of normalised points in one image, and du/dx, du/dy, dv/dx, dv/dy."""
@@ -59,23 +64,23 @@ class PointBatch:
         return image.u, image.v, image.by_point
 
     def _turned(self, x: Array, y: Array) -> list[Array]:
-        """R (x, y, 1): the left ray's direction in the right camera's frame."""
+        """R (x, y, 1), the direction of the left ray in the right camera's frame."""
         return [row[0] * x + row[1] * y + row[2] for row in self.R]
 
     def optimal(self) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
-        """Points of least squares (n, 3), covariances (n, 6), epipolar errors and which are behind."""
+        """Least-squares points (n, 3), covariances (n, 6), epipolar errors, and which points are behind."""
         (x, y), right = (
             nearly_rays(camera.entries, camera.distortion, *pixels)
             for camera, pixels in zip(self.cameras, self.pixels, strict=True)
         )
         w = self._nearest_w(x, y, *right)
         left_out = ~np.isfinite(x + w)
-        x[left_out], y[left_out], w[left_out] = 0.0, 0.0, 1.0  # so that they do no harm
+        x[left_out], y[left_out], w[left_out] = 0.0, 0.0, 1.0  # any finite values
         N, cost = self._normal(x, y, w)
-        for _ in range(_MOST_STEPS):
+        for _ in range(_MAX_STEPS):
             step = _solve(N)
             moved = _step_length(N, step)
-            if not moved.max(initial=0.0) > _SETTLED:
+            if not moved.max(initial=0.0) > _SMALL_STEP:
                 break
             x, y, w, N, cost = self._descend((x, y, w), step, N, cost)
         points = np.stack([x / w, y / w, 1 / w], axis=1)
@@ -89,7 +94,7 @@ class PointBatch:
     def _descend(
         self, state: tuple[Array, Array, Array], step: list[Array], N: list[Array], cost: Array
     ) -> tuple[Array, Array, Array, list[Array], Array]:
-        """One step for each point, halved for those whose error it would raise."""
+        """One step of each point, halved where it raises the error."""
         x, y, w = (value + change for value, change in zip(state, step, strict=True))
         N_new, new = self._normal(x, y, w)
         worse = ~(new <= cost * _RISE + _ROUNDING)
@@ -111,14 +116,14 @@ class PointBatch:
         return x, y, w, N_new, new
 
     def _nearest_w(self, x: Array, y: Array, x_r: Array, y_r: Array) -> Array:
-        """Inverse depth along the left ray that comes nearest to the right image point; linear."""
+        """Inverse depth along the left ray nearest to the right image point, by linear least squares."""
         h0, h1, h2 = self._turned(x, y)
         t0, t1, t2 = self.t
         a, b = t0 - x_r * t2, t1 - y_r * t2
         return np.asarray((a * (x_r * h2 - h0) + b * (y_r * h2 - h1)) / (a * a + b * b))
 
     def _depth(self, x: Array, y: Array, w: Array) -> Array:
-        """Depth in the right camera times w: positive in front of it where w is."""
+        """Depth in the right camera times w."""
         row = self.R[2]
         return np.asarray(row[0] * x + row[1] * y + row[2] + w * self.t[2])
 
@@ -180,10 +185,10 @@ class PointBatch:
         return np.asarray(points)
 
     def midpoint(self) -> Array:
-        """(n, 3) middles of the shortest segments between the rays."""
-        seen, (x, y) = self._rays()
-        left = np.stack([*seen, np.ones_like(x)])
-        # The right camera's rays and centre in the left one's frame.
+        """(n, 3) midpoints of the shortest segments between the rays."""
+        left_ray, (x, y) = self._rays()
+        left = np.stack([*left_ray, np.ones_like(x)])
+        # Rays and centre of the right camera in the left one's frame.
         right = np.stack([self.R[0][k] * x + self.R[1][k] * y + self.R[2][k] for k in range(3)])
         centre = np.stack([-sum(self.R[j][k] * self.t[j] for j in range(3)) + 0.0 * x for k in range(3)])
         ll, lr, rr = ((a * b).sum(axis=0) for a, b in ((left, left), (left, right), (right, right)))
@@ -193,7 +198,7 @@ class PointBatch:
         return np.asarray(0.5 * (along_left * left + centre + along_right * right)).T
 
     def compare(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Distance of the points' images from the pixels [px], and which points are behind."""
+        """Distances of the points' images from the pixels [px], and which points are behind."""
         X, Y, Z = points.T
         w = 1.0 / Z
         x, y = X * w, Y * w
@@ -203,7 +208,7 @@ class PointBatch:
 
 
 def _solve(N: list[Array]) -> list[Array]:
-    """Steps of x, y, w by Cholesky's factors, written out."""
+    """Steps of x, y, w by a written-out Cholesky factorisation."""
     a, b, c, d, e, f, gx, gy, gw = N
     l10, l20 = b / a, c / a
     d1 = d - l10 * b
@@ -222,7 +227,7 @@ def _solve(N: list[Array]) -> list[Array]:
 
 
 def _step_length(N: list[Array], step: list[Array]) -> Array:
-    """By how much a step moves the images [px]: its length in the metric of the normal matrix."""
+    """Change of the images by a step [px]: its length in the metric of the normal matrix."""
     a, b, c, d, e, f = N[:6]
     x, y, w = step
     return np.sqrt(np.abs(x * (a * x + 2 * (b * y + c * w)) + y * (d * y + 2 * e * w) + f * w * w))

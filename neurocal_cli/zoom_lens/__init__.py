@@ -1,6 +1,6 @@
-"""Cameras with active lenses, the paper's section 4.2: how a camera's parameters follow zoom and focus.
+"""Cameras with zoom lenses (the paper's "active lenses", section 4.2).
 
-Five multi-layer feed-forward networks give alpha_u, alpha_v, u0, v0 and t_z at any setting (and more
-of them the lens's coefficients, where it bends); the other parameters are constants. They learn
-together with the calibrating net, on the pixel error of all settings at once.
+Multi-layer feed-forward networks predict alpha_u, alpha_v, u0, v0, t_z and the distortion coefficients at
+any setting of zoom and focus. The other parameters are constants. All networks are trained on the
+reprojection error of all settings.
 """

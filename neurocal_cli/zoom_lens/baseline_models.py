@@ -1,9 +1,9 @@
-"""The usual ways to model a lens from the same data: tables with interpolation, polynomials (Willson).
+"""Baseline models of the same data: interpolated tables and polynomials (Willson 1994).
 
-Each is fitted one parameter at a time, to static calibrations with averaged constants, and jointly,
-on the pixel error with the constants free. Of what passes through every setting the joint fit is that
-of the tables themselves. alpha_u is taken on the networks' scale and alpha_v by its ratio to it, so a
-rival misses nothing but the network.
+Each is fitted one parameter at a time, to static calibrations with averaged constants, and jointly, on the
+reprojection error with free constants. The joint fit of a model that passes through every setting is that of
+the tables. The baselines use the same scales of alpha_u and alpha_v as the networks, so they differ from the
+zoom lens in the networks only.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
-from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.interpolation import (
     grid_axes,
     lookup_matrix,
@@ -26,66 +25,66 @@ from neurocal_cli.zoom_lens.interpolation import (
     thin_plate_matrix,
 )
 from neurocal_cli.zoom_lens.parameter_networks import local_to_outputs, outputs_to_local
-from neurocal_cli.zoom_lens.quadratic_error import QuadraticError
-from neurocal_cli.zoom_lens.setting_normals import Constants
-from neurocal_cli.zoom_lens.zoom_lens import TableRecord, ZoomLens
+from neurocal_cli.zoom_lens.quadratic_error import QuadraticError, inverse
+from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["Rival", "rivals_of"]
+__all__ = ["Baseline", "baselines_of"]
 
-_MOST_DEGREE = 6
+_HIGHEST_DEGREE = 6
 
-# Local parameters (n, L) and constants at scaled controls (n, D).
-Rival = Callable[[Array], tuple[Array, Constants]]
+# From scaled controls (n, D) to local parameters (n, L) and constants.
+Baseline = Callable[[Array], tuple[Array, Constants]]
 
 
-def rivals_of(lens: ZoomLens, scale: str | None = None) -> dict[str, Rival]:
-    """All rivals that the settings allow, by name; those fitted jointly end in ``_joint``.
+def baselines_of(lens: ZoomLens, scale: str | None = None) -> dict[str, Baseline]:
+    """All baselines that the settings determine, by name; those fitted jointly end in ``_joint``.
 
     Parameters
     ----------
     lens : ZoomLens
     scale : str, optional
-        Of alpha_u; the networks' own unless given.
+        Of alpha_u; default that of the networks.
     """
     scale = scale or lens.members[0].nets.scale
     x = lens.scaled(lens.settings)
     axes = grid_axes(x)
-    rivals: dict[str, Rival] = {}
+    baselines: dict[str, Baseline] = {}
     for suffix, table in (("", lens.static), ("_joint", lens.tables)):
         if lens.known and suffix:
-            continue  # there is nothing that parameters of known cameras could share
+            continue  # known cameras have no points for a joint fit
         if axes is not None:
-            rivals[f"lookup{suffix}"] = _through(table, scale, partial(lookup_matrix, axes))
-            rivals[f"spline{suffix}"] = _through(table, scale, partial(spline_matrix, axes))
+            baselines[f"lookup{suffix}"] = _through(table, scale, partial(lookup_matrix, axes))
+            baselines[f"spline{suffix}"] = _through(table, scale, partial(spline_matrix, axes))
         if x.shape[1] > 1 and len(x) >= 4:
-            rivals[f"thin_plate{suffix}"] = _through(table, scale, partial(thin_plate_matrix, x))
+            baselines[f"thin_plate{suffix}"] = _through(table, scale, partial(thin_plate_matrix, x))
     for degree, powers in _degrees(x):
-        rivals[f"polynomial_{degree}"] = _polynomial(lens.static, lens.variance, scale, x, powers)
+        baselines[f"polynomial_{degree}"] = _polynomial(lens.static, lens.variance, scale, x, powers)
         if not lens.known:
-            rivals[f"polynomial_{degree}_joint"] = _joint_polynomial(lens, scale, x, powers)
-    return rivals
+            baselines[f"polynomial_{degree}_joint"] = _joint_polynomial(lens, scale, x, powers)
+    return baselines
 
 
 def _degrees(x: Array) -> Iterator[tuple[int, Array]]:
-    """Degrees, and powers of the controls, whose coefficients the settings determine."""
-    for degree in range(1, _MOST_DEGREE + 1):
+    """Degrees and powers of the controls whose coefficients the settings determine."""
+    for degree in range(1, _HIGHEST_DEGREE + 1):
         powers = powers_up_to(x, degree)
         enough = powers.sum(axis=1).max() == degree and len(powers) < len(x)
         if enough and np.linalg.matrix_rank(monomials(x, powers)) == len(powers):
             yield degree, powers
 
 
-def _through(table: TableRecord, scale: str, matrix: Callable[[Array], Array]) -> Rival:
+def _through(table: Tables, scale: str, matrix: Callable[[Array], Array]) -> Baseline:
     outputs = local_to_outputs(scale, table.local)[0]
     return lambda to: (outputs_to_local(scale, matrix(to) @ outputs)[0], table.constants)
 
 
-def _polynomial(table: TableRecord, variance: float, scale: str, x: Array, powers: Array) -> Rival:
-    """Each parameter by itself, weighted by the variances of the static calibrations."""
+def _polynomial(table: Tables, variance: float, scale: str, x: Array, powers: Array) -> Baseline:
+    """Each parameter alone, weighted by the variances of the static calibrations."""
     outputs, by_local = local_to_outputs(scale, table.local)
     L = outputs.shape[1]
-    inverse = solve_scaled(table.normal.H[:, :L, :L], np.tile(np.eye(L), (len(x), 1, 1)), ROUNDING)
-    spread = variance * np.einsum("sij,sjk,sik->si", by_local, inverse, by_local)
+    covariance = inverse(table.normal.H[:, :L, :L])
+    spread = variance * np.einsum("sij,sjk,sik->si", by_local, covariance, by_local)
     Phi = monomials(x, powers)
     weight = 1 / np.sqrt(np.maximum(spread, 1e-300))
     coefficients = np.column_stack(
@@ -99,7 +98,7 @@ def _polynomial(table: TableRecord, variance: float, scale: str, x: Array, power
 
 @dataclass(frozen=True, eq=False)
 class _Polynomials:
-    """A polynomial of the controls for each output, as `quadratic_error` sees it.
+    """A polynomial of the controls for each output: a `quadratic_error.LocalModel`.
 
     Attributes
     ----------
@@ -120,7 +119,7 @@ class _Polynomials:
 
     @property
     def prior(self) -> Array:
-        """(K L,) zeros: nothing is known of them."""
+        """(K L,) zeros: there is no prior."""
         return np.zeros(self.coefficients.size)
 
     def moved(self, step: Array) -> _Polynomials:
@@ -139,8 +138,8 @@ class _Polynomials:
         return local, [J.reshape(*local.shape, -1)]
 
 
-def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Rival:
-    """All parameters and the constants together, on the settings' normal matrices."""
+def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Baseline:
+    """All parameters and the constants together, on the normal matrices of the settings."""
     table = lens.tables
     outputs, _ = local_to_outputs(scale, table.local)
     start = np.asarray(np.linalg.lstsq(monomials(x, powers), outputs, rcond=None)[0], dtype=float)

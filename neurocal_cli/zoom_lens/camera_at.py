@@ -1,4 +1,4 @@
-"""The camera that a lens is at one setting."""
+"""The calibrated camera at one setting of a zoom lens."""
 
 from __future__ import annotations
 
@@ -9,18 +9,19 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.points import Correspondences
+from neurocal_cli.zoom_lens.setting_normals import Constants
 from neurocal_cli.zoom_lens.settings import describe
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 __all__ = ["camera_at"]
 
-_VIEW = "view"  # the name of points that name none, so that they are judged with this pose
+_VIEW = "view"  # the default name of a view, so that points without a name are evaluated with this pose
 
 
 def camera_at(
     lens: ZoomLens, setting: Array, camera_name: str = "camera", warnings: tuple[str, ...] = ()
 ) -> Calibration:
-    """Calibration at a setting, with standard deviations; it holds no points.
+    """Calibration at a setting, with standard deviations and without points.
 
     Parameters
     ----------
@@ -29,12 +30,12 @@ def camera_at(
         In the order of the lens's controls.
     camera_name : str
     warnings : tuple of str
-        To be kept with it.
+        Stored in the calibration.
 
     Raises
     ------
     InputError
-        No camera there.
+        The networks give no valid camera there.
     """
     prediction = lens.predict(np.asarray(setting, dtype=float)[None])
     values, std = prediction.local[0], prediction.std[0]
@@ -52,13 +53,7 @@ def camera_at(
         intrinsics=Intrinsics(values[0], values[1], values[2], values[3], theta),
         std=spread,
         fixed=frozenset() if has_theta else frozenset({"theta"}),
-        views=_pose(
-            lens,
-            prediction.local[0],
-            prediction.constants.R,
-            prediction.constants.t,
-            prediction.covariance[0],
-        ),
+        views=_views(lens, values, prediction.constants, prediction.covariance[0]),
         points=Correspondences.none(lens.image_size, lens.unit),
         type=1,
         method="lens",
@@ -77,11 +72,11 @@ def camera_at(
     )
 
 
-def _pose(lens: ZoomLens, local: Array, R: Array, t: Array, covariance: Array) -> dict[str, ViewResult]:
-    """The pose of a camera that stood still."""
+def _views(lens: ZoomLens, local: Array, constants: Constants, covariance: Array) -> dict[str, ViewResult]:
+    """The pose of a still camera as one view."""
     if not lens.still:
         return {}
-    L = len(lens.names)
+    R, t, L = constants.R, constants.t, len(lens.names)
     angles = euler_jacobian(R) @ covariance[L + 1 : L + 4, L + 1 : L + 4] @ euler_jacobian(R).T
     variances = [*np.diagonal(angles), *np.diagonal(covariance)[L + 4 : L + 6], covariance[4, 4]]
     std = dict(zip(POSE_NAMES, np.sqrt(np.maximum(variances, 0.0)).tolist(), strict=True))

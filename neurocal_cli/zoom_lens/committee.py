@@ -1,13 +1,12 @@
-"""Step 2: networks for each parameter by itself, several topologies and starts of each.
+"""Step 2: networks for each parameter alone, with several topologies and starts.
 
-The parameters are taken in an order, as Willson (1994) takes his polynomials: t_z first, as it is the
-least certain, then the others as they are when t_z is what its networks say. So the error that
-remains in t_z's networks is made up for by alpha_u, with which it trades off, instead of adding to
-it; and alpha_u's targets, t_z being held, are precise.
+The parameters are fitted in an order, like the polynomials of Willson (1994). t_z comes first, as it is the
+least certain. The others are then estimated with t_z held at the output of its networks. alpha_u, which is
+correlated with t_z, compensates for the remaining error of these networks, and its targets are precise.
 
-Evidence ranks the networks, whatever their topology; noise is far below the bends of a lens, so some
-of the best pass through all settings and bend freely between them. Those fall out of line: of the
-best ones, the committee is those that agree most between the settings (`_agreeing`).
+Evidence ranks networks of all topologies. The noise is far smaller than the variation of the parameters, so
+some of the best networks overfit: they pass through all settings and oscillate between them. The committee
+therefore consists of those of the best networks that agree most between the settings (`_agreeing`).
 """
 
 from __future__ import annotations
@@ -23,34 +22,36 @@ from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.mlfn import Topology
 from neurocal_cli.zoom_lens.network_training import Schedule, sparse_controls, train
 from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, ParameterNet, to_scale
+from neurocal_cli.zoom_lens.quadratic_error import inverse
 from neurocal_cli.zoom_lens.setting_normals import Normal
 
 __all__ = ["TOPOLOGIES", "Budget", "fit_committee", "suitable_topologies"]
 
+# The two slow tests of tests/test_zoom_lens.py measure the errors that these choices reach between settings.
 # (own, hidden): tanh units of the first layer for each control, units of the second.
 TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
-# Three values of a control tell no more than its bow: no tanh units of its own then.
+# Three values of a control determine no more than its rational unit, so it has no tanh units of its own.
 _SPARSE = ((0, 0), (0, 1), (0, 2), (0, 3))
 _WEIGHTS_PER_SETTING = 2.0
-_CLEARLY = 5.0  # logarithm of the odds for another scale than the logarithmic, which fits any zoom's noise
-_IN_LINE = 0.6  # share of the best networks that may be in the committee
-_GRID = 13  # places on each control where networks are compared
+_LOG_ODDS = 5.0  # log-odds that another scale than the logarithmic one must reach
+_AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
+_GRID = 13  # values of each control at which networks are compared
 
 
 @dataclass(frozen=True)
 class Budget:
-    """How hard to look.
+    """Numbers of networks to train and to keep.
 
     Parameters
     ----------
     topologies : tuple of (int, int), optional
-        Default: those that the settings allow.
+        Default: those that suit the number of settings.
     starts : int
         Random starts of each topology.
     best : int
-        Networks, by evidence, that may be in the committee.
+        Networks of the highest evidence that may be in the committee.
     members : int
-        Networks of each parameter in it.
+        Size of the committee.
     schedule : Schedule
     """
 
@@ -63,7 +64,7 @@ class Budget:
 
 @dataclass(frozen=True, eq=False)
 class _Ranked:
-    """Networks of one parameter, the best first, and the evidence of the best in units of the targets."""
+    """Networks of one parameter, the best first, and the evidence of the best, in units of the targets."""
 
     nets: list[ParameterNet]
     evidence: float
@@ -79,7 +80,7 @@ def fit_committee(
     budget: Budget,
     report: Callable[[float], None],
 ) -> tuple[LensNets, ...]:
-    """Fit networks to the tables, one parameter at a time.
+    """Fit networks to tables of local parameters, one parameter at a time.
 
     Parameters
     ----------
@@ -90,8 +91,7 @@ def fit_committee(
     local : (S, L) array
         The tables.
     normal : Normal
-        At the tables; its covariances are the targets' variances. Of zero size in H where the
-        variances are not known.
+        At the tables, for the variances of the targets; H is empty where they are unknown.
     variance : float [px^2]
         Of the noise.
     rng : numpy.random.Generator
@@ -102,17 +102,12 @@ def fit_committee(
     Returns
     -------
     members : tuple of LensNets
-        The first consists of each parameter's network that agrees best with the others.
+        The first consists of the networks that agree best with the others.
     """
     probe = _probe(x.shape[1])
     L = len(names)
-    order = [j for j, name in enumerate(names) if name == "t_z"] + [
-        2,
-        3,
-        *range(4 + ("t_z" in names), L),
-        0,
-        1,
-    ]
+    first = [j for j, name in enumerate(names) if name == "t_z"]
+    order = [*first, 2, 3, *range(4 + len(first), L), 0, 1]
     values, held = local.copy(), np.zeros(L, dtype=bool)
     chosen: dict[int, list[ParameterNet]] = {}
     scale = "log"
@@ -134,14 +129,14 @@ def fit_committee(
 
 
 def suitable_topologies(x: Array) -> tuple[tuple[int, int], ...]:
-    """Topologies that are worth trying on settings (S, D): up to twice as many weights, most of them idle."""
+    """Topologies for settings (S, D): at most two weights a setting, as the priors make most of them idle."""
     limit = max(_WEIGHTS_PER_SETTING * len(x), Topology(x.shape[1], 0, 1).n_weights)
     choices = _SPARSE if sparse_controls(x).any() else TOPOLOGIES
     return tuple(pair for pair in choices if Topology(x.shape[1], *pair).n_weights <= limit)
 
 
 def _probe(D: int) -> Array:
-    """Places between the settings, a grid over the whole range."""
+    """A grid over the whole range of the controls."""
     axes = np.meshgrid(*[np.linspace(-1, 1, _GRID)] * D, indexing="ij")
     return np.column_stack([axis.ravel() for axis in axes])
 
@@ -149,7 +144,7 @@ def _probe(D: int) -> Array:
 def _given(
     local: Array, values: Array, normal: Normal, variance: float, held: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
-    """Tables when some parameters are held at other values, and the variances of the rest; (S, L) both."""
+    """Tables with some parameters held at other values, and the variances of the rest; (S, L) both."""
     L = local.shape[1]
     if not normal.H.size:
         return local, np.zeros_like(local)
@@ -159,30 +154,29 @@ def _given(
     values = values.copy()
     values[:, free] = local[:, free] + solve_scaled(B, pull, ROUNDING)[..., 0]
     spread = np.zeros_like(local)
-    inverse = solve_scaled(B, np.tile(np.eye(len(free)), (len(local), 1, 1)), ROUNDING)
-    spread[:, free] = variance * np.diagonal(inverse, axis1=1, axis2=2)
+    spread[:, free] = variance * np.diagonal(inverse(B), axis1=1, axis2=2)
     return values, spread
 
 
 def _best_scale(
     x: Array, alpha: Array, variance: Array, rng: np.random.Generator, budget: Budget
 ) -> tuple[str, _Ranked]:
-    """The scale of alpha_u on which the data are most probable, and its networks."""
+    """The scale of alpha_u with the highest evidence, and its networks."""
     fits = {}
     for scale in SCALES:
         targets, derivative = to_scale(scale, alpha)
         ranked = _fit(x, targets, variance * derivative**2, rng, budget)
-        # A density of targets, as one of alpha.
+        # The density of the targets as one of alpha.
         fits[scale] = (ranked.evidence + float(np.log(np.abs(derivative)).sum()), ranked)
     best = max(fits, key=lambda name: fits[name][0])
-    scale = best if fits[best][0] > fits["log"][0] + _CLEARLY else "log"
+    scale = best if fits[best][0] > fits["log"][0] + _LOG_ODDS else "log"
     return scale, fits[scale][1]
 
 
 def _fit(x: Array, targets: Array, variance: Array, rng: np.random.Generator, budget: Budget) -> _Ranked:
     """Train all topologies from all starts and rank the networks by evidence."""
     centre, spread = float(targets.mean()), float(targets.std())
-    # Targets that are all the same have no spread; their noise, or 1, serves.
+    # Equal targets have no spread; their noise, or 1, replaces it.
     spread = max(spread, float(np.sqrt(variance.mean())), 1e-9 * abs(centre)) or 1.0
     scaled = (targets - centre) / spread
     nets, evidence = [], []
@@ -202,10 +196,9 @@ def _fit(x: Array, targets: Array, variance: Array, rng: np.random.Generator, bu
 def _agreeing(nets: Sequence[ParameterNet], probe: Array, count: int) -> list[ParameterNet]:
     """The `count` networks nearest to the median of all, the nearest first.
 
-    Those farthest from it are never taken: where few settings leave few networks to choose from, the
-    nearer ones are repeated.
+    Networks far from it are never taken. Where there are too few networks, the nearer ones are repeated.
     """
     outputs = np.array([net.output(probe) for net in nets])
     distance = ((outputs - np.median(outputs, axis=0)) ** 2).mean(axis=1)
-    order = np.argsort(distance, kind="stable")[: max(1, round(_IN_LINE * len(nets)))]
+    order = np.argsort(distance, kind="stable")[: max(1, round(_AGREEING_SHARE * len(nets)))]
     return [nets[order[k % len(order)]] for k in range(count)]

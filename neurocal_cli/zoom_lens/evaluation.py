@@ -1,4 +1,4 @@
-"""How well a lens predicts points at any settings, and how well its rivals do."""
+"""Reprojection error of a zoom lens and of the baseline models at any settings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from neurocal_cli.camera.projection import image_points
 from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.geometry import Array
 from neurocal_cli.methods import calibrate
-from neurocal_cli.zoom_lens.baseline_models import rivals_of
+from neurocal_cli.zoom_lens.baseline_models import baselines_of
 from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData
 from neurocal_cli.zoom_lens.settings import LensPoints, describe
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
@@ -24,7 +24,7 @@ __all__ = ["LensEvaluation", "SettingError", "evaluate_lens"]
 
 @dataclass(frozen=True)
 class SettingError:
-    """Error at one setting.
+    """Reprojection error at one setting.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class SettingError:
 
 @dataclass(frozen=True)
 class LensEvaluation:
-    """Error of a lens at the settings of some points.
+    """Reprojection error of a lens at the settings of some points.
 
     Attributes
     ----------
@@ -50,8 +50,8 @@ class LensEvaluation:
         Over all points.
     settings : tuple of SettingError
         In ascending order.
-    rivals : dict of float by name [px]
-        Rms error of the usual models of the same calibration data; nan where one has no camera.
+    baselines : dict of float by name [px]
+        Rms error of the baseline models of the same calibration data; nan where one gives no valid camera.
     warnings : tuple of str
     """
 
@@ -59,15 +59,15 @@ class LensEvaluation:
     rmse_px: float
     max_px: float
     settings: tuple[SettingError, ...]
-    rivals: Mapping[str, float]
+    baselines: Mapping[str, float]
     warnings: tuple[str, ...] = ()
 
 
 def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
-    """Reprojection error at the settings of points.
+    """Evaluate a lens at the settings of points.
 
-    A still camera is judged with its own pose. For a moving one, and for known cameras, the pose of
-    each view is fitted with the intrinsic parameters held, for each rival as well.
+    A still camera is evaluated with its own pose. For a moving camera and for known cameras the pose of each
+    view is fitted with fixed intrinsic parameters, for each baseline as well.
 
     Raises
     ------
@@ -87,21 +87,22 @@ def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
         warnings.append(
             f"{behind} of {len(squares)} points lie behind the camera and are left out of all averages"
         )
-    rivals = {}
-    for name, rival in rivals_of(lens).items():
-        rivals[name] = _rival_error(lens, points, *rival(x), constants)
+    baselines = {
+        name: _baseline_error(lens, points, *baseline(x), constants)
+        for name, baseline in baselines_of(lens).items()
+    }
     return LensEvaluation(
         n_points=len(squares),
         rmse_px=_rms(squares),
         max_px=float(np.sqrt(np.nanmax(squares))) if behind < len(squares) else np.nan,
         settings=tuple(_setting(points, s, squares[setting == s]) for s in range(points.n_settings)),
-        rivals=rivals,
+        baselines=baselines,
         warnings=tuple(warnings),
     )
 
 
 def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]:
-    """The points with the controls of the lens, in its order, and what to warn of."""
+    """The points with the controls of the lens, in its order, and warnings."""
     source = points.points.source
     missing = [name for name in lens.controls if name not in points.controls]
     if missing:
@@ -116,7 +117,7 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
             f"{there[0]} x {there[1]}; give points of images of the lens's size"
         )
     columns = dict(zip(points.controls, points.settings[points.point_setting].T, strict=True))
-    # Every point counts the same, as in any reprojection error.
+    # All points have the same weight in a reprojection error.
     plain = replace(points.points, covariance=None, across=None)
     matched = LensPoints.grouped(plain, {name: columns[name] for name in lens.controls})
     outside = np.asarray(((matched.settings < lens.low) | (matched.settings > lens.high)).any(axis=1))
@@ -132,7 +133,7 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
 
 
 def _poses(lens: ZoomLens, points: LensPoints, local: Array, theta: float) -> Constants:
-    """Pose of each view, the camera being known (type 3)."""
+    """Pose of each view with known cameras (type 3)."""
     V = points.points.n_views
     R, t = np.empty((V, 3, 3)), np.empty((V, 3))
     number = {name: k for k, name in enumerate(points.points.view_names)}
@@ -169,17 +170,17 @@ def _squares(lens: ZoomLens, points: LensPoints, local: Array, constants: Consta
     return np.asarray((u - pixels[:, 0]) ** 2 + (v - pixels[:, 1]) ** 2)
 
 
-def _rival_error(
+def _baseline_error(
     lens: ZoomLens, points: LensPoints, local: Array, constants: Constants, fitted: Constants
 ) -> float:
-    """Rms error of one rival; its views' poses start from those of the lens."""
+    """Rms error of one baseline; the poses of its views start at those of the lens."""
     if not (np.isfinite(local).all() and (local[:, :2] > 0).all()):
         return np.nan
     if not lens.still:
         if not np.isfinite(fitted.R).all():
             return np.nan
         n_k = len(coefficient_names(lens.model))
-        # A table of known cameras may hold t_z, which poses replace.
+        # A table of known cameras may contain t_z, which the poses replace.
         intrinsic = np.column_stack([local[:, :4], local[:, local.shape[1] - n_k :]])
         data = PixelData.of(points, False, lens.model, True)
         _, constants = data.linearise(intrinsic, replace(fitted, theta=constants.theta))
@@ -187,12 +188,12 @@ def _rival_error(
 
 
 def _rms(squares: Array) -> float:
-    seen = squares[np.isfinite(squares)]
-    return float(np.sqrt(seen.mean())) if len(seen) else np.nan
+    valid = squares[np.isfinite(squares)]
+    return float(np.sqrt(valid.mean())) if len(valid) else np.nan
 
 
 def _setting(points: LensPoints, s: int, squares: Array) -> SettingError:
-    seen = squares[np.isfinite(squares)]
-    largest = float(np.sqrt(seen.max())) if len(seen) else np.nan
+    valid = squares[np.isfinite(squares)]
+    largest = float(np.sqrt(valid.max())) if len(valid) else np.nan
     values = dict(zip(points.controls, points.settings[s].tolist(), strict=True))
     return SettingError(values, len(squares), _rms(squares), largest)

@@ -1,9 +1,9 @@
-"""`fit_lens_cameras`: known cameras at many settings in, a lens out; only step 2 of the paper."""
+"""`fit_lens_cameras`: a zoom lens from known cameras, step 2 of the paper only."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -13,20 +13,20 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.initialisation import check_settings
 from neurocal_cli.zoom_lens.parameter_networks import LensNets, local_to_outputs
-from neurocal_cli.zoom_lens.setting_normals import Constants, Normal
-from neurocal_cli.zoom_lens.settings import CONTROLS
-from neurocal_cli.zoom_lens.zoom_lens import Member, TableRecord, ZoomLens
+from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables
+from neurocal_cli.zoom_lens.settings import CONTROLS, scaled_controls
+from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 
 __all__ = ["LensCameras", "fit_lens_cameras"]
 
 _INTRINSIC = ("alpha_u", "alpha_v", "u0", "v0")
 _MEMBERS = 4
-_EXACT = 1e-6  # share of itself to which a parameter counts as given, if it does not scatter at all
+_LEAST_STD = 1e-6  # standard deviation of a parameter without scatter, as a share of the parameter
 
 
 @dataclass(frozen=True, eq=False)
 class LensCameras:
-    """Cameras that are known at some settings, with errors that are not.
+    """Cameras that are known at some settings, with unknown errors.
 
     Attributes
     ----------
@@ -39,9 +39,9 @@ class LensCameras:
     unit : str
     source : str
     model : str
-        Lens model.
+        Distortion model.
     theta : float [rad]
-        Of all of them.
+        Of all cameras.
     """
 
     controls: tuple[str, ...]
@@ -64,12 +64,12 @@ class LensCameras:
         model: str = "none",
         theta: float = np.pi / 2,
     ) -> LensCameras:
-        """Take columns zoom and/or focus, alpha_u, alpha_v, u0, v0, perhaps t_z, and coefficients, (S,) each.
+        """Read columns zoom and/or focus, alpha_u, alpha_v, u0, v0, perhaps t_z, and coefficients, (S,) each.
 
         Raises
         ------
         InputError
-            A column that is missing, values that no camera has, one setting only.
+            A missing column, impossible values, or one setting only.
         """
         controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
         coefficients = coefficient_names(model)
@@ -105,7 +105,7 @@ def fit_lens_cameras(
     topologies: tuple[tuple[int, int], ...] | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> ZoomLens:
-    """Fit networks to known cameras; the noise of the parameters is told from their scatter.
+    """Fit networks to known cameras; the scatter about them gives the noise of the parameters.
 
     Raises
     ------
@@ -116,9 +116,8 @@ def fit_lens_cameras(
     distinct = len(np.unique(cameras.settings, axis=0))
     check_settings(distinct, len(cameras.controls), cameras.source)
     low, high = cameras.settings.min(axis=0), cameras.settings.max(axis=0)
-    x = 2 * (cameras.settings - low) / (high - low) - 1
+    x = scaled_controls(cameras.settings, low, high)
     L, S = len(cameras.names), len(x)
-    budget = Budget(topologies=topologies)
     empty = Normal(np.zeros((0, L, L)), np.zeros((0, L)), np.zeros(0), True)
     members = fit_committee(
         x,
@@ -127,11 +126,11 @@ def fit_lens_cameras(
         empty,
         1.0,
         np.random.default_rng(seed),
-        replace(budget, members=_MEMBERS),
+        Budget(topologies=topologies, members=_MEMBERS),
         lambda share: report("fitting a network to each parameter", share),
     )
     constants = Constants(cameras.theta, np.eye(3), np.zeros(2))
-    table = TableRecord(cameras.local, constants, _scatter_normal(members, cameras.local))
+    table = Tables(cameras.local, constants, _scatter_normal(members, cameras.local))
     return ZoomLens(
         controls=cameras.controls,
         settings=cameras.settings,
@@ -163,8 +162,8 @@ def _scatter_normal(members: tuple[LensNets, ...], local: Array) -> Normal:
     outputs, by_local = local_to_outputs(members[0].scale, local)
     size = np.abs(np.median(outputs, axis=0))
     size[1] = 1.0  # log(alpha_v / alpha_u): a ratio of 1 is 0
-    scatter = np.maximum(scatter, (_EXACT * size) ** 2)
+    scatter = np.maximum(scatter, (_LEAST_STD * size) ** 2)
     H = np.swapaxes(by_local, 1, 2) @ (by_local / scatter[:, None])
-    H = np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2)  # exactly symmetric, as a file of it will be
+    H = np.triu(H) + np.swapaxes(np.triu(H, 1), 1, 2)  # exactly symmetric, like one read from a file
     S, L = local.shape
     return Normal(H, np.zeros((S, L)), np.zeros(S), True)

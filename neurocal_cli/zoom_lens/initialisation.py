@@ -1,4 +1,4 @@
-"""Step 1 of a lens: the calibrating net at each setting, without settings whose pixels do not fit."""
+"""Step 1: a calibration at each setting, and rejection of settings whose pixels do not fit."""
 
 from __future__ import annotations
 
@@ -12,25 +12,24 @@ from neurocal_cli.errors import DegenerateGeometryError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.committee import Budget
 from neurocal_cli.zoom_lens.outlier_settings import bad_pixels
-from neurocal_cli.zoom_lens.setting_normals import PixelData
+from neurocal_cli.zoom_lens.setting_normals import PixelData, Tables
 from neurocal_cli.zoom_lens.settings import LensPoints, scaled_controls
 from neurocal_cli.zoom_lens.static_calibration import (
     StaticFit,
-    Tables,
     calibrate_each,
     common_tables,
     first_constants,
 )
-from neurocal_cli.zoom_lens.zoom_lens import Rejected
+from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting
 
-__all__ = ["Options", "Progress", "Start", "begin", "check_settings", "without"]
+__all__ = ["CalibratedSettings", "FitOptions", "Progress", "calibrate_settings", "check_settings", "without"]
 
 Progress = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)
-class Options:
-    """What the user asked for; see `fit_lens`."""
+class FitOptions:
+    """Options of `fit_lens`."""
 
     training: str
     still: bool
@@ -40,14 +39,14 @@ class Options:
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """What step 1 found."""
+class CalibratedSettings:
+    """Result of step 1."""
 
     lens: LensPoints
     data: PixelData
     static: StaticFit
     tables: Tables
-    rejected: tuple[Rejected, ...]
+    rejected: tuple[RejectedSetting, ...]
 
     @property
     def controls(self) -> Array:
@@ -57,14 +56,14 @@ class Start:
 
     @property
     def variance(self) -> float:
-        """Of the noise of one coordinate [px^2], from the residuals of the tables."""
+        """Variance of the noise of one coordinate [px^2], from the residuals of the tables."""
         n, S = self.data.views.n_equations, self.lens.n_settings
         unknowns = S * len(self.data.names) + (6 if self.data.still else 1 + 6 * self.lens.points.n_views)
         return float(max(self.tables.normal.cost.sum() / max(n - unknowns, 1), 1e-18))
 
 
 def check_settings(count: int, controls: int, source: str) -> None:
-    """Refuse too few settings to tell how anything changes.
+    """Refuse too few settings.
 
     Raises
     ------
@@ -78,9 +77,11 @@ def check_settings(count: int, controls: int, source: str) -> None:
         )
 
 
-def begin(lens: LensPoints, model: str, options: Options, reject: bool, report: Progress) -> Start:
-    """Step 1, without the settings whose pixels do not fit."""
-    rejected: list[Rejected] = []
+def calibrate_settings(
+    lens: LensPoints, model: str, options: FitOptions, reject: bool, report: Progress
+) -> CalibratedSettings:
+    """Calibrate each setting, then the tables; reject settings whose pixels do not fit."""
+    rejected: list[RejectedSetting] = []
     data = PixelData.of(lens, options.still, model, options.free_theta)
     static = calibrate_each(lens, data, options.seed, options.free_theta, report)
     while True:
@@ -92,16 +93,17 @@ def begin(lens: LensPoints, model: str, options: Options, reject: bool, report: 
             )
         bad = bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if reject else None
         if bad is None or len(rejected) >= max(1, lens.n_settings // 5):
-            return Start(lens, data, static, tables, tuple(rejected))
-        rejected.append(Rejected(tuple(lens.settings[bad.setting].tolist()), bad.reason))
-        keep = np.arange(lens.n_settings) != bad.setting
+            return CalibratedSettings(lens, data, static, tables, tuple(rejected))
+        setting, reason = bad
+        rejected.append(RejectedSetting(tuple(lens.settings[setting].tolist()), reason))
+        keep = np.arange(lens.n_settings) != setting
         lens, data, static = without(lens, static, keep, model, options)
 
 
 def without(
-    lens: LensPoints, static: StaticFit, keep: NDArray[np.bool_], model: str, options: Options
+    lens: LensPoints, static: StaticFit, keep: NDArray[np.bool_], model: str, options: FitOptions
 ) -> tuple[LensPoints, PixelData, StaticFit]:
-    """The data without some settings; nothing is calibrated again."""
+    """The data without some settings. Nothing is calibrated again."""
     views = keep[lens.view_setting]
     rest = lens.select(keep)
     check_settings(rest.n_settings, len(rest.controls), lens.points.source)

@@ -1,7 +1,7 @@
-"""What else goes through or near values at settings: tables, splines, polynomials.
+"""Interpolation matrices of the baseline models: tables, splines, polynomials.
 
-Each is linear in what it is made from: M (n, S) with y(x) = M y_S for those that pass through the
-settings' values, Phi (n, K) with y(x) = Phi c for polynomials.
+Interpolation is linear in the values at the settings, y(x) = M y_S with M (n, S), and polynomials in their
+coefficients, y(x) = Phi c with Phi (n, K).
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ __all__ = ["grid_axes", "lookup_matrix", "monomials", "powers_up_to", "spline_ma
 
 
 def grid_axes(x: Array) -> list[Array] | None:
-    """The values of each control if the settings (S, D), sorted, are a full grid; else None."""
+    """The values of each control if the sorted settings (S, D) are a full grid, else None."""
     axes = [np.unique(column) for column in x.T]
     if np.prod([len(axis) for axis in axes]) != len(x) or min(len(axis) for axis in axes) < 2:
         return None
@@ -23,7 +23,7 @@ def grid_axes(x: Array) -> list[Array] | None:
 
 
 def lookup_matrix(axes: list[Array], x: Array) -> Array:
-    """Linear (bilinear) interpolation in a grid; outside, the outermost cells go on."""
+    """Linear (bilinear) interpolation in a grid; the outermost cells extrapolate."""
     return _tensor([_spline(axis, column, 1) for axis, column in zip(axes, x.T, strict=True)])
 
 
@@ -35,8 +35,8 @@ def spline_matrix(axes: list[Array], x: Array) -> Array:
 def thin_plate_matrix(nodes: Array, x: Array) -> Array:
     """Thin-plate splines through settings anywhere; cubic in one dimension.
 
-    By least squares of smallest norm, as settings of two controls may all be on one line; SciPy's
-    `RBFInterpolator` finds those singular.
+    The solution has the smallest norm, as all settings of two controls may be on one line. SciPy's
+    `RBFInterpolator` refuses those as singular.
     """
 
     def kernel(a: Array, b: Array) -> Array:
@@ -53,7 +53,7 @@ def thin_plate_matrix(nodes: Array, x: Array) -> Array:
 
 
 def powers_up_to(nodes: Array, degree: int) -> Array:
-    """Powers of the controls (K, D) up to a total degree, as far as the settings (S, D) tell them apart."""
+    """Powers of the controls (K, D) up to a total degree that the values of the settings (S, D) determine."""
     most = [len(np.unique(column)) - 1 for column in nodes.T]
     ranges = np.meshgrid(*[np.arange(min(limit, degree) + 1) for limit in most], indexing="ij")
     powers = np.stack(ranges, axis=-1).reshape(-1, nodes.shape[1])
@@ -66,7 +66,7 @@ def monomials(x: Array, powers: Array) -> Array:
 
 
 def _tensor(matrices: list[Array]) -> Array:
-    """Weights on a grid from those along its axes."""
+    """Weights on a grid, the tensor product of those along its axes."""
     product = matrices[0]
     for more in matrices[1:]:
         product = (product[:, :, None] * more[:, None]).reshape(len(product), -1)
@@ -74,7 +74,7 @@ def _tensor(matrices: list[Array]) -> Array:
 
 
 def _spline(axis: Array, x: Array, degree: int) -> Array:
-    """(n, S) weights of the values at an axis in a spline at x; outside, the outermost piece goes on."""
+    """(n, S) weights of the values at the knots in a spline at x; the outermost pieces extrapolate."""
     from scipy.interpolate import make_interp_spline
 
     spline = make_interp_spline(axis, np.eye(len(axis)), k=min(degree, len(axis) - 1))

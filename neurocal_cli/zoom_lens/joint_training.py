@@ -1,10 +1,10 @@
-"""Step 3: all networks and the constants together, on the reprojection error over all settings.
+"""Step 3: training of all networks and the constants on the reprojection error of all settings.
 
     E = sum_s |r_s(p(x_s; w), q)|^2 / (2 sigma^2) + 1/2 sum_g a_g |w_g|^2
 
-with p the networks' outputs at setting s, which are weights of the calibrating net there, and q the
-constants. All weights move at once. A setting enters through its normal matrix (`quadratic_error`), so a
-step costs a millisecond; the matrices are renewed until nothing changes.
+with p the networks' outputs at setting s, which are the weights of the calibrating network there, and q the
+constants. A setting enters through its normal matrix (`quadratic_error`), so a step costs a millisecond. The
+matrices are recomputed until nothing changes.
 """
 
 from __future__ import annotations
@@ -16,29 +16,29 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
-from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
-from neurocal_cli.zoom_lens.network_training import followed
+from neurocal_cli.zoom_lens.network_training import updated_precision
 from neurocal_cli.zoom_lens.parameter_networks import LensNets
-from neurocal_cli.zoom_lens.quadratic_error import QuadraticError, gauss_newton, loosened
+from neurocal_cli.zoom_lens.quadratic_error import QuadraticError, gauss_newton, inverse, with_scatter
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData
 
-__all__ = ["NEARLY", "Joint", "JointLearner", "posterior", "train_joint"]
+__all__ = ["Joint", "JointLearner", "posterior", "train_joint"]
 
-_ROUNDS = 16  # of normal matrices
-_SETTLED = 0.5  # of 2 E, a quarter of a standard deviation: a round that gains less is the last
-NEARLY = 1e-3  # share of 2 E: what gains less than this in the last round has converged
-# On one set of matrices. A step that gains less than 0.02 of 2 E, a seventh of a standard deviation, is
-# the last.
+# 2 E is chi-squared: a change of 1 is one standard deviation of a single parameter. The training stops far
+# below that; test_alternating_ends_where_joint_training_ends checks that its end does not depend on the way.
+_ROUNDS = 16  # most sets of normal matrices
+_SMALL_GAIN = 0.5  # of 2 E: a round that gains less is the last
+_CONVERGED = 1e-3  # share of 2 E: training has converged when its last round gains less
+# On one set of matrices a step that gains less than 0.02 of 2 E is the last.
 _OPTIONS = DescentOptions(
     damping=1e-4, shrink=0.1, least_damping=1e-12, largest_damping=1e8,
     tolerance=0.0, negligible=0.02, by_promise=False, flat=0.0, max_iterations=25,
 )  # fmt: skip
-_FIRST = 4  # rounds in which the priors follow the data
+_PRIOR_ROUNDS = 4  # the first rounds, which update the priors
 
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A lens that has learnt.
+    """Networks and constants after training.
 
     Attributes
     ----------
@@ -69,8 +69,9 @@ def train_joint(
     variance: float,
     scatter: Array,
     report: Callable[[float], None] | None = None,
+    descend: Callable[[JointLearner], float] | None = None,
 ) -> Joint:
-    """Minimise E from networks that were fitted one at a time.
+    """Minimise E, starting from networks that were fitted one at a time.
 
     Parameters
     ----------
@@ -83,25 +84,30 @@ def train_joint(
         Of the noise of one coordinate.
     scatter : (L,) array
         Variance of each local parameter from setting to setting.
+    report : callable, optional
+        Called with the share that is done.
+    descend : callable, optional
+        Lowers 2 E on the present normal matrices and returns it; default `JointLearner.descend`.
     """
+    descend = descend or JointLearner.descend
     learner = JointLearner(data, x, nets, constants, variance, scatter)
     converged = False
     for round_ in range(_ROUNDS):
         if report is not None:
             report(round_ / _ROUNDS)
         before = learner.linearise()
-        if round_ < _FIRST:
-            learner.follow_priors()
-        after = learner.descend()
-        converged = before - after < NEARLY * after
-        if before - after < _SETTLED and round_ >= _FIRST:
+        if round_ < _PRIOR_ROUNDS:
+            learner.update_priors()
+        after = descend(learner)
+        converged = before - after < _CONVERGED * after
+        if before - after < _SMALL_GAIN and round_ >= _PRIOR_ROUNDS:
             break
     learner.linearise()
     return learner.result(converged)
 
 
 class JointLearner:
-    """The state of a lens that learns: its networks, its constants and the settings' normal matrices."""
+    """Networks and constants in training, with the normal matrices of the settings."""
 
     def __init__(
         self, data: PixelData, x: Array, nets: LensNets, constants: Constants, variance: float, scatter: Array
@@ -110,16 +116,16 @@ class JointLearner:
         self.nets, self.constants = nets, constants
 
     def linearise(self) -> float:
-        """Renew the normal matrices where the networks are; 2 E."""
+        """Recompute the normal matrices at the present networks; 2 E."""
         self.reference = self.nets.local(self.x)
         normal, self.constants = self.data.linearise(self.reference, self.constants)
-        self.normal = loosened(normal, self.scatter, self.variance)
+        self.normal = with_scatter(normal, self.scatter, self.variance)
         self.error = QuadraticError(self.x, self.reference, self.normal, self.variance)
         self.shared = np.zeros(self.data.n_shared)
         return self.cost(self.nets, self.shared)
 
     def cost(self, nets: LensNets, shared: Array) -> float:
-        """2 E on the present normal matrices, the constants a step `shared` from where they were."""
+        """2 E on the present normal matrices, after a step `shared` of the constants."""
         return self.error.cost(nets, shared)
 
     def system(self) -> tuple[Array, Array]:
@@ -133,39 +139,34 @@ class JointLearner:
         return cost
 
     def accept(self, nets: LensNets, shared: Array) -> None:
-        """Take over networks and a step of the constants."""
+        """Accept networks and a step of the constants."""
         self.nets, self.constants = nets, self.constants.moved(shared)
 
-    def follow_priors(self) -> None:
-        """Let the priors follow the data: MacKay's rule, half the way on a logarithmic scale."""
+    def update_priors(self) -> None:
+        """Update the priors by MacKay's formula, half the way on a logarithmic scale."""
         N, _ = self.system()
-        leverage = np.diagonal(_inverse(N))
+        leverage = np.diagonal(inverse(N))
         nets, start = [], 0
         for net in self.nets.nets:
-            P, group = net.topology.n_weights, net.topology.groups
-            kinds = (group[None] == np.arange(net.topology.n_groups)[:, None]).astype(float)
+            P, kinds = net.topology.n_weights, net.topology.membership
             here = leverage[start : start + P]
             effective = np.maximum(kinds.sum(axis=1) - net.precision * (kinds @ here), 1e-3)
             squares = np.maximum(kinds @ net.weights**2, 1e-12)
-            target = followed(effective, squares, self.x)
+            target = updated_precision(effective, squares, self.x)
             nets.append(replace(net, precision=np.sqrt(net.precision * target)))
             start += P
         self.nets = replace(self.nets, nets=tuple(nets))
 
     def result(self, converged: bool) -> Joint:
-        """What has been learnt; `linearise` comes before."""
+        """Result of the training; call `linearise` before."""
         N, _ = self.system()
         cost = self.cost(self.nets, self.shared)
         _, volume = np.linalg.slogdet(N)
         evidence = -0.5 * cost - 0.5 * volume + 0.5 * float(np.log(self.nets.prior).sum())
-        return Joint(self.nets, self.constants, cost, _inverse(N), float(evidence), converged)
+        return Joint(self.nets, self.constants, cost, inverse(N), float(evidence), converged)
 
 
 def posterior(x: Array, nets: LensNets, normal: Normal, variance: float, scatter: Array) -> Array:
     """Covariance of all weights and the constants (P + Q, P + Q), from normal matrices of the settings."""
     J = np.concatenate(nets.local_with_jacobians(x)[1], axis=2)
-    return _inverse(gauss_newton(J, loosened(normal, scatter, variance).H / variance, nets.prior))
-
-
-def _inverse(N: Array) -> Array:
-    return solve_scaled(N, np.eye(len(N)), ROUNDING)
+    return inverse(gauss_newton(J, with_scatter(normal, scatter, variance).H / variance, nets.prior))

@@ -1,22 +1,22 @@
-"""One multi-layer feed-forward network (the paper's MLFN) from lens controls to one camera parameter.
+"""A multi-layer feed-forward network (the paper's MLFN) from zoom and focus to one camera parameter.
 
-Two hidden layers and a linear output. Units of the first see one control each, so they bend its scale:
-one bow for each control, and tanh units. Tanh units of the second see the controls and the bent ones.
-The output sees both by direct connections as well, and the products of two controls and of their bows
-(sigma-pi units), so that without weights that are under a prior the network is a plane:
+The network has two hidden layers and a linear output. The first layer has one rational unit for each control
+and tanh units of single controls. The tanh units of the second layer take the controls and the first layer.
+The output takes all of them by direct connections, and products of two controls and of their rational units
+(sigma-pi units). A network whose weights under a prior are 0 is a plane:
 
     h(x) = (1 - x^2) / (1 + tilt x),   tilt = 0.99 tanh(a),
     z = (x, h(x)),   r = (z, tanh(s x + c)),   g = tanh(U r + b),
     y = v.g + q.r + z'M z / 2 + o,   M = 0 but between two controls
 
-The bow is made for optics. By Newton's formula image distances, and with them focal lengths, are
-homographic functions (A x + B) / (1 + C x) of where groups of glass are and of the object's
-distance; they rise steeply towards a pole beyond the range's end, at close focus or at the long end
-of a zoom, where tanh units would need many settings. Plane and bow together are all such functions,
-the pole at -1 / tilt, and all parabolas, tilt 0. At both ends of the range a bow is 0; beyond them
-x in its denominator stays -1 or 1, so that nobody who extrapolates meets the pole.
+The rational unit is made for optics. By Newton's formula, image distances and focal lengths are homographic
+functions (A x + B) / (1 + C x) of the positions of groups of glass and of the object's distance. They rise
+steeply towards a pole beyond the end of the range, at close focus or at the long end of a zoom. Tanh units
+would need many settings there. Plane and rational unit together are all such functions, with the pole at
+-1 / tilt, and all parabolas (tilt 0). The rational unit is 0 at both ends of the range. Beyond them x in its
+denominator stays -1 or 1, so that extrapolation does not reach the pole.
 
-Stacks of B networks of one topology are computed side by side: weights are (B, P).
+B networks of one topology are computed together: weights are (B, P).
 """
 
 from __future__ import annotations
@@ -31,19 +31,20 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Topology", "respond", "respond_with_jacobian"]
 
-_STEEPEST = 0.99  # of a bow's tilt: its pole stays a hundredth of half the range beyond the range's end
+# Keeps the pole 1 % of half the range outside it; test_five_values_tell_close_focus needs a pole so near.
+_LARGEST_TILT = 0.99
 
 
 @dataclass(frozen=True)
 class Topology:
-    """Which units a network has.
+    """Numbers of units of a network.
 
     Parameters
     ----------
     controls : int
         Inputs, D.
     own : int
-        Tanh units of the first hidden layer for each control, beside its bow.
+        Tanh units of the first hidden layer for each control, beside its rational unit.
     hidden : int
         Units of the second hidden layer, H.
     """
@@ -54,12 +55,12 @@ class Topology:
 
     @property
     def width(self) -> int:
-        """R: what the second layer and the output see."""
+        """R: inputs of the second layer and of the output."""
         return self.controls * (2 + self.own)
 
     @cached_property
     def pairs(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Places in r of the two factors of each product."""
+        """Indices in r of the two factors of each product."""
         D = self.controls
         pairs = [(i, j) for i in range(2 * D) for j in range(i) if i % D != j % D]
         first, second = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
@@ -67,7 +68,7 @@ class Topology:
 
     @cached_property
     def parts(self) -> dict[str, slice]:
-        """Places of a, s, c, U, b, v, q, m (the weights in M), o among the weights."""
+        """Slices of a, s, c, U, b, v, q, m (the weights in M), o among the weights."""
         D, own, R, H = self.controls, self.controls * self.own, self.width, self.hidden
         counts = {"a": D, "s": own, "c": own, "U": H * R, "b": H, "v": H, "q": R, "m": len(self.pairs[0])}
         parts, start = {}, 0
@@ -83,10 +84,10 @@ class Topology:
 
     @cached_property
     def groups(self) -> NDArray[np.int64]:
-        """(P,) the prior that each weight is under; -1: the plane, which is free.
+        """(P,) number of the prior of each weight; -1: the plane, which has none.
 
         Weights of one kind share a prior: s, c, the weights in U from each control, b, v, q from tanh
-        units and q from bows, a, and m.
+        units, q from rational units, a, and m.
         """
         D, R, H = self.controls, self.width, self.hidden
         group = np.full(self.n_weights, -1)
@@ -100,11 +101,16 @@ class Topology:
 
     @property
     def n_groups(self) -> int:
-        """How many priors there are."""
+        """Number of priors."""
         return 8 + self.controls
 
+    @cached_property
+    def membership(self) -> Array:
+        """(n_groups, P) 1 where a weight has a prior, else 0."""
+        return (self.groups[None] == np.arange(self.n_groups)[:, None]).astype(float)
+
     def random_weights(self, count: int, rng: np.random.Generator) -> Array:
-        """(count, P) weights to start from: hidden units at random, their outgoing weights small."""
+        """(count, P) initial weights: random hidden units with small outgoing weights."""
         weights = rng.normal(size=(count, self.n_weights))
         for outgoing in ("v", "q", "m"):
             weights[:, self.parts[outgoing]] *= 0.3
@@ -134,17 +140,17 @@ def respond_with_jacobian(topology: Topology, weights: Array, x: Array) -> tuple
     y, r, g = _layers(topology, weights, x)
     part, D = topology.parts, topology.controls
     B, n, H = len(weights), len(x), topology.hidden
-    z, bow, bent = r[:, :, : 2 * D], r[:, :, D : 2 * D], r[:, :, 2 * D :]
+    z, rational, own_units = r[:, :, : 2 * D], r[:, :, D : 2 * D], r[:, :, 2 * D :]
     U = weights[:, part["U"]].reshape(B, H, topology.width)
     by_sum = (1 - g * g) * weights[:, None, part["v"]]  # by the argument of each second-layer unit
     by_r = by_sum @ U + weights[:, None, part["q"]]
     by_r[:, :, : 2 * D] += z @ _products(topology, weights)
-    by_argument = by_r[:, :, 2 * D :] * (1 - bent * bent)
+    by_argument = by_r[:, :, 2 * D :] * (1 - own_units * own_units)
     squashed, inside = np.tanh(weights[:, None, part["a"]]), np.clip(x, -1, 1)
-    by_tilt = by_r[:, :, D : 2 * D] * bow * -inside / (1 + _STEEPEST * squashed * inside)
+    by_tilt = by_r[:, :, D : 2 * D] * rational * -inside / (1 + _LARGEST_TILT * squashed * inside)
     first, second = topology.pairs
     J = np.empty((B, n, topology.n_weights))
-    J[:, :, part["a"]] = by_tilt * _STEEPEST * (1 - squashed * squashed)
+    J[:, :, part["a"]] = by_tilt * _LARGEST_TILT * (1 - squashed * squashed)
     J[:, :, part["s"]] = by_argument * np.repeat(x, topology.own, axis=1)
     J[:, :, part["c"]] = by_argument
     J[:, :, part["U"]] = (by_sum[..., None] * r[:, :, None]).reshape(B, n, -1)
@@ -162,15 +168,15 @@ def _products(topology: Topology, weights: Array) -> Array:
 
 
 def _layers(topology: Topology, weights: Array, x: Array) -> tuple[Array, Array, Array]:
-    """Output (B, n), first hidden layer with the controls (B, n, R), second (B, n, H)."""
+    """Output (B, n), controls and first hidden layer (B, n, R), second hidden layer (B, n, H)."""
     part = topology.parts
     B, n, D = len(weights), *x.shape
-    tilt = _STEEPEST * np.tanh(weights[:, None, part["a"]])
-    bow = (1 - x * x) / (1 + tilt * np.clip(x, -1, 1))
-    bent = np.tanh(
+    tilt = _LARGEST_TILT * np.tanh(weights[:, None, part["a"]])
+    rational = (1 - x * x) / (1 + tilt * np.clip(x, -1, 1))
+    own_units = np.tanh(
         weights[:, None, part["s"]] * np.repeat(x, topology.own, axis=1) + weights[:, None, part["c"]]
     )
-    r = np.concatenate([np.broadcast_to(x, (B, n, D)), bow, bent], axis=2)
+    r = np.concatenate([np.broadcast_to(x, (B, n, D)), rational, own_units], axis=2)
     U = weights[:, part["U"]].reshape(B, topology.hidden, topology.width)
     g = np.tanh(r @ np.swapaxes(U, 1, 2) + weights[:, None, part["b"]])
     y = (g @ weights[:, part["v"], None] + r @ weights[:, part["q"], None])[..., 0] + weights[:, part["o"]]

@@ -1,59 +1,47 @@
-"""Settings whose data are wrong: pixels that fit no camera, or a camera that fits no neighbour."""
+"""Outlier settings: pixels that fit no camera, or a camera that contradicts the other settings."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.zoom_lens.cross_validation import LeftOut
-from neurocal_cli.zoom_lens.static_calibration import Tables
+from neurocal_cli.zoom_lens.setting_normals import Tables
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["BadSetting", "bad_pixels", "doubtful", "stands_out"]
+__all__ = ["bad_pixels", "contradiction", "most_suspect"]
 
-_PIXELS = 3.0  # times the median error of the settings, from which on the pixels are wrong
-_DOUBT = 4.0  # times the median surprise of the settings; only then it is worth to look closer
-_SIGMAS = 8.0  # standard deviations from what all the others predict, rms over the parameters
-_VISIBLE = 5.0  # times the noise that the error must have in the image
-
-
-@dataclass(frozen=True)
-class BadSetting:
-    """A setting's number and what is wrong with it."""
-
-    setting: int
-    reason: str
+# The limits are wide, as a lens may change sharply between two settings. The tests of settings that are left
+# out in tests/test_zoom_lens.py check both sides: wrong pixels and wrong names are found, and no setting of a
+# lens that changes sharply is rejected.
+_WRONG_PIXELS = 3.0  # times the median rms error of the settings
+_SUSPECT = 4.0  # times the median cross-validation error; only such settings are examined
+_SIGMAS = 8.0  # standard deviations from the prediction of all other settings, rms over the parameters
+_LEAST_ERROR = 5.0  # times the noise, in the image
 
 
-def bad_pixels(rms: Array) -> BadSetting | None:
-    """The setting that fits worst, if it fits far worse than the others; rms is (S,) in px."""
+def bad_pixels(rms: Array) -> tuple[int, str] | None:
+    """The setting that fits far worse than the others and the reason to reject it; rms is (S,) in px."""
     worst, typical = int(rms.argmax()), float(np.median(rms))
-    if rms[worst] <= _PIXELS * typical:
+    if rms[worst] <= _WRONG_PIXELS * typical:
         return None
-    return BadSetting(
-        worst, f"its reprojection error is {rms[worst]:.3g} px, that of the others {typical:.3g} px"
-    )
+    return worst, f"its reprojection error is {rms[worst]:.3g} px, that of the others {typical:.3g} px"
 
 
-def doubtful(errors: LeftOut) -> int | None:
-    """The setting that surprises most, if it does so much more than the others."""
-    worst = int((errors.surprise * errors.pixels).argmax())
-    if errors.pixels[worst] <= _DOUBT * np.median(errors.pixels):
-        return None
-    return worst
+def most_suspect(pixels: Array, normalised: Array) -> int | None:
+    """The setting that the others predict worst, if far worse than the rest; see `LeftOutErrors`."""
+    worst = int((normalised * pixels).argmax())
+    return worst if pixels[worst] > _SUSPECT * np.median(pixels) else None
 
 
-def stands_out(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str | None:
-    """Reason to leave out setting s, given a lens that learnt without it; None to keep it.
+def contradiction(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str | None:
+    """Reason to reject setting s, given a lens that was fitted without it; None to keep it.
 
     Parameters
     ----------
     lens : ZoomLens
     setting : (D,) array
     tables : Tables
-        With the setting.
+        Fitted with the setting.
     s : int
     """
     prediction = lens.predict(setting[None])
@@ -63,6 +51,6 @@ def stands_out(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str | 
     own = lens.variance * np.linalg.pinv(H, hermitian=True)
     sigmas = float(np.sqrt(error @ np.linalg.solve(prediction.covariance[0, :L, :L] + own, error) / L))
     pixels = float(np.sqrt(max(error @ H @ error, 0.0) / max(tables.normal.H[s, 2, 2], 1.0)))
-    if sigmas < _SIGMAS or pixels < _VISIBLE * np.sqrt(2 * lens.variance):
+    if sigmas < _SIGMAS or pixels < _LEAST_ERROR * np.sqrt(2 * lens.variance):
         return None
     return f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations off what the other settings predict"

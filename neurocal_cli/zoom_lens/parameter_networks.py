@@ -1,9 +1,8 @@
-"""The networks of one lens: each gives one camera parameter at any setting.
+"""The networks of one zoom lens: each predicts one camera parameter at any setting.
 
-A network's output is preconditioned: it is centred and scaled, and stands for alpha_u on a logarithmic,
-plain or reciprocal scale, whichever its data are simplest on (`Scale`), and for log(alpha_v / alpha_u),
-as the shape of the pixels hardly changes with the lens. u0, v0, t_z and the distortion coefficients
-are taken as they are.
+The outputs are centred and scaled. alpha_u is on a logarithmic, linear or reciprocal scale, whichever has the
+highest evidence. Instead of alpha_v there is log(alpha_v / alpha_u), as the pixels' shape hardly changes with
+the setting. u0, v0, t_z and the distortion coefficients are used as they are.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ def from_scale(scale: str, y: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, eq=False)
 class ParameterNet:
-    """One network with its output's preconditioning.
+    """One network with the scaling of its output.
 
     Attributes
     ----------
@@ -63,7 +62,7 @@ class ParameterNet:
     centre, spread : float
         Output = centre + spread y.
     scatter : float
-        Variance of the output from setting to setting beyond what the network follows.
+        Variance of the output from setting to setting that the network does not explain.
     """
 
     topology: Topology
@@ -109,7 +108,7 @@ class LensNets:
 
     @property
     def prior(self) -> Array:
-        """(P,) precisions of their priors."""
+        """(P,) precisions of the priors of all weights."""
         return np.concatenate([net.prior for net in self.nets])
 
     def moved(self, step: Array) -> LensNets:
@@ -132,6 +131,15 @@ class LensNets:
         local, by_output = outputs_to_local(self.scale, np.column_stack([y for y, _ in pairs]))
         return local, [by_output[:, :, j, None] * J[:, None] for j, (_, J) in enumerate(pairs)]
 
+    def local_scatter(self, local: Array) -> Array:
+        """(L,) variance of the local parameters from setting to setting; `local` (S, L) are their values."""
+        scatter = np.array([net.scatter for net in self.nets])
+        alpha = np.median(local[:, :2], axis=0)
+        slope = float(np.median(np.abs(to_scale(self.scale, local[:, 0])[1])))
+        scatter[0] /= slope**2
+        scatter[1] = scatter[1] * alpha[1] ** 2 + scatter[0]
+        return scatter
+
 
 def outputs_to_local(scale: str, outputs: Array) -> tuple[Array, Array]:
     """Local parameters (n, L) from the networks' outputs (n, L), and derivatives (n, L, L)."""
@@ -145,7 +153,7 @@ def outputs_to_local(scale: str, outputs: Array) -> tuple[Array, Array]:
 
 
 def local_to_outputs(scale: str, local: Array) -> tuple[Array, Array]:
-    """Outputs (n, L) that stand for local parameters (n, L), and derivatives (n, L, L)."""
+    """The networks' outputs (n, L) for local parameters (n, L), and derivatives (n, L, L)."""
     outputs, n, L = local.copy(), *local.shape
     by_local = np.tile(np.eye(L), (n, 1, 1))
     outputs[:, 0], by_local[:, 0, 0] = to_scale(scale, local[:, 0])
@@ -155,6 +163,6 @@ def local_to_outputs(scale: str, local: Array) -> tuple[Array, Array]:
 
 
 def split(nets: Sequence[ParameterNet], weights: Array) -> list[Array]:
-    """Cut one vector of all weights into one for each network."""
+    """Split the vector of all weights into those of each network."""
     ends = np.cumsum([net.topology.n_weights for net in nets])
     return np.split(weights, ends[:-1])

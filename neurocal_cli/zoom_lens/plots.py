@@ -1,16 +1,15 @@
-"""Pictures of lenses: each parameter over the settings, and the errors."""
+"""Pictures of zoom lenses: each parameter over the settings, and the errors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from io import BytesIO
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.plots import check_available
+from neurocal_cli.plots import picture, style
 from neurocal_cli.zoom_lens.evaluation import LensEvaluation
 from neurocal_cli.zoom_lens.static_calibration import local_covariance
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
@@ -21,15 +20,15 @@ if TYPE_CHECKING:
 
 __all__ = ["draw_evaluation", "draw_lens"]
 
-_FINE = 121  # places along a curve
-_MOST_CURVES = 6  # of the second control; more cannot be told apart
+_FINE = 121  # points of a curve
+_MOST_CURVES = 6  # values of the second control; more are not legible
 _COLUMNS = 3
 _INK, _ACCENT = "#1f4e79", "#c0392b"
 _PANEL = (4.4, 3.3)  # inches
 
 
 def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:
-    """Draw each parameter over the settings, with data, fit and band of two standard deviations.
+    """Draw each parameter over the settings, with data, prediction and a band of two standard deviations.
 
     Parameters
     ----------
@@ -66,37 +65,22 @@ def draw_lens(lens: ZoomLens, kind: str = "png") -> bytes:
 
 
 def draw_evaluation(evaluation: LensEvaluation, controls: tuple[str, ...], kind: str = "png") -> bytes:
-    """Draw the error over the settings, and the lens's error beside its rivals'."""
+    """Draw the error over the settings, and the errors of the lens and of the baselines."""
 
     def draw(figure: Figure) -> None:
         axes = _panels(figure, 2)
         settings = np.array([[s.values[name] for name in controls] for s in evaluation.settings])
         values = np.array([s.rmse_px for s in evaluation.settings])
         _draw_errors(figure, axes[0], controls, settings, values, "Error of the networks")
-        _draw_rivals(axes[1], evaluation)
+        _draw_baselines(axes[1], evaluation)
 
     return _picture(draw, 2, kind)
 
 
-def _picture(draw: Any, panels: int, kind: str) -> bytes:
-    """A figure of its own, not pyplot's: no global state, no window, no choice of a backend."""
-    check_available()
-    from matplotlib import rc_context
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
+def _picture(draw: Callable[[Figure], None], panels: int, kind: str) -> bytes:
+    """A figure with room for some panels."""
     columns = min(_COLUMNS, panels)
-    rows = -(-panels // columns)
-    with rc_context({"font.size": 9, "axes.titlesize": 10, "svg.hashsalt": "neurocal"}):
-        figure = Figure(figsize=(_PANEL[0] * columns, _PANEL[1] * rows + 0.4))
-        figure.set_layout_engine("constrained", w_pad=0.1, h_pad=0.1)
-        FigureCanvasAgg(figure)
-        draw(figure)
-        buffer = BytesIO()
-        # A date would make each picture differ from the last.
-        undated = {"png": {"Software": None}, "pdf": {"CreationDate": None}, "svg": {"Date": None}}
-        figure.savefig(buffer, format=kind, dpi=120, metadata=undated[kind])
-    return buffer.getvalue()
+    return picture(draw, (_PANEL[0] * columns, _PANEL[1] * -(-panels // columns) + 0.4), 0.1, kind)
 
 
 def _panels(figure: Figure, count: int) -> Sequence[Axes]:
@@ -107,15 +91,8 @@ def _panels(figure: Figure, count: int) -> Sequence[Axes]:
     return list(axes[:count])
 
 
-def _style(axes: Axes, title: str) -> None:
-    axes.set_title(title)
-    axes.grid(True, color="0.9", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
 def _slices(lens: ZoomLens) -> list[tuple[float | None, NDArray[np.intp]]]:
-    """Values of the second control with the settings nearest to each; all where there is none."""
+    """Values of the second control with the settings nearest to each; all settings where there is none."""
     if len(lens.controls) == 1:
         return [(None, np.arange(len(lens.settings)))]
     second = np.unique(lens.settings[:, 1])
@@ -152,7 +129,7 @@ def _draw_parameter(axes: Axes, lens: ZoomLens, j: int, name: str) -> None:
             color=color,
         )
     unit = "px" if name in ("alpha_u", "alpha_v", "u0", "v0") else lens.unit if name == "t_z" else ""
-    _style(axes, name)
+    style(axes, name)
     axes.set(xlabel=lens.controls[0], ylabel=unit.replace("$", r"\$"))
     if j == 0 and len(slices) > 1:
         axes.legend(frameon=False, fontsize=7)
@@ -162,7 +139,7 @@ def _draw_errors(
     figure: Figure, axes: Axes, controls: tuple[str, ...], settings: Array, values: Array, title: str
 ) -> None:
     """Error over one control as bars, over two as coloured squares."""
-    _style(axes, f"{title}, rms [px]")
+    style(axes, f"{title}, rms [px]")
     if len(controls) == 1:
         axes.plot(settings[:, 0], values, "o-", color=_INK, markersize=3, linewidth=0.8)
         axes.set(xlabel=controls[0], ylabel="rms [px]", ylim=(0, 1.15 * float(np.nanmax(values))))
@@ -182,9 +159,9 @@ def _draw_errors(
     figure.colorbar(drawn, ax=axes, shrink=0.9)
 
 
-def _draw_rivals(axes: Axes, evaluation: LensEvaluation) -> None:
-    """A bar for each model, the shortest on top."""
-    errors = {"networks": evaluation.rmse_px, **evaluation.rivals}
+def _draw_baselines(axes: Axes, evaluation: LensEvaluation) -> None:
+    """A bar for each model, the smallest error on top."""
+    errors = {"networks": evaluation.rmse_px, **evaluation.baselines}
     known = {name: value for name, value in errors.items() if np.isfinite(value) and value > 0}
     order = sorted(known, key=lambda name: -known[name])
     colors = [_ACCENT if name == "networks" else _INK for name in order]
@@ -195,6 +172,6 @@ def _draw_rivals(axes: Axes, evaluation: LensEvaluation) -> None:
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     axes.xaxis.set_major_formatter(ScalarFormatter())
     axes.xaxis.set_minor_formatter(NullFormatter())
-    _style(axes, "The same points, baseline models")
+    style(axes, "The same points, baseline models")
     axes.set_xlabel("rms [px]")
     axes.tick_params(axis="y", labelsize=7)

@@ -1,9 +1,10 @@
-"""The reprojection error of all settings, on fixed normal matrices, of a model of the local parameters.
+"""The reprojection error of all settings as a quadratic function of the local parameters.
 
     2 E = sum_s (c_s - 2 g_s . d_s + d_s . H_s d_s) / sigma^2 + sum_k a_k w_k^2,   d_s = (p(x_s; w) - p_s, q)
 
-with p_s where the matrices were made, w the model's weights, a_k the precisions of their priors, and q a
-step of the constants. A setting costs a few small products, however many points it has.
+with p_s the parameters at which the normal matrices were computed, w the model's weights, a_k the precisions
+of their priors, and q a step of the constants. The cost of an evaluation does not depend on the number of
+points.
 """
 
 from __future__ import annotations
@@ -19,17 +20,17 @@ from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minim
 from neurocal_cli.least_squares.normal_equations import ROUNDING, damped_step, solve_scaled
 from neurocal_cli.zoom_lens.setting_normals import Normal
 
-__all__ = ["LocalModel", "QuadraticError", "gauss_newton", "loosened"]
+__all__ = ["LocalModel", "QuadraticError", "gauss_newton", "inverse", "with_scatter"]
 
 Model = TypeVar("Model", bound="LocalModel")
 
 
 class LocalModel(Protocol):
-    """Anything that gives local parameters at any controls: networks, polynomials."""
+    """A model of the local parameters as functions of the controls: networks, polynomials."""
 
     @property
     def weights(self) -> Array:
-        """(P,) what is learnt."""
+        """(P,) what is estimated."""
         ...
 
     @property
@@ -52,14 +53,14 @@ class LocalModel(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class QuadraticError:
-    """2 E of any model.
+    """2 E of a model.
 
     Attributes
     ----------
     x : (S, D) array
         Scaled controls of the settings.
     reference : (S, L) array
-        Local parameters that the normal matrices were made at.
+        Local parameters at which the normal matrices were computed.
     normal : Normal
     variance : float [px^2]
         Of the noise of one coordinate.
@@ -71,12 +72,12 @@ class QuadraticError:
     variance: float
 
     def _offset(self, local: Array, shared: Array) -> tuple[Array, Array]:
-        """Where the parameters are from the reference (S, L + Q), and H times that."""
+        """Differences from the reference (S, L + Q), and H times these."""
         d = np.column_stack([local - self.reference, np.broadcast_to(shared, (len(local), len(shared)))])
         return d, (self.normal.H @ d[..., None])[..., 0]
 
     def cost(self, model: LocalModel, shared: Array) -> float:
-        """2 E, the constants a step `shared` (Q,) from where they were."""
+        """2 E after a step `shared` (Q,) of the constants."""
         d, Hd = self._offset(model.local(self.x), shared)
         fit = self.normal.cost.sum() + ((Hd - 2 * self.normal.g) * d).sum()
         return float(fit / self.variance + (model.prior * model.weights**2).sum())
@@ -100,7 +101,7 @@ class QuadraticError:
 
 
 class _Problem(Generic[Model]):
-    """2 E as `least_squares` sees it: one group."""
+    """2 E as a problem of `least_squares` with one group."""
 
     def __init__(self, error: QuadraticError, model: Model, shared: Array) -> None:
         self.error, self.model, self.shared = error, model, shared
@@ -108,14 +109,14 @@ class _Problem(Generic[Model]):
         self.N, self.downhill = error.system(model, shared)
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Damped step of all weights and the constants, and what it promises."""
+        """Damped step of all weights and the constants, and the predicted gain."""
         step, promised = damped_step(self.N[None].copy(), self.downhill[None], damping)
         return step[0], promised
 
     def move(
         self, step: Array, active: NDArray[np.intp]
     ) -> tuple[tuple[Model, Array, Array], Array, NDArray[np.bool_]]:
-        """The model after a step; any weights are sensible."""
+        """The model after a step; all weights are valid."""
         P = len(step) - len(self.shared)
         model, shared = self.model.moved(step[:P]), self.shared + step[P:]
         cost = np.array([self.error.cost(model, shared)])
@@ -124,14 +125,14 @@ class _Problem(Generic[Model]):
     def accept(
         self, trial: tuple[Model, Array, Array], better: NDArray[np.bool_], active: NDArray[np.intp]
     ) -> None:
-        """Take it over."""
+        """Accept the trial."""
         if better[0]:
             self.model, self.shared, self.cost = trial
             self.N, self.downhill = self.error.system(self.model, self.shared)
 
 
 def gauss_newton(J: Array, H: Array, prior: Array) -> Array:
-    """Second derivatives of E (P + Q, P + Q), given those of the settings (S, L + Q, L + Q).
+    """Gauss-Newton matrix of E (P + Q, P + Q) from those of the settings (S, L + Q, L + Q).
 
     J (S, L, P) are the derivatives of the local parameters by the weights, prior (P,) the precisions
     of the weights.
@@ -147,11 +148,16 @@ def gauss_newton(J: Array, H: Array, prior: Array) -> Array:
     return N
 
 
-def loosened(normal: Normal, scatter: Array, variance: float) -> Normal:
-    """Normal matrices that allow local parameters a scatter from setting to setting.
+def inverse(H: Array) -> Array:
+    """Inverse of symmetric matrices (..., n, n); a ridge of rounding keeps singular ones finite."""
+    return solve_scaled(H, np.broadcast_to(np.eye(H.shape[-1]), H.shape), ROUNDING)
 
-    Each setting's local parameters are the model's plus an offset of variance `scatter` (L,), which
-    is eliminated.
+
+def with_scatter(normal: Normal, scatter: Array, variance: float) -> Normal:
+    """Normal matrices for local parameters that scatter from setting to setting.
+
+    The local parameters of a setting are those of the model plus an offset of variance `scatter` (L,). The
+    offset is eliminated.
     """
     if not scatter.any():
         return normal

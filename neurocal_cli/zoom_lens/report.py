@@ -1,4 +1,4 @@
-"""Lenses and their evaluations as text and as JSON."""
+"""Reports of zoom lenses and their evaluations as text and as JSON."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.report import align, rounded
+from neurocal_cli.report import align, number_or_none, rounded
 from neurocal_cli.zoom_lens.evaluation import LensEvaluation
 from neurocal_cli.zoom_lens.settings import CONTROLS
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
@@ -22,7 +22,7 @@ _UNITS = {"alpha_u": "px", "alpha_v": "px", "u0": "px", "v0": "px"}
 
 
 def lens_report(lens: ZoomLens) -> str:
-    """Summary of a lens: what it was learnt from, its networks, how well it fits."""
+    """Summary of a lens: its data, its networks and its errors."""
     kind = "known cameras" if lens.known else "camera still" if lens.still else "camera moving"
     points = "" if lens.known else f", {int(lens.counts.sum())} points"
     head = f"zoom lens: {len(lens.settings)} settings of {' and '.join(lens.controls)}{points}, {kind}"
@@ -59,7 +59,7 @@ def _scale_text(lens: ZoomLens) -> str:
 
 
 def _scatter_text(lens: ZoomLens, scatter: list[float]) -> str:
-    """The scatter of each network's output, that of alpha as a share."""
+    """The scatter about each network; that of alpha is relative."""
     local = lens.tables.local
     C = np.linalg.inv(lens.tables.normal.H)
     std = np.sqrt(np.diagonal(C, axis1=1, axis2=2))
@@ -87,7 +87,7 @@ def _network_rows(lens: ZoomLens) -> list[list[str]]:
 
 
 def camera_report(calibration: Calibration) -> str:
-    """Parameters of the camera at a setting."""
+    """Table of the parameters of the camera at a setting."""
     names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
     values = [*calibration.intrinsics.values(), *calibration.distortion]
     rows = [["parameter", "value", "std"]]
@@ -102,7 +102,7 @@ def camera_report(calibration: Calibration) -> str:
 
 
 def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...]) -> str:
-    """Error of a lens as aligned text: overall, its rivals, the worst settings."""
+    """Errors of a lens as aligned text: overall, of the baselines, at the worst settings."""
     shown = sorted(evaluation.settings, key=lambda setting: -_or_zero(setting.rmse_px))[:_MOST_SETTINGS]
     settings = [[*controls, "points", "rms [px]", "max [px]"]]
     for setting in shown:
@@ -115,41 +115,39 @@ def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...]) -> 
     )
     title = "settings with the largest error:" if len(evaluation.settings) > len(shown) else "settings:"
     return "\n\n".join(
-        [head, "\n".join(align(_rival_rows(evaluation))), "\n".join([title, *align(settings)])]
+        [head, "\n".join(align(_baseline_rows(evaluation))), "\n".join([title, *align(settings)])]
     )
 
 
-def _rival_rows(evaluation: LensEvaluation) -> list[list[str]]:
-    """A row for each way of interpolation: one at a time, and jointly."""
+def _baseline_rows(evaluation: LensEvaluation) -> list[list[str]]:
+    """A row for each baseline: fitted one parameter at a time, and jointly."""
     rows = [["rms error [px]", "one at a time", "joint"], ["networks", "", _pixels(evaluation.rmse_px)]]
-    rivals = evaluation.rivals
-    for name in [name for name in rivals if not name.endswith("_joint")]:
-        joint = rivals.get(f"{name}_joint")
-        rows.append([name.replace("_", " "), _pixels(rivals[name]), "" if joint is None else _pixels(joint)])
+    baselines = evaluation.baselines
+    for name in [name for name in baselines if not name.endswith("_joint")]:
+        joint = baselines.get(f"{name}_joint")
+        rows.append(
+            [name.replace("_", " "), _pixels(baselines[name]), "" if joint is None else _pixels(joint)]
+        )
     return rows
 
 
 def evaluation_json(evaluation: LensEvaluation) -> dict[str, Any]:
-    """Turn an evaluation into values that JSON can hold; a number that does not exist is None."""
+    """An evaluation as JSON values; None for numbers that do not exist."""
     return {
         "n_points": evaluation.n_points,
-        "rmse_px": _number(evaluation.rmse_px),
-        "max_px": _number(evaluation.max_px),
+        "rmse_px": number_or_none(evaluation.rmse_px),
+        "max_px": number_or_none(evaluation.max_px),
         "settings": [
             {
                 **{name: setting.values.get(name) for name in CONTROLS},
                 "n_points": setting.n_points,
-                "rmse_px": _number(setting.rmse_px),
-                "max_px": _number(setting.max_px),
+                "rmse_px": number_or_none(setting.rmse_px),
+                "max_px": number_or_none(setting.max_px),
             }
             for setting in evaluation.settings
         ],
-        "rivals": {name: _number(value) for name, value in evaluation.rivals.items()},
+        "rivals": {name: number_or_none(value) for name, value in evaluation.baselines.items()},
     }
-
-
-def _number(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 def _or_zero(value: float) -> float:

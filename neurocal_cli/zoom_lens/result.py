@@ -1,4 +1,4 @@
-"""From trained networks to a lens, with its errors and what the user should know."""
+"""Assembly of a `ZoomLens` from trained networks, with its errors and warnings."""
 
 from __future__ import annotations
 
@@ -6,22 +6,25 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.zoom_lens.initialisation import Options, Start
+from neurocal_cli.zoom_lens.cross_validation import left_out_errors
+from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions
 from neurocal_cli.zoom_lens.joint_training import Joint
 from neurocal_cli.zoom_lens.setting_normals import Constants
-from neurocal_cli.zoom_lens.settings import LensPoints, describe
-from neurocal_cli.zoom_lens.static_calibration import Tables, first_constants, fit_local
-from neurocal_cli.zoom_lens.training import errors_left_out, scatter_of
-from neurocal_cli.zoom_lens.zoom_lens import Member, TableRecord, ZoomLens
+from neurocal_cli.zoom_lens.settings import describe
+from neurocal_cli.zoom_lens.static_calibration import first_constants, fit_local
+from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 
 __all__ = ["assemble", "provisional"]
 
-_POOR_FIT = 1.5  # error of the lens over that of the tables from which on it is warned of
+# Ratio of the error of the networks to that of the tables that gives a warning. The networks of smooth lenses
+# stay within 1.04 of the noise floor even between settings (slow tests in tests/test_zoom_lens.py).
+_POOR_FIT = 1.5
 
 
-def provisional(start: Start, joints: list[Joint], options: Options) -> ZoomLens:
-    """A lens without the figures that only a finished one needs."""
-    scatter = np.min([scatter_of(joint.nets, start.tables) for joint in joints], axis=0)
+def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
+    """The lens without its errors and warnings."""
+    still = start.data.still
+    scatter = np.min([joint.nets.local_scatter(start.tables.local) for joint in joints], axis=0)
     averaged = fit_local(
         start.data, start.tables.local, first_constants(start.static, start.lens, options.still)
     )
@@ -30,11 +33,13 @@ def provisional(start: Start, joints: list[Joint], options: Options) -> ZoomLens
         settings=start.lens.settings,
         names=start.data.names,
         model=start.data.model,
-        still=start.data.still,
+        still=still,
         known=False,
-        members=tuple(Member(joint.nets, _own(joint.constants, start.data.still)) for joint in joints),
-        tables=_record(start.tables, start.data.still),
-        static=_record(averaged, start.data.still),
+        members=tuple(
+            Member(joint.nets, _without_views(joint.constants, start.data.still)) for joint in joints
+        ),
+        tables=replace(start.tables, constants=_without_views(start.tables.constants, still)),
+        static=replace(averaged, constants=_without_views(averaged.constants, still)),
         variance=start.variance,
         scatter=scatter,
         free_theta=options.free_theta,
@@ -50,17 +55,13 @@ def provisional(start: Start, joints: list[Joint], options: Options) -> ZoomLens
     )
 
 
-def _own(constants: Constants, still: bool) -> Constants:
-    """Without the poses of the views, which are no part of a lens."""
+def _without_views(constants: Constants, still: bool) -> Constants:
+    """Remove the poses of the views of a moving camera, which are not part of the lens."""
     return constants if still else Constants(constants.theta, np.eye(3), np.zeros(2))
 
 
-def _record(tables: Tables, still: bool) -> TableRecord:
-    return TableRecord(tables.local, _own(tables.constants, still), tables.normal)
-
-
-def assemble(start: Start, joints: list[Joint], options: Options, points: LensPoints) -> ZoomLens:
-    """The finished lens."""
+def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
+    """The lens with its errors and warnings."""
     lens = provisional(start, joints, options)
     x = start.controls
     local = np.mean([member.nets.local(x) for member in lens.members], axis=0)
@@ -68,8 +69,8 @@ def assemble(start: Start, joints: list[Joint], options: Options, points: LensPo
     constants = replace(constants, theta=float(np.mean([joint.constants.theta for joint in joints])))
     there, _ = start.data.linearise(local, constants)
     rmse = np.sqrt(there.cost / start.data.counts)
-    errors = [errors_left_out(start, joint) for joint in joints]
-    # Linear in the weights is an approximation that fails for a member now and then: the median holds.
+    errors = [left_out_errors(start, joint) for joint in joints]
+    # The linearisation fails for a member now and then, so the median counts.
     squares = np.median([e.pixels**2 for e in errors], axis=0)
     left_out = float(np.sqrt((squares * start.data.counts).sum() / len(start.lens.points)))
     tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
@@ -77,7 +78,7 @@ def assemble(start: Start, joints: list[Joint], options: Options, points: LensPo
     return replace(finished, warnings=_warnings(finished, start, tables_rms))
 
 
-def _warnings(lens: ZoomLens, start: Start, tables_rms: float) -> tuple[str, ...]:
+def _warnings(lens: ZoomLens, start: CalibratedSettings, tables_rms: float) -> tuple[str, ...]:
     warnings = []
     alone = int((~start.static.good).sum())
     if alone:

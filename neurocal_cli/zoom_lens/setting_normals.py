@@ -1,12 +1,12 @@
-"""The reprojection error of all settings through their normal matrices.
+"""Normal matrices of the reprojection error at each setting.
 
-At each setting the camera has local parameters, which change with the lens: alpha_u, alpha_v, u0, v0,
-t_z and the distortion coefficients; and all settings share the constants (zero-order terms), theta
-and, for a camera that stands still, R, t_x, t_y. Where the target moves from image to image each view
-has a pose of its own instead, which is eliminated (variable projection), and t_z is no parameter.
+The local parameters change with the setting: alpha_u, alpha_v, u0, v0, t_z and the distortion coefficients.
+All settings share the constants (the paper's zero-order terms): theta and, for a still camera, R, t_x, t_y.
+Where the target moves, each view has its own pose, which is eliminated (variable projection), and t_z is not
+a parameter.
 
-A setting's points enter only through H = J^T J, g = J^T r and the sum of squares, over its local and
-the shared parameters; residuals are in pixels.
+The points of a setting enter only through H = J^T J, g = J^T r and the sum of squares, over its local and
+the shared parameters. Residuals are in pixels.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation
 from neurocal_cli.least_squares.schur_complement import eliminate
 from neurocal_cli.zoom_lens.settings import LensPoints
 
-__all__ = ["Constants", "Normal", "PixelData"]
+__all__ = ["Constants", "Normal", "PixelData", "Tables"]
 
-_POSE_STEPS = 12  # of views whose poses start where the last matrices left them
+_POSE_STEPS = 12  # most steps of the poses, which start at those of the last normal matrices
 
 
 @dataclass(frozen=True, eq=False)
 class Constants:
-    """What all settings share.
+    """Parameters that all settings share.
 
     Attributes
     ----------
     theta : float [rad]
     R : (3, 3) array or (V, 3, 3) array
-        Of the camera that stands still, or of each view.
+        Of the still camera, or of each view.
     t : (2,) array or (V, 3) array
-        t_x and t_y, or each view's translation.
+        t_x and t_y, or the translation of each view.
     """
 
     theta: float
@@ -63,7 +63,7 @@ class Normal:
     H : (S, L + Q, L + Q) array
         Over the local parameters, then the shared ones.
     g : (S, L + Q) array
-        J^T r with r = observed - predicted: downhill.
+        J^T r with r = observed - predicted.
     cost : (S,) array [px^2]
         Sum of squared residuals.
     sensible : bool
@@ -77,10 +77,29 @@ class Normal:
 
     @property
     def blocks(self) -> Array:
-        """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares, as Schur complements take it."""
+        """(S, L + Q + 1, L + Q + 1) H bordered by g and the sum of squares."""
         g = self.g[..., None]
         below = np.concatenate([np.swapaxes(g, 1, 2), self.cost[:, None, None]], axis=2)
         return np.concatenate([np.concatenate([self.H, g], axis=2), below], axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class Tables:
+    """Local parameters at each setting and the constants that go with them.
+
+    Attributes
+    ----------
+    local : (S, L) array
+    constants : Constants
+    normal : Normal
+        Linearised there. For known cameras: of the squared errors over the networks' scatter.
+    converged : bool
+    """
+
+    local: Array
+    constants: Constants
+    normal: Normal
+    converged: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +112,9 @@ class PixelData:
     setting : (V,) int array
     n_settings : int
     still : bool
-        Whether the camera and the target stand still.
+        Whether neither the camera nor the target moves.
     model : str
-        Lens model.
+        Distortion model.
     free_theta : bool
     """
 
@@ -119,7 +138,7 @@ class PixelData:
 
     @property
     def n_shared(self) -> int:
-        """Q: theta, and omega, t_x, t_y of a camera that stands still."""
+        """Q: theta, and omega, t_x, t_y of a still camera."""
         return 6 if self.still else 1
 
     @property
@@ -130,13 +149,13 @@ class PixelData:
         )
 
     def linearise(self, local: Array, constants: Constants) -> tuple[Normal, Constants]:
-        """Model the reprojection error around local parameters (S, L) and constants.
+        """Linearise the reprojection error at local parameters (S, L) and constants.
 
         Returns
         -------
         normal : Normal
         constants : Constants
-            The same; where views have poses, with those that fit best.
+            The same, with the best poses where each view has its own.
         """
         state = self._state(local, constants)
         if not self.still:
@@ -149,11 +168,11 @@ class PixelData:
         summed = np.zeros((self.n_settings, *reduced.shape[1:]))
         np.add.at(summed, self.setting, reduced)
         L = summed.shape[1] - 1
-        if not self.free_theta:  # held: it moves nothing and costs nothing
+        if not self.free_theta:  # a unit diagonal holds it at 0
             theta = len(self.names)
             summed[:, theta, :] = summed[:, :, theta] = 0.0
             summed[:, theta, theta] = 1.0
-        upper = np.triu(summed)  # exactly symmetric, as a file of it will be
+        upper = np.triu(summed)  # exactly symmetric, like one read from a file
         summed = upper + np.swapaxes(np.triu(summed, 1), 1, 2)
         good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
         return Normal(summed[:, :L, :L], summed[:, :L, -1], summed[:, -1, -1], good), constants
@@ -188,7 +207,7 @@ class PixelData:
         return by_local / self.views.pixel_scale, by_theta / self.views.pixel_scale
 
     def _chain(self, N: Array, local: Array, constants: Constants) -> Array:
-        """Normal matrices over local and shared parameters and the residual, of a still camera's views."""
+        """Normal matrices over local and shared parameters and the residual, for a still camera."""
         views, V, K = self.views, len(N), N.shape[1] - 12
         by_local, by_theta = self._entries_by_parameters(local, constants)
         C = np.zeros((V, 12 + K, 12 + K))
@@ -197,7 +216,7 @@ class PixelData:
         C[:, 10, 4] = 1 / views.scale
         C[:, 11 : 11 + K, 5 : 5 + K] = np.eye(K)
         C[:, :5, 5 + K] = by_theta
-        # The world turns about its origin, a view's points about their centre: t moves as well.
+        # The world turns about its origin, the points of a view about their centre, so t changes too.
         centre = (constants.R @ views.centre[..., None])[..., 0]
         C[:, 5:8, 6 + K : 9 + K] = np.eye(3)
         C[:, 8:11, 6 + K : 9 + K] = -cross_matrix(centre) / scale
@@ -206,7 +225,7 @@ class PixelData:
         return self._in_pixels(np.swapaxes(C, 1, 2) @ N @ C)
 
     def _eliminate(self, N: Array, local: Array, constants: Constants) -> Array:
-        """Normal matrices over local parameters, theta and the residual, each view's pose eliminated."""
+        """Normal matrices over local parameters, theta and the residual, with the poses eliminated."""
         V, K = len(N), N.shape[1] - 12
         keep = np.concatenate([camera_columns(K), [11 + K]])
         U, _ = eliminate(N, keep, np.arange(POSE.start, POSE.stop))

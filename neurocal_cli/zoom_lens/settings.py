@@ -1,4 +1,4 @@
-"""Points seen at many settings of one lens."""
+"""Known points and their images at many settings of one zoom lens."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ CONTROLS = ("zoom", "focus")
 
 @dataclass(frozen=True, eq=False)
 class LensPoints:
-    """Known points with the lens setting at which each was seen.
+    """Known points and their images, with the setting of each.
 
     Attributes
     ----------
     points : Correspondences
-        A view is one image, so it has one setting.
+        Each view is one image and has one setting.
     controls : tuple of str
-        Which of zoom and focus there are.
+        zoom, focus or both.
     settings : (S, D) array
-        The different settings in ascending order, in the user's own units.
+        The distinct settings in ascending order, in the user's units.
     view_setting : (V,) int array
-        Setting of each view.
+        Number of the setting of each view.
     """
 
     points: Correspondences
@@ -51,7 +51,7 @@ class LensPoints:
         Raises
         ------
         InputError
-            No such column, numbers that are not finite, a view with two settings.
+            No such column, a value that is not finite, or a view with two settings.
         """
         controls = tuple(name for name in CONTROLS if columns.get(name) is not None)
         if not controls:
@@ -82,16 +82,16 @@ class LensPoints:
 
     @property
     def n_settings(self) -> int:
-        """S."""
+        """Number of settings S."""
         return len(self.settings)
 
     @property
     def point_setting(self) -> NDArray[np.int64]:
-        """(N,) setting of each point."""
+        """(N,) number of the setting of each point."""
         return self.view_setting[self.points.view_index]
 
     def varying(self) -> LensPoints:
-        """Without the controls that never change.
+        """Remove controls that never change.
 
         Raises
         ------
@@ -109,17 +109,17 @@ class LensPoints:
         return LensPoints(self.points, controls, self.settings[:, moves], self.view_setting)
 
     def select(self, keep: NDArray[np.bool_]) -> LensPoints:
-        """Restrict to some settings; keep is (S,)."""
+        """Keep some of the settings; keep is (S,)."""
         columns = dict(zip(self.controls, self.settings[self.point_setting].T, strict=True))
         rows = keep[self.point_setting]
         return LensPoints.grouped(self.points.select(rows), {name: c[rows] for name, c in columns.items()})
 
 
 def describe(controls: tuple[str, ...], setting: Array) -> str:
-    """Name a setting, as in ``zoom 250 focus 4``."""
+    """Text of a setting, such as ``zoom 250 focus 4``."""
     return " ".join(f"{name} {value:.10g}" for name, value in zip(controls, setting, strict=True))
 
 
 def scaled_controls(settings: Array, low: Array, high: Array) -> Array:
-    """Settings on a scale from -1 to 1 over the calibrated range."""
+    """Scale settings to -1 to 1 over the calibrated range."""
     return 2 * (np.asarray(settings, dtype=float) - low) / (high - low) - 1

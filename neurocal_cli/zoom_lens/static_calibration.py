@@ -1,8 +1,8 @@
-"""Step 1: the calibrating net at each setting, then one camera of tables with common constants.
+"""Step 1: a calibration at each setting, then tables of local parameters with common constants.
 
-The static calibrations start from random weights and know nothing of each other. Their constants
-(zero-order terms) are then made one, and all local parameters and the constants go to the minimum of
-the reprojection error over all settings: the best that any table of values at the settings can do.
+The static calibrations are independent and start from random weights. Their constants are then made equal.
+The local parameters of all settings and the constants together minimise the reprojection error. This is the
+smallest error that any model of the local parameters can reach at the settings.
 """
 
 from __future__ import annotations
@@ -14,21 +14,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.schur_complement import schur_covariance, schur_step
 from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
-from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData
+from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData, Tables
 from neurocal_cli.zoom_lens.settings import LensPoints, describe
 
-__all__ = ["StaticFit", "Tables", "calibrate_each", "common_tables", "fit_local", "local_covariance"]
+__all__ = ["StaticFit", "calibrate_each", "common_tables", "fit_local", "local_covariance"]
 
-_OPTIONS = DescentOptions(
-    damping=1e-3, largest_damping=1e12
-)  # the static calibrations are near, not at the minimum
+# The static calibrations are near the minimum, but not at it.
+_OPTIONS = DescentOptions(damping=1e-3, largest_damping=1e12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +40,11 @@ class StaticFit:
     R, t : (V, 3, 3), (V, 3) arrays
         Pose of each view.
     good : (S,) bool array
-        Where the calibration succeeded; elsewhere the values are those of the nearest setting that did.
+        Where the calibration succeeded. Elsewhere the values are those of the nearest good setting.
     rmse : (S,) array [px]
         nan where it failed.
     reasons : dict of str by setting
-        Why the others failed.
+        Of the failures.
     """
 
     local: Array
@@ -58,29 +56,10 @@ class StaticFit:
     reasons: dict[int, str]
 
 
-@dataclass(frozen=True, eq=False)
-class Tables:
-    """Local parameters at each setting and the constants that go with them.
-
-    Attributes
-    ----------
-    local : (S, L) array
-    constants : Constants
-    normal : Normal
-        Linearised there.
-    converged : bool
-    """
-
-    local: Array
-    constants: Constants
-    normal: Normal
-    converged: bool
-
-
 def calibrate_each(
     lens: LensPoints, data: PixelData, seed: int, skew: bool, progress: Callable[[str, float], None]
 ) -> StaticFit:
-    """Calibrate every setting by itself, from random weights.
+    """Calibrate each setting alone, from random weights.
 
     Raises
     ------
@@ -104,12 +83,9 @@ def calibrate_each(
         for name, view in cal.views.items():
             R[number[name]], t[number[name]] = view.pose.R, view.pose.t
         t_z = [float(np.mean([view.pose.t[2] for view in cal.views.values()]))] if data.still else []
-        lensing = (
-            cal.distortion
-            if cal.distortion_model == data.model
-            else np.zeros(len(coefficient_names(data.model)))
-        )
-        local[s] = [K.alpha_u, K.alpha_v, K.u0, K.v0, *t_z, *lensing]
+        local[s, : 4 + data.still] = [K.alpha_u, K.alpha_v, K.u0, K.v0, *t_z]
+        if cal.distortion_model == data.model:
+            local[s, 4 + data.still :] = cal.distortion
         theta[s], rmse[s] = K.theta, cal.rmse_px
     good = np.isfinite(rmse)
     _refuse_failures(lens, good, reasons)
@@ -122,7 +98,7 @@ def calibrate_each(
 
 
 def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Calibration:
-    """One setting; without its distortion where the points cannot tell it."""
+    """One setting; without distortion where its points do not determine it."""
     try:
         return calibrate(points, distortion=model, outliers="keep", skew=skew, seed=seed)
     except DegenerateGeometryError:
@@ -142,7 +118,7 @@ def _refuse_failures(lens: LensPoints, good: NDArray[np.bool_], reasons: dict[in
 
 
 def _nearest_good(lens: LensPoints, good: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """(S,) each setting itself, or the nearest one that was calibrated."""
+    """(S,) the setting itself, or the nearest one that was calibrated."""
     x = lens.settings / np.maximum(np.ptp(lens.settings, axis=0), 1e-300)
     distance = ((x[:, None] - x[None]) ** 2).sum(axis=-1)
     distance[:, ~good] = np.inf
@@ -150,12 +126,12 @@ def _nearest_good(lens: LensPoints, good: NDArray[np.bool_]) -> NDArray[np.intp]
 
 
 def first_constants(fit: StaticFit, lens: LensPoints, still: bool) -> Constants:
-    """Medians over the settings, for a start."""
+    """Starting values of the constants: medians over the settings."""
     theta = float(np.median(fit.theta[fit.good]))
     if not still:
         return Constants(theta, fit.R, fit.t)
     views = np.flatnonzero(fit.good[lens.view_setting])
-    # The rotation nearest to all others.
+    # The median rotation: the one nearest to all others.
     chords = ((fit.R[views][:, None] - fit.R[views][None]) ** 2).sum(axis=(-2, -1))
     middle = views[int(np.sqrt(chords).sum(axis=1).argmin())]
     return Constants(theta, fit.R[middle], np.median(fit.t[views, :2], axis=0))
@@ -164,24 +140,16 @@ def first_constants(fit: StaticFit, lens: LensPoints, still: bool) -> Constants:
 def common_tables(
     data: PixelData, local: Array, constants: Constants, progress: Callable[[str, float], None] | None = None
 ) -> Tables:
-    """Minimise the reprojection error over local parameters and constants together."""
-    return _minimise(data, local, constants, shared=True, progress=progress)
+    """Minimise the reprojection error over the local parameters and the constants."""
+    return _minimise(_CommonTables(data, local, constants, True, progress))
 
 
 def fit_local(data: PixelData, local: Array, constants: Constants) -> Tables:
-    """Minimise it over the local parameters, the constants being held."""
-    return _minimise(data, local, constants, shared=False, progress=None)
+    """Minimise the reprojection error over the local parameters alone."""
+    return _minimise(_CommonTables(data, local, constants, False, None))
 
 
-def _minimise(
-    data: PixelData,
-    local: Array,
-    constants: Constants,
-    shared: bool,
-    progress: Callable[[str, float], None] | None,
-) -> Tables:
-    """The local parameters are eliminated setting by setting (Schur complement)."""
-    problem = _CommonTables(data, local, constants, shared, progress)
+def _minimise(problem: _CommonTables) -> Tables:
     settled = bool(minimise(problem, _OPTIONS).settled[0])
     return Tables(problem.local, problem.constants, problem.normal, settled)
 
@@ -191,7 +159,10 @@ _Trial = tuple[Array, Constants, Normal]
 
 
 class _CommonTables:
-    """The reprojection error of all settings as `least_squares` sees it: one group."""
+    """The reprojection error of all settings as a problem of `least_squares` with one group.
+
+    The local parameters of each setting are eliminated (Schur complement).
+    """
 
     def __init__(
         self,
@@ -211,7 +182,7 @@ class _CommonTables:
         return self.normal.cost.sum(keepdims=True)
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
-        """Steps of the local parameters and of the constants, and the gain that they promise."""
+        """Steps of the local parameters and of the constants, and the predicted gain."""
         if self.progress is not None:
             self.progress("common constants", self.tried / (self.tried + 10))
         self.tried += 1
@@ -223,7 +194,7 @@ class _CommonTables:
         return (by_local, by_shared), np.array([promised])
 
     def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
-        """Where a step leads, with all points in front of the camera and none folded back."""
+        """The tables after a step; valid if all points are in front and the distortion is monotonic."""
         by_local, by_shared = step
         local = self.local + by_local
         constants = self.constants.moved(by_shared) if self.shared else self.constants
@@ -231,7 +202,7 @@ class _CommonTables:
         return (local, constants, normal), normal.cost.sum(keepdims=True), np.array([normal.sensible])
 
     def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Take it over."""
+        """Accept the trial."""
         if better[0]:
             self.local, self.constants, self.normal = trial
 

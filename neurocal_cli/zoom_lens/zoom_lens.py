@@ -1,4 +1,4 @@
-"""A lens that has learnt: camera parameters at any setting, and how sure they are."""
+"""A calibrated zoom lens: camera parameters at any setting, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -12,55 +12,38 @@ from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.zoom_lens.joint_training import posterior
 from neurocal_cli.zoom_lens.parameter_networks import LensNets
-from neurocal_cli.zoom_lens.setting_normals import Constants, Normal
+from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.settings import describe, scaled_controls
 
-__all__ = ["Member", "Prediction", "Rejected", "TableRecord", "ZoomLens"]
+__all__ = ["Member", "Prediction", "RejectedSetting", "ZoomLens"]
 
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """One lens of the committee: its networks and its constants."""
+    """One member of the committee: its networks and constants."""
 
     nets: LensNets
     constants: Constants
 
 
 @dataclass(frozen=True)
-class Rejected:
-    """A setting that was left out, and why."""
+class RejectedSetting:
+    """A setting that was left out, and the reason."""
 
     setting: tuple[float, ...]
     reason: str
 
 
 @dataclass(frozen=True, eq=False)
-class TableRecord:
-    """Parameters at each setting: what the networks learnt from, and what their rivals need.
-
-    Attributes
-    ----------
-    local : (S, L) array
-    constants : Constants
-    normal : Normal
-        Of the pixel error there. For known cameras: of the squared errors over the networks' scatter.
-    """
-
-    local: Array
-    constants: Constants
-    normal: Normal
-
-
-@dataclass(frozen=True, eq=False)
 class Prediction:
-    """Parameters at some settings.
+    """Predicted parameters at some settings.
 
     Attributes
     ----------
     local : (n, L) array
     constants : Constants
     covariance : (n, L + Q, L + Q) array
-        Of the local parameters and of theta, and of omega, t_x, t_y where the camera stands still.
+        Of the local parameters and of theta; of omega, t_x, t_y as well for a still camera.
     """
 
     local: Array
@@ -75,7 +58,7 @@ class Prediction:
 
 @dataclass(frozen=True, eq=False)
 class ZoomLens:
-    """A calibrated lens.
+    """A camera with a calibrated zoom lens.
 
     Attributes
     ----------
@@ -84,29 +67,29 @@ class ZoomLens:
     settings : (S, D) array
         At which it was calibrated.
     names : tuple of str
-        Local parameters, which follow the controls.
+        Local parameters, which depend on the controls.
     model : str
-        Lens model; its coefficients are the last of the local parameters.
+        Distortion model; its coefficients are the last of the local parameters.
     still : bool
-        Whether camera and target stood still, so that there is a pose.
+        Whether neither camera nor target moved, so that there is one pose.
     known : bool
-        Whether it was fitted to known cameras and not to points.
+        Whether it was fitted to known cameras, not to points.
     members : tuple of Member
-        The committee; the lens is their mean.
-    tables, static : TableRecord
-        The best tables with common constants, and the static calibrations with averaged ones.
+        The committee; predictions are its mean.
+    tables, static : Tables
+        Fitted with common constants, and the static calibrations with averaged constants.
     variance : float [px^2]
-        Of the noise of one coordinate; 1 for known cameras.
+        Of the noise of one pixel coordinate; 1 for known cameras.
     scatter : (L,) array
-        Variance of the local parameters from setting to setting beyond it.
+        Additional variance of the local parameters from setting to setting.
     free_theta : bool
     counts : (S,) array
         Points of each setting.
     rmse : (S,) array [px]
-        Error of the lens at each setting; nan for known cameras.
-    rejected : tuple of Rejected
+        Reprojection error at each setting; nan for known cameras.
+    rejected : tuple of RejectedSetting
     left_out_px : float
-        Error at settings that are left out one by one, predicted from all others; nan if not known.
+        Cross-validation error, each setting predicted from all others; nan where unknown.
     training : str
     seed : int
     converged : bool
@@ -122,14 +105,14 @@ class ZoomLens:
     still: bool
     known: bool
     members: tuple[Member, ...]
-    tables: TableRecord
-    static: TableRecord
+    tables: Tables
+    static: Tables
     variance: float
     scatter: Array
     free_theta: bool
     counts: NDArray[np.int64]
     rmse: Array
-    rejected: tuple[Rejected, ...]
+    rejected: tuple[RejectedSetting, ...]
     left_out_px: float
     training: str
     seed: int
@@ -145,16 +128,16 @@ class ZoomLens:
 
     @property
     def high(self) -> Array:
-        """(D,) upper end."""
+        """(D,) upper end of the calibrated range."""
         return self.settings.max(axis=0)
 
     @property
     def rmse_px(self) -> float:
-        """Error over all points [px]."""
+        """Rms reprojection error over all points [px]."""
         return float(np.sqrt((self.rmse**2 * self.counts).sum() / max(self.counts.sum(), 1)))
 
     def scaled(self, settings: Array) -> Array:
-        """Settings on the networks' scale, -1 to 1."""
+        """Settings on the scale of the networks' inputs, -1 to 1."""
         return scaled_controls(settings, self.low, self.high)
 
     @cached_property
@@ -169,14 +152,14 @@ class ZoomLens:
     def setting_of(
         self, values: dict[str, float | None], extrapolate: bool = False
     ) -> tuple[Array, list[str]]:
-        """Put a setting in the order of the controls, (D,), and check it.
+        """Check a setting and put it in the order of the controls.
 
         Parameters
         ----------
         values : dict
             Value of each control; None for one that is not given.
         extrapolate : bool
-            Whether it may lie outside the calibrated range; it is then warned of.
+            Whether a setting outside the calibrated range gives a warning and not an error.
 
         Returns
         -------
@@ -186,7 +169,7 @@ class ZoomLens:
         Raises
         ------
         UsageError
-            A control that is missing, or one that the lens does not have.
+            A missing control, or one that the lens does not have.
         InputError
             A setting outside the calibrated range, or not finite.
         """
@@ -208,22 +191,19 @@ class ZoomLens:
         return setting, [f"{text}: the networks extrapolate there" for text in outside]
 
     def predict(self, settings: Array) -> Prediction:
-        """Parameters at settings (n, D), with covariances.
+        """Predict parameters at settings (n, D), with covariances.
 
         Raises
         ------
         InputError
-            No camera there: a scale factor that is not positive (only far outside the range).
+            A scale factor is not positive, which happens only far outside the calibrated range.
         """
         x = self.scaled(np.asarray(settings, dtype=float))
         pairs = [member.nets.local_with_jacobians(x) for member in self.members]
         locals_ = np.array([local for local, _ in pairs])
-        if not (np.isfinite(locals_).all() and (locals_[:, :, :2] > 0).all()):
-            bad = int(
-                np.argmin(
-                    (np.isfinite(locals_).all(axis=2) & (locals_[:, :, :2] > 0).all(axis=2)).all(axis=0)
-                )
-            )
+        valid = (np.isfinite(locals_).all(axis=2) & (locals_[:, :, :2] > 0).all(axis=2)).all(axis=0)
+        if not valid.all():
+            bad = int(np.argmin(valid))
             raise InputError(
                 "the networks give no valid camera at "
                 f"{describe(self.controls, np.atleast_2d(settings)[bad])}; "
@@ -238,7 +218,7 @@ class ZoomLens:
         between = np.einsum("mni,mnj->nij", deviation, deviation) / max(len(both) - 1, 1)
         covariance = within + between
         L = len(self.names)
-        if not self.known:  # what the camera itself does from setting to setting
+        if not self.known:
             covariance[:, range(L), range(L)] += self.scatter
         return Prediction(locals_.mean(axis=0), constants, covariance)
 
@@ -254,7 +234,7 @@ def _spread(jacobians: list[Array], covariance: Array, Q: int) -> Array:
 
 
 def _mean_constants(constants: list[Constants], still: bool) -> tuple[Constants, Array]:
-    """Mean of the members' constants, and each one's offset from it (m, 6): theta, omega, t_x, t_y."""
+    """Mean of the members' constants and the differences from it (m, 6): theta, omega, t_x, t_y."""
     theta = np.array([c.theta for c in constants])
     if not still:
         zero = np.zeros((len(theta), 5))

@@ -135,8 +135,8 @@ def sides(scene: RigScene, sigma: float, seed: int = 1) -> tuple[Correspondences
 def all_residuals(problem: RigProblem, state: RigState) -> Array:
     """Whitened residuals, computed through no more than the cameras' own projections."""
     out = []
-    for side, seen in enumerate(problem.sightings):
-        camera = state.seen_by(side, problem.frames, seen)
+    for side, seen in enumerate(problem.observations):
+        camera = state.camera_with_poses(side, problem.frames, seen)
         error = residuals(seen.batches, camera)
         if seen.batches.whitening is not None:
             error = error * (seen.batches.whitening[:, :1] > 0)
