@@ -2,14 +2,14 @@
 
 A pattern is a normalised world point ``Z = (X, Y, Z, 1)`` and its normalised pixel
 ``d = (u, v, 1)``. The hidden layer has the weights V (3 x 4, the pose), the output layer W (3 x 3,
-the intrinsic matrix); the paper's fourth hidden neuron is the constant 1 whose output weights are
-the zero column of A, so it is left out. For a flat board the input Z is constantly 0 and its column
-of V goes too: V is then 3 x 3. With o = W V Z the network's outputs are O = gamma o, eq. (7).
+the intrinsic matrix). The paper's fourth hidden neuron is the constant 1. Its output weights are the
+zero column of A, so it is left out. For a flat board the input Z is always 0. Its column of V is left
+out as well, and V is 3 x 3. With o = W V Z the network's outputs are O = gamma o, eq. (7).
 
     E_2D = 1/2 sum_i w_i |d_i - gamma_i o_i|^2                                    eqs. (5), (8)
 
 Every function takes a stack of networks: a leading axis of G networks, each with N patterns of I
-inputs. A network may be one view of a camera, or one random start of it.
+inputs. A network is one view of a camera, or one random start of it.
 
 Index conventions: the paper swaps V's indices between (6) and (9)-(10) and W's between (10) and
 (15). Here ``V[j, l]`` goes from input l to hidden neuron j and ``W[k, j]`` from there to output k.
@@ -45,16 +45,16 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Patterns:
-    """What a stack of networks learns from.
+    """Training data of a stack of networks.
 
     Parameters
     ----------
     inputs : (G, N, I) array
-        Normalised world points, last input 1. G may be 1: shared by all networks.
+        Normalised world points, with the last input 1. All networks share them if G is 1.
     targets : (G, N, 3) array
         Normalised pixels (u, v, 1).
     weights : (G, N) array
-        Importance w_i of each pattern; 0 for padding.
+        Weight w_i of each pattern; 0 for padding.
     """
 
     inputs: Array
@@ -76,7 +76,7 @@ class Patterns:
 
 
 def random_weights(rng: np.random.Generator, networks: int, n_inputs: int) -> tuple[Array, Array]:
-    """Initial weights, uniform in [-1, 1] as the paper has them; W (G, 3, 3) and V (G, 3, I)."""
+    """Initial weights, uniform in [-1, 1] as in the paper; W (G, 3, 3) and V (G, 3, I)."""
     return rng.uniform(-1, 1, (networks, 3, 3)), rng.uniform(-1, 1, (networks, 3, n_inputs))
 
 
@@ -86,7 +86,7 @@ def output(W: Array, V: Array, inputs: Array) -> Array:
 
 
 def optimal_gamma(o: Array, targets: Array) -> Array:
-    """The factor that minimises |d - gamma o|^2, where (11) comes to rest; (G, N)."""
+    """The factor that minimises |d - gamma o|^2, the fixed point of (11); (G, N)."""
     return np.asarray((targets * o).sum(-1) / (o * o).sum(-1))
 
 
@@ -106,7 +106,7 @@ class Gradients:
 
 
 def gradients(W: Array, V: Array, gamma: Array, patterns: Patterns) -> Gradients:
-    """Exact gradient of E_2D; the rules (9)-(11) are its negative, a pattern at a time."""
+    """Exact gradient of E_2D; (9)-(11) are its negative for a single pattern."""
     Z, w = patterns.inputs, patterns.weights
     Y = Z @ np.swapaxes(V, -1, -2)  # hidden outputs, eq. (6)
     o = Y @ np.swapaxes(W, -1, -2)
@@ -122,9 +122,9 @@ def gradients(W: Array, V: Array, gamma: Array, patterns: Patterns) -> Gradients
 def residual_jacobian(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Array]:
     """Residuals d - gamma o with gamma eliminated, and their derivative by the product W V.
 
-    The residual is what the target has perpendicular to the ray o. The derivative of gamma itself
-    points along the ray and is dropped (Kaufman's variable projection): gradient exact, Hessian
-    that of Gauss and Newton.
+    The residual is the component of the target perpendicular to the ray o. The derivative of gamma is along
+    the ray and is dropped (Kaufman's variable projection). The gradient is exact, and the Hessian is that of
+    Gauss-Newton.
 
     Returns
     -------
@@ -144,7 +144,7 @@ def residual_jacobian(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Ar
 
 
 def _rotation_part(V: Array) -> Array:
-    """Columns of V that make up the rotation.
+    """Columns of V that form the rotation.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def _rotation_part(V: Array) -> Array:
 
 
 def e_orth(V: Array, a: float = 1.0) -> Array:
-    """E_orth of eq. (14): how far the rows of V's rotation part are from orthonormal times sqrt(a); (G,)."""
+    """E_orth of eq. (14): deviation of the rows of V's rotation from orthonormal times sqrt(a); (G,)."""
     M = _rotation_part(V)
     gram = M @ np.swapaxes(M, -1, -2) - a * np.eye(3)
     upper = np.triu(np.ones((3, 3)))
@@ -168,8 +168,8 @@ def e_orth_gradient(V: Array, a: float = 1.0) -> Array:
     """Exact gradient of E_orth by V, zero in the translation's column; (G, 3, I).
 
     Erratum of eq. (15): as printed, delta v_1j = (V_2j + V_3j) {(v_1.v_2) + (v_1.v_3)} adds the two
-    products before multiplying. The derivative pairs each row with its own product,
-    2 {(v_1.v_2) V_2j + (v_1.v_3) V_3j}, and likewise for rows 2 and 3.
+    products before it multiplies. The correct derivative multiplies each row by its own product,
+    2 {(v_1.v_2) V_2j + (v_1.v_3) V_3j}. Rows 2 and 3 are alike.
     """
     M = _rotation_part(V)
     gram = M @ np.swapaxes(M, -1, -2) - a * np.eye(3)
@@ -181,7 +181,7 @@ def e_orth_gradient(V: Array, a: float = 1.0) -> Array:
 
 
 def e_orth_jacobian(V: Array, a: float = 1.0) -> tuple[Array, Array]:
-    """The six terms whose squares make up E_orth, eq. (13), and their derivative by V.
+    """The six terms whose squares add up to E_orth, eq. (13), and their derivative by V.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Trainers of the calibrating network. They see patterns and weights, and know no cameras."""
+"""Trainers of the calibrating network. They work on patterns and weights, not on cameras."""
 
 from __future__ import annotations
 

@@ -1,16 +1,17 @@
-"""The paper's trainer: the back-propagation rule of section 3, eqs. (9)-(11), a pattern at a time.
+"""The paper's trainer: back-propagation of section 3, eqs. (9)-(11), one pattern at a time.
 
-Every pattern in turn moves W, V and its own factor gamma, which starts at 1. Patterns come in a
-shuffled order, the same in every epoch: neighbours in space pull the weights the same way, and in
-their order on the target training takes twice as long.
+Each pattern updates W, V and its own factor gamma, which starts at 1. The order of the patterns is shuffled
+once and is the same in every epoch. In their order on the target, neighbouring patterns change the weights
+alike, and training takes twice as long.
 
-What the rates do. gamma is the slow part: the weights follow it within an epoch, so rate_gamma
-sets the pace, up to 2 / |o|^2 where it overshoots; hence 0.4 beside 0.05 for the weights. On exact
-data a constant rate converges to the exact camera. On noisy data it ends on a small cycle about the
-optimum, 2-40 % above its loss; the excess goes with the square of the rate, so the rates are halved
-whenever the loss has come to rest. From random weights the paper's Table 1 scene (440 points) takes
-400-800 epochs to 1e-7 px; boxes and corners with 0.3 px of noise take 1,000-6,000. Slower are nearly
-flat targets (20,000 and more) and views so close that the gammas differ by a factor of 14 (8,000).
+The learning rates: gamma is the slowest variable, as the weights adapt to it within an epoch. rate_gamma
+therefore determines the speed of training, up to 2 / |o|^2, where gamma overshoots. Hence it is 0.4, and 0.05
+for the weights. On exact data a constant rate converges to the exact camera. On noisy data it ends in a small
+cycle around the optimum, with a loss 2-40 % too high. The excess is proportional to the square of the rate,
+so the rates are halved whenever the loss no longer decreases. The paper's Table 1 scene (440 points) takes
+400-800 epochs from random weights to 1e-7 px; boxes and corners with 0.3 px of noise take 1,000-6,000.
+Nearly flat targets (20,000 and more) and views so close that the gammas differ by a factor of 14 (8,000) are
+slower. tests/test_backprop.py trains on scenes of these kinds.
 """
 
 from __future__ import annotations
@@ -29,43 +30,45 @@ from neurocal_cli.training.task import Task, Trained
 
 __all__ = ["BackpropOptions", "BackpropTrained", "train_backprop"]
 
-# Checkpoints come every 10 epochs at first, later every 1/40 of the epochs so far: some 230 in 50,000.
+# test_noisy_scenes_reach_the_optimum and test_the_curve_stays_short_over_many_epochs in
+# tests/test_backprop.py check these numbers. The interval between checkpoints is 10 epochs at first, later
+# 1/40 of the epochs so far: 230 in 50,000.
 _FIRST_CHECK = 10
 _CHECKS_PER_LIFE = 40
-# The loss is compared over 10 of them, a quarter of the training so far.
+# The loss is compared over 10 checkpoints, a quarter of the training so far.
 _WINDOW = 10
-# Halvings in succession that must gain nothing: the cycles of two rates may agree by chance.
+# Successive halvings without a gain that end the training: the cycles of two rates may agree by chance.
 _QUIET = 2
-# A network whose loss exceeds 10 times that of the silent network, W V = 0, has diverged.
+# A network whose loss exceeds 10 times that of W V = 0 has diverged.
 _DIVERGED = 10.0
 
 
 @dataclass(frozen=True)
 class BackpropOptions:
-    """Constants of the rule.
+    """Options of `train_backprop`.
 
     Parameters
     ----------
     epochs : int
-        Presentations of all patterns after which training is given up.
+        Most epochs.
     rate_weights, rate_gamma : float
-        The paper's learning constants alpha_1 and alpha_2, for patterns of order 1.
+        The paper's learning constants alpha_1 and alpha_2, for normalised patterns.
     beta : float
-        Weight of E_orth beside each pattern's E_2D, eq. (14).
+        Weight of E_orth relative to the E_2D of a pattern, eq. (14).
     a : float
-        Squared length of V's rows in E_orth.
+        Squared length of the rows of V in E_orth.
     resting_gamma : bool
-        Start each gamma where (11) comes to rest for the initial weights, instead of at 1: to go on
-        from weights that are trained, which gammas of 1 would lead astray first.
+        Start each gamma at the fixed point of (11) for the initial weights, not at 1. This continues from
+        trained weights without a detour.
     tolerance : float
-        Relative change of the loss that no longer counts.
+        Relative change of the loss that is taken for none.
     floor : float
-        Rms error, in normalised pixels, below which there is nothing left to learn.
+        Rms error, in normalised pixels, below which training ends.
     halvings : int
-        How often a network that diverges starts again, at half its rates.
+        Most restarts of a network that diverges, each with half the rates.
     method : {"auto", "patterns", "blocks"}
-        Pattern by pattern, as the paper has it, or in small blocks, at rates bounded so that they stay
-        stable; "auto" takes blocks only where numba is missing.
+        One pattern at a time, as in the paper, or small blocks of patterns with rates that are bounded for
+        stability. "auto" uses blocks only if numba is missing.
     """
 
     epochs: int = 50_000
@@ -88,14 +91,14 @@ class BackpropOptions:
 
 @dataclass(frozen=True, eq=False)
 class BackpropTrained(Trained):
-    """Networks after training by the rule.
+    """Networks after training by back-propagation.
 
     Attributes
     ----------
     restarts : (G,) int array
-        How often each network diverged and started again.
+        Restarts of each network after it diverged.
     rate_weights : (G,) array
-        Rate of W and V that each network had last.
+        Last rate of W and V of each network.
     """
 
     restarts: NDArray[np.int64] = field(kw_only=True)
@@ -109,9 +112,8 @@ def train_backprop(
 ) -> BackpropTrained:
     """Train a stack of networks by eqs. (9)-(11), with E_orth of eq. (14) where beta > 0.
 
-    The rates of a network are halved whenever its loss has come to rest: a constant rate ends on a
-    small cycle about the optimum, whose excess goes with the rate's square. It has settled when two
-    halvings in succession leave the loss as it was, or when the loss is below the floor.
+    The rates of a network are halved whenever its loss no longer decreases. A network has settled when two
+    successive halvings do not change the loss, or when the loss is below the floor.
 
     Parameters
     ----------
@@ -123,14 +125,14 @@ def train_backprop(
     Returns
     -------
     BackpropTrained
-        Its curve is the loss that is minimised: E_2D, plus beta E_orth for each pattern. A network
-        that diverges at all rates comes back with its initial weights, not settled.
+        Its curve is the loss that is minimised: E_2D, plus beta E_orth for each pattern. A network that
+        diverges at all rates has its initial weights and is not settled.
 
     Raises
     ------
     InputError
-        Weights or patterns that are not finite; E_orth asked of networks for a flat board, whose V
-        lacks the column that makes it a rotation.
+        Weights or patterns that are not finite; E_orth for a flat board, whose V lacks a column of the
+        rotation.
     """
     run = _Run(task, options or BackpropOptions())
     while run.active.any() and run.epoch < run.options.epochs:
@@ -146,7 +148,7 @@ _Entry = TypeVar("_Entry", bound=np.generic)
 
 
 def _presenter(method: str) -> tuple[_Present, _Bound | None]:
-    """Choose what presents the patterns and bounds the rates; numba is imported here and nowhere else."""
+    """Functions that present the patterns and bound the rates; only this imports numba."""
     if method != "blocks":
         from neurocal_cli.training import rule
 
@@ -158,7 +160,7 @@ def _presenter(method: str) -> tuple[_Present, _Bound | None]:
 
 
 class _Run:
-    """A stack in training: its weights, and what decides each network's rates and end."""
+    """A stack of networks in training, with the state of the rates of each network."""
 
     def __init__(self, task: Task, options: BackpropOptions) -> None:
         self.task, self.options = task, options
@@ -177,7 +179,7 @@ class _Run:
         self.restarts = np.zeros(networks, dtype=np.int64)
         self.scale = np.ones(networks)
         self.rate = np.full(networks, options.rate_weights)
-        # When the present rates began, and the loss to which those before them had led.
+        # Checkpoint of the last change of the rates, and the loss before it.
         self.since = np.zeros(networks, dtype=np.int64)
         self.before = np.full(networks, np.inf)
         self.quiet = np.zeros(networks, dtype=np.int64)
@@ -191,7 +193,7 @@ class _Run:
         self.floor = 0.5 * options.floor**2 * self.w.sum(-1)
 
     def _order(self, patterns: Patterns) -> None:
-        """Put the patterns in the order of presentation; those of weight 0 last, never presented."""
+        """Put the patterns in the order of presentation; those of weight 0 are last and never presented."""
         weights = patterns.weights
         self.used = np.count_nonzero(weights > 0, axis=1).astype(np.int64)
         shuffled = np.random.default_rng(0).permutation(weights.shape[1])
@@ -199,12 +201,12 @@ class _Run:
         inputs = np.broadcast_to(patterns.inputs, (len(weights), *patterns.inputs.shape[1:]))
         self.Z = _four_inputs(np.take_along_axis(inputs, self.order[..., None], axis=1))
         self.d = _contiguous(np.take_along_axis(patterns.targets, self.order[..., None], axis=1))
-        # The largest weight is 1, or the rates would mean something else in each task.
+        # The largest weight is 1, so that the rates do not depend on the scale of the weights.
         largest = np.maximum(weights.max(axis=1, keepdims=True), 1e-300)
         self.w = _contiguous(np.take_along_axis(weights / largest, self.order, axis=1))
 
     def loss(self) -> Array:
-        """Sum what is minimised, eq. (14), over the patterns; (G,)."""
+        """The loss that is minimised, eq. (14), summed over the patterns; (G,)."""
         with np.errstate(all="ignore"):
             loss = e_2d(self.W, self.V, self.gamma, Patterns(self.Z, self.d, self.w))
             if self.options.beta > 0:
@@ -212,7 +214,7 @@ class _Run:
         return loss
 
     def advance(self) -> None:
-        """Train to the next checkpoint and judge every network there."""
+        """Train to the next checkpoint and update the rates of every network."""
         options = self.options
         epochs = min(max(_FIRST_CHECK, self.epoch // _CHECKS_PER_LIFE), options.epochs - self.epoch)
         with np.errstate(all="ignore"):
@@ -230,7 +232,7 @@ class _Run:
         self._judge(loss)
 
     def _rates(self) -> Array:
-        """Rate of W and V in each network; halving the scale halves it, bounded or not."""
+        """Rate of W and V of each network, proportional to its scale."""
         rate = np.full(len(self.W), self.options.rate_weights)
         if self.bound is not None:
             rate = np.fmin(rate, self.bound(self.Z, self.w, self.W, self.V, self.gamma, self.used))
@@ -238,7 +240,7 @@ class _Run:
         return self.rate
 
     def _restart(self, diverged: NDArray[np.bool_], loss: Array) -> None:
-        """Send networks that diverged back to their initial weights, at half the rates."""
+        """Restart networks that diverged at their initial weights, with half the rates."""
         for weights, initial in zip((self.W, self.V, self.gamma), self.start, strict=True):
             weights[diverged] = initial[diverged]
         loss[diverged] = self.curve[0][diverged]
@@ -249,7 +251,7 @@ class _Run:
         self.active &= self.restarts <= self.options.halvings
 
     def _judge(self, loss: Array) -> None:
-        """Halve the rates of networks that have come to rest; end those that gain nothing by it."""
+        """Halve the rates where the loss no longer decreases; end networks that gain nothing by it."""
         checkpoint = len(self.curve) - 1
         past = self.curve[max(checkpoint - _WINDOW, 0)]
         least = self.options.tolerance * loss
@@ -284,11 +286,11 @@ class _Run:
 
 
 def _contiguous(array: Array) -> Array:
-    """Copy an array that the kernel will change, in the one layout for which it is compiled."""
+    """A copy that the kernel may change, in the layout for which it is compiled."""
     return np.array(array, dtype=np.float64, order="C")
 
 
 def _four_inputs(array: NDArray[_Entry]) -> NDArray[_Entry]:
-    """Complete the four inputs of the kernel: the one that a flat board's network lacks is 0 and fixed."""
+    """Pad to the four inputs of the kernel; the input that a flat board lacks is 0 and fixed."""
     missing = 4 - array.shape[-1]
     return np.ascontiguousarray(np.pad(array, [(0, 0)] * (array.ndim - 1) + [(0, missing)]))

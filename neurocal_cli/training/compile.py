@@ -21,18 +21,18 @@ def _importable() -> ModuleType | None:
 
 _NUMBA = _importable()
 
-# Whether `jit` compiles or hands the Python source back.
+# Whether `jit` compiles or returns the Python function.
 COMPILING = _NUMBA is not None
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def jit(function: _Function) -> _Function:
-    """Compile a function of numbers and arrays, keeping the machine code on disk where that is possible."""
+    """Compile a function of numbers and arrays, and cache the machine code on disk if possible."""
     if _NUMBA is None:
         return function
     try:
         return cast(_Function, _NUMBA.njit(cache=True)(function))
     except RuntimeError:
-        # Neither the package's folder nor the user's cache can be written: compile each time.
+        # Neither the package's folder nor the user's cache is writable: compile at each start.
         return cast(_Function, _NUMBA.njit(function))

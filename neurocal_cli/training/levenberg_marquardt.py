@@ -1,20 +1,18 @@
 """Networks trained by Levenberg-Marquardt: E_2D with gamma eliminated (variable projection).
 
-Golub and Pereyra (1973) eliminate what is linear. The descent itself is `least_squares`'.
+The linear parameters gamma are eliminated as by Golub and Pereyra (1973). `least_squares` does the descent.
 
-The two layers are linear, so the error depends on the product W V alone: nine directions in which
-W and V compensate each other change nothing. With both layers free the step is therefore taken in
-the product; with V given (the extrinsics are known) it is taken in W.
+The two layers are linear, so the error depends on the product W V alone. If both layers are free, the step is
+that of the product. If V is given (the extrinsics are known), it is that of W.
 
-Random weights put about half of the points behind the camera, and from there a plain descent on
-(5) finds its way in one start of two. The paper begins with every gamma at 1 and lets it go
-slowly, which keeps all points on the same side. The elimination does the same with a stiffness mu
-that is first large and then 0,
+Random weights put about half of the points behind the camera. From there a descent on (5) converges in one
+start of two. In the paper every gamma starts at 1 and changes slowly, which keeps all points on the same
+side. Here a stiffness mu, first large and then 0, has the same effect:
 
     E = 1/2 sum_i w_i (|d_i - gamma_i o_i|^2 + mu (1 - gamma_i)^2),
 
-whose optimal factor is gamma = (d.o + mu) / (o.o + mu). With mu large this is an affine camera, a
-linear problem; when mu is taken away the perspective unfolds from it.
+The optimal factor is gamma = (d.o + mu) / (o.o + mu). A large mu gives an affine camera, which is a linear
+problem. With mu = 0 the descent continues from there to the perspective camera.
 """
 
 from __future__ import annotations
@@ -43,11 +41,11 @@ class LMOptions:
     stiffness : tuple of float
         Values of mu in turn; the last must be 0.
     release : float
-        A stiffness is left as soon as a step lowers E by less than this share.
+        A stiffness ends when a step lowers E by less than this share.
     tolerance : float
-        Training has settled when a step lowers E by less than this share.
+        Training has converged when a step lowers E by less than this share.
     max_iterations : int
-        Steps for each network.
+        Most steps of each network.
     damping : float
         Initial lambda, relative to the mean diagonal of the normal matrix.
     """
@@ -59,9 +57,10 @@ class LMOptions:
     damping: float = 1e-3
 
 
-_FLOOR = 1e-13  # rms error, in units of the normalised image, that rounding alone accounts for
-# Random starts are far from the minimum: lambda falls to a tenth at most, and a step is judged by what it
-# gained. test_convergence.py and test_starts.py hold the share of starts that arrive.
+_FLOOR = 1e-13  # rms error of rounding alone, in units of the normalised image
+# Random starts are far from the minimum: lambda falls to a tenth at most, and the measured gain of a step
+# counts, not the predicted one. test_convergence.py and test_starts.py check the share of starts that
+# converge.
 _FAR = DescentOptions(shrink=0.1, least_damping=1e-12, largest_damping=1e8, by_promise=False, flat=0.0)
 _SOFTENED = 0.1  # share of the initial damping after the stiffness is taken away
 
@@ -72,13 +71,13 @@ def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
     Parameters
     ----------
     task : Task
-        Either both layers free throughout, or V fixed and W free in part, or W fixed and V free.
+        V is free, or V is fixed and W free in part.
     options : LMOptions, optional
 
     Returns
     -------
     Trained
-        Where both layers are free, W keeps its initial value and V takes up the product.
+        If V is free, W keeps its initial value and V is W^-1 times the product.
 
     Raises
     ------
@@ -107,7 +106,7 @@ def train_lm(task: Task, options: LMOptions | None = None) -> Trained:
 
 
 def _split(W: Array, product: Array) -> tuple[Array, Array]:
-    """W as it was and the V that gives the product; the identity where W is nearly singular."""
+    """W and the V that gives the product; W is the identity where it is nearly singular."""
     with np.errstate(over="ignore", invalid="ignore"):
         try:
             V = cast("Array", np.linalg.solve(W, product))
@@ -127,7 +126,7 @@ class _Normal:
         Z, d, w = patterns.inputs, patterns.targets, patterns.weights
         self.n_inputs = Z.shape[2]
         self.Z, self.w = Z, w
-        # One row an output and pattern in the last axis: every operation runs over patterns.
+        # Patterns are the last axis, along which NumPy is fastest.
         self.Zt = np.ascontiguousarray(np.swapaxes(Z, -1, -2))
         self.dt = np.ascontiguousarray(np.swapaxes(d, -1, -2))
         a, b = np.triu_indices(self.n_inputs)
@@ -141,7 +140,7 @@ class _Normal:
 
     def __call__(self, product: Array, mu: float, networks: NDArray[np.intp]) -> tuple[Array, Array, Array]:
         """E (K,), gradient (K, n) and matrix (K, n, n) of some networks, in their order."""
-        # All of them, as in most steps: no copies of the patterns.
+        # A slice avoids copies of the patterns in most steps.
         rows = slice(None) if len(networks) == len(self.w) else networks
         d, w = self.dt[rows], self.w[rows]
         o = product @ self.Zt[rows]
@@ -151,7 +150,7 @@ class _Normal:
         loss = 0.5 * (w * ((error * error).sum(axis=1) + mu * (1 - gamma) ** 2)).sum(axis=1)
         wg = w * gamma
         gradient = -(error * wg[:, None]) @ self.Z[rows]
-        # gamma^2 (I - o o^T / (o.o + mu)): what the elimination leaves of each pattern.
+        # gamma^2 (I - o o^T / (o.o + mu)): the weight of each pattern after the elimination.
         wgg = wg * gamma
         share = (o * (wgg / -norm)[:, None])[:, :, None] * o[:, None]  # (K, 3, 3, N)
         share = share.reshape(len(product), 9, -1)
@@ -175,7 +174,7 @@ class _Networks:
         self.history: list[tuple[NDArray[np.int64], NDArray[np.intp], Array]] = []
 
     def train(self, options: LMOptions) -> None:
-        """Descend with each stiffness in turn; a network that runs out of iterations stays where it is."""
+        """Descend with each stiffness in turn, for networks that have iterations left."""
         networks, damping = np.arange(len(self.loss)), options.damping
         for stage, mu in enumerate(options.stiffness):
             last = stage == len(options.stiffness) - 1
@@ -200,7 +199,7 @@ class _Networks:
         return descent.outcome.stop != Stop.LIMIT
 
     def curve(self, most: int) -> Array:
-        """(K, G) loss of each network after each of its iterations; the last one stays."""
+        """(K, G) loss of each network after each iteration; its last loss is repeated."""
         curve = np.full((most + 1, len(self.loss)), np.nan)
         for iteration, networks, loss in self.history:
             curve[iteration, networks] = loss
@@ -211,7 +210,7 @@ class _Networks:
 
 
 class _Stiffened:
-    """Some networks with one stiffness mu, as `least_squares` sees them; each is a group."""
+    """Networks with one stiffness mu as a problem of `least_squares`; each network is a group."""
 
     def __init__(self, stack: _Networks, mu: float, networks: NDArray[np.intp]) -> None:
         self.stack, self.normal, self.networks, self.mu = stack, stack.normal, networks, mu
@@ -224,18 +223,18 @@ class _Stiffened:
         return self.stack.loss[self.networks]
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Damped step and the loss that it should take off."""
+        """Damped step and the predicted gain."""
         H, g = self.matrix[active], self.gradient[active]  # copies
         diagonal = np.einsum("kii->ki", H)
-        # The mean of the diagonal, not each entry of it, and a second term: where the scale is free nothing
-        # but the damping keeps the matrix regular.
+        # The ridge is proportional to the mean of the diagonal. Where the scale is free, it alone keeps the
+        # matrix regular, so it has a least value.
         ridge = (damping + 1e-14) * diagonal.mean(axis=1) + 1e-300
         diagonal += ridge[:, None]
         step = cast("Array", np.linalg.solve(H, -g[..., None])[..., 0])
         return step, 0.5 * (ridge[:, None] * step**2 - step * g).sum(axis=1)
 
     def move(self, step: Array, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
-        """The products after a step; every product is a network."""
+        """The products after a step; all products are valid."""
         networks = self.networks[active]
         trial = self.stack.product[networks]
         trial.reshape(len(trial), -1)[:, self.normal.free] += step
@@ -246,7 +245,7 @@ class _Stiffened:
         return (trial, loss, gradient, matrix), loss, np.ones(len(trial), dtype=bool)
 
     def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Take over the networks that became better."""
+        """Accept the trial for networks that improved."""
         if not better.all():
             active = active[better]
             trial = (trial[0][better], trial[1][better], trial[2][better], trial[3][better])

@@ -1,7 +1,7 @@
-"""The learning rule of the paper's section 3, a pattern at a time, as a kernel for numba.
+"""Back-propagation of the paper's section 3, one pattern at a time, as a kernel for numba.
 
-Importing this module imports numba where it is installed, so only the trainer does, when it runs.
-No fast-math: the compiled kernel and its plain Python source give the same numbers.
+This module imports numba if it is installed, so only the trainer imports it, when it runs. Fast-math is off:
+the compiled kernel and its Python source give the same numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Mask = NDArray[np.bool_]
 
 @jit
 def descend_orthogonality(V: Array, free: Mask, rate: float, a: float, gradient: Array) -> None:
-    """One step down E_orth of eq. (14), by its true gradient: see `network.e_orth_gradient`."""
+    """One gradient step on E_orth of eq. (14); see `network.e_orth_gradient`."""
     for row in range(3):
         for column in range(3):
             gradient[row, column] = 0.0
@@ -39,7 +39,7 @@ def learn(
     Z: Array, d: Array, w: Array, W: Array, V: Array, gamma: Array, free_W: Mask, free_V: Mask,
     rate_weights: float, rate_gamma: float, pull: float, a: float, epochs: int, used: int,
 ) -> None:  # fmt: skip
-    """Present the first `used` patterns of one network, one by one, `epochs` times."""
+    """Train one network on its first `used` patterns, one by one, for some epochs."""
     Y, error, back, gradient = np.empty(3), np.empty(3), np.empty(3), np.empty((3, 3))
     for _ in range(epochs):
         for i in range(used):
@@ -51,7 +51,7 @@ def learn(
                 error[k] = w[i] * (d[i, k] - gamma[i] * o)
                 along += error[k] * o
                 error[k] *= rate_weights * gamma[i]
-            for j in range(3):  # before W moves
+            for j in range(3):  # before W changes
                 back[j] = error[0] * W[0, j] + error[1] * W[1, j] + error[2] * W[2, j]
             for k in range(3):  # eq. (9)
                 for j in range(3):
@@ -72,7 +72,7 @@ def present(
     rate_weights: Array, rate_gamma: Array, pull: float, a: float, epochs: int, used: NDArray[np.int64],
     active: Mask,
 ) -> None:  # fmt: skip
-    """Let the active networks of a stack learn in place."""
+    """Train the active networks of a stack in place."""
     for g in range(W.shape[0]):
         if active[g]:
             learn(Z[g], d[g], w[g], W[g], V[g], gamma[g], free_W, free_V,

@@ -1,9 +1,9 @@
-"""The learning rule in blocks of patterns, in NumPy: what trains where numba is missing.
+"""Back-propagation in blocks of patterns, in NumPy, for installations without numba.
 
-Plain Python spends 15 us on a pattern, 700 times the compiled kernel. A block's changes are summed
-at the rule's own rates, as if its patterns had been presented at once. What single patterns correct
-in each other a block adds up, so `stable_rate` bounds the rate of the weights by the loss's curvature.
-A stack of networks shares the cost.
+Plain Python takes 15 us for a pattern, 700 times the compiled kernel. The changes of a block are summed, as
+if its patterns had been presented at once. Successive patterns would correct each other, but the changes of
+a block add up. `stable_rate` therefore bounds the rate of the weights by the curvature of the loss. The
+networks of a stack are trained together.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ __all__ = ["BLOCK", "present", "stable_rate"]
 
 BLOCK = 8
 
-# A summed step of 2 over the curvature neither converges nor diverges; the curvature is an upper bound.
+# Steps of 2 over the curvature neither converge nor diverge; this is less, and the curvature an upper bound.
+# test_blocks_do_not_diverge_by_the_rate_of_the_weights repeats it.
 _STABLE = 1.5
 
 Mask = NDArray[np.bool_]
@@ -34,7 +35,7 @@ def _blocks(used: int) -> Iterator[slice]:
 
 
 def stable_rate(Z: Array, w: Array, W: Array, V: Array, gamma: Array, used: NDArray[np.int64]) -> Array:
-    """Bound the rate of W and V at which sums over blocks do not overshoot; (G,)."""
+    """Largest rate of W and V at which sums over blocks do not overshoot; (G,)."""
     weighted = Z * (w * gamma**2)[..., None]
     C = np.swapaxes(weighted, 1, 2) @ Z / used[:, None, None]
     by_W = np.linalg.norm(V @ C @ np.swapaxes(V, 1, 2), axis=(1, 2))
@@ -47,7 +48,7 @@ def present(
     rate_weights: Array, rate_gamma: Array, pull: float, a: float, epochs: int, used: NDArray[np.int64],
     active: Mask,
 ) -> None:  # fmt: skip
-    """Let the active networks of a stack learn in place; the arguments of `rule.present`."""
+    """Train the active networks of a stack in place; the arguments are those of `rule.present`."""
     W_, V_, gamma_ = W[active], V[active], gamma[active]
     rate, rate_factor = rate_weights[active, None, None], rate_gamma[active, None]
     move_W, move_V = rate * free_W, rate * free_V
@@ -67,6 +68,6 @@ def present(
             factor += rate_factor * (error * o).sum(-1)  # eq. (11)
             W_ += move_W * (scaled @ Y)  # eq. (9)
             V_ += move_V * change_V  # eq. (10)
-    # A fixed weight keeps every bit, also where 0 times a change is nan or turns -0 into 0.
+    # Fixed weights stay the same to the last bit, even where 0 times a change is nan or -0 becomes 0.
     W[active], V[active] = np.where(free_W, W_, W[active]), np.where(free_V, V_, V[active])
     gamma[active] = gamma_

@@ -1,7 +1,7 @@
 """Random starts, repeated until two of them agree.
 
-A single training from random weights may end in the wrong place. Two that end at the same lowest
-loss, with all points on the same side of the camera, are a cheap certificate that they found it.
+Training from random weights may end in a local minimum. Two starts that end at the same lowest loss, with all
+points on the same side of the camera, have most probably found the global minimum.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ __all__ = ["Agreement", "FixedWeights", "Learnt", "learn"]
 
 @dataclass(frozen=True)
 class Agreement:
-    """When two losses are the same.
+    """Tolerances within which two losses are the same.
 
     Parameters
     ----------
     relative : float
         Difference in rms error, as a share of it.
     absolute : float
-        The same in normalised pixels: what the trainer cannot resolve.
+        The same in normalised pixels, the accuracy of the trainer.
     """
 
     relative: float = 1e-4
@@ -59,7 +59,7 @@ class Learnt:
     rms : (K,) array
         Network error in normalised pixels.
     starts, agreed : (K,) int arrays
-        Starts used and how many of them ended at the best.
+        Number of starts, and number of those that ended at the best loss.
     iterations : int
         Of all the starts together.
     in_front : (K,) bool array
@@ -91,7 +91,7 @@ def learn(
     fixed: FixedWeights | None = None,
     agreement: Agreement | None = None,
 ) -> Learnt:
-    """Train each network from random weights until two starts agree or `limit` are spent.
+    """Train each network from random weights until two starts agree, with `limit` starts at most.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ class _Search:
         self.curve = np.zeros(0)
 
     def train(self, views: NDArray[np.intp], count: int, trainer: Trainer, rng: np.random.Generator) -> None:
-        """`count` more starts for each of these views."""
+        """Train `count` more starts of each of these views."""
         networks = np.repeat(views, count)
         patterns = self.patterns.take(networks)
         W, V = random_weights(rng, len(networks), patterns.n_inputs)
@@ -149,7 +149,7 @@ class _Search:
         depth = output(trained.W, trained.V, patterns.inputs)[..., 2]
         real = patterns.weights > 0
         rms = patterns.rms(trained.loss)
-        # A loss that overflowed must not win: nothing is below nan.
+        # A loss that overflowed to nan must not be chosen.
         in_front = ((~real | (depth > 0)).all(1) | (~real | (depth < 0)).all(1)) & np.isfinite(rms)
         for start in range(count):
             self._keep(views, slice(start, None, count), trained, rms, in_front, start)
@@ -163,7 +163,7 @@ class _Search:
         in_front: NDArray[np.bool_],
         start: int,
     ) -> None:
-        """Enter one start of each view into the record; points on both sides of a camera lose."""
+        """Compare one start of each view with its best so far; all points on one side is better."""
         rms, in_front = rms[which], in_front[which]
         old, old_front = self.rms[views], self.in_front[views]
         close = self.agreement.relative * np.minimum(rms, old) + self.agreement.absolute

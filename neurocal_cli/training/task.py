@@ -1,4 +1,4 @@
-"""The one interface between the calibrating network and whatever trains it."""
+"""The interface between the calibrating network and its trainers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Task:
     V : (G, 3, I) array
         Initial hidden weights.
     free_W, free_V : bool arrays (3, 3) and (3, I)
-        Which weights may move; the others keep their initial values.
+        Which weights are free; the others keep their initial values.
     """
 
     patterns: Patterns
@@ -50,9 +50,9 @@ class Trained:
     loss : (G,) array
         E_2D.
     iterations : (G,) int array
-        Steps (epochs for backprop) that each network took.
+        Iterations (epochs of back-propagation) of each network.
     settled : (G,) bool array
-        Whether training stopped by itself, not at its limit.
+        Whether training converged before its limit of iterations.
     curve : (K, G) array
         Loss of each network along its training.
     """
@@ -67,12 +67,12 @@ class Trained:
 
     @property
     def product(self) -> Array:
-        """W V, all that the network's output depends on; (G, 3, I)."""
+        """W V, which determines the network's output; (G, 3, I)."""
         return self.W @ self.V
 
 
 class Trainer(Protocol):
-    """Anything that trains a stack of networks."""
+    """A function that trains a stack of networks."""
 
     def __call__(self, task: Task) -> Trained:
         """Lower E_2D from the task's initial weights."""
