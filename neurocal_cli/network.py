@@ -28,13 +28,9 @@ from neurocal_cli.geometry import Array
 __all__ = [
     "Gradients",
     "Patterns",
-    "denormalise",
     "e_2d",
     "e_orth",
     "e_orth_gradient",
-    "e_orth_jacobian",
-    "e_pixel",
-    "e_pixel_gradient",
     "gradients",
     "optimal_gamma",
     "output",
@@ -178,46 +174,3 @@ def e_orth_gradient(V: Array, a: float = 1.0) -> Array:
     gradient = np.zeros_like(V)
     gradient[..., :, :3] = (factor * gram) @ M
     return gradient
-
-
-def e_orth_jacobian(V: Array, a: float = 1.0) -> tuple[Array, Array]:
-    """The six terms whose squares add up to E_orth, eq. (13), and their derivative by V.
-
-    Returns
-    -------
-    residuals : (G, 6) array
-        v_1.v_1 - a, v_1.v_2, v_1.v_3, v_2.v_2 - a, v_2.v_3, v_3.v_3 - a.
-    jacobian : (G, 6, 3, I) array
-    """
-    M = _rotation_part(V)
-    rows, columns = np.triu_indices(3)
-    residuals = (M @ np.swapaxes(M, -1, -2) - a * np.eye(3))[..., rows, columns]
-    jacobian = np.zeros((*V.shape[:-2], 6, *V.shape[-2:]))
-    for term, (i, j) in enumerate(zip(rows, columns, strict=True)):
-        jacobian[..., term, i, :3] += M[..., j, :]
-        jacobian[..., term, j, :3] += M[..., i, :]
-    return residuals, jacobian
-
-
-def e_pixel(W: Array, V: Array, patterns: Patterns) -> Array:
-    """The literal pixel error, eq. (4), in normalised pixels; (G,)."""
-    o = output(W, V, patterns.inputs)
-    error = o[..., :2] / o[..., 2:] - patterns.targets[..., :2]
-    return np.asarray((patterns.weights * (error**2).sum(-1)).sum(-1))
-
-
-def e_pixel_gradient(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Array]:
-    """Exact gradient of eq. (4) by W (G, 3, 3) and V (G, 3, I)."""
-    Z = patterns.inputs
-    Y = Z @ np.swapaxes(V, -1, -2)
-    o = Y @ np.swapaxes(W, -1, -2)
-    image = o[..., :2] / o[..., 2:]
-    error = 2 * patterns.weights[..., None] * (image - patterns.targets[..., :2])
-    by_o = np.concatenate([error, -(error * image).sum(-1, keepdims=True)], axis=-1) / o[..., 2:]
-    by_o_t = np.swapaxes(by_o, -1, -2)
-    return by_o_t @ Y, np.swapaxes(W, -1, -2) @ (by_o_t @ Z)
-
-
-def denormalise(W: Array, V: Array, S1: Array, S2: Array) -> Array:
-    """P = S1 W V S2, eq. (12), for V of four inputs; (G, 3, 4)."""
-    return S1 @ W @ V @ S2

@@ -18,7 +18,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, euler_to_rotation, similarity
 from neurocal_cli.network import (
     Patterns,
-    denormalise,
     e_2d,
     e_orth,
     e_orth_gradient,
@@ -28,8 +27,8 @@ from neurocal_cli.network import (
     random_weights,
     residual_jacobian,
 )
+from neurocal_cli.training import backprop_blocks as blocks
 from neurocal_cli.training import compile  # noqa: A004
-from neurocal_cli.training import rule_in_blocks as blocks
 from neurocal_cli.training.backprop import BackpropOptions, train_backprop
 from neurocal_cli.training.task import Task
 
@@ -164,17 +163,17 @@ def least_loss(product: Array, patterns: Patterns) -> float:
 
 
 def intrinsic_errors(scene: Scene, product: Array) -> Array:
-    P = denormalise(np.eye(3)[None], product, scene.S1, scene.S2)
+    P = scene.S1 @ product @ scene.S2  # eq. (12)
     found = [decompose(each, scene.world)[0].values() for each in P]
     return np.abs(np.array(found) - scene.intrinsics.values())
 
 
 def plain_rule(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The kernel's module loaded once more, without a compiler."""
-    from neurocal_cli.training import rule
+    from neurocal_cli.training import backprop_kernel
 
     monkeypatch.setattr(compile, "_NUMBA", None)
-    spec = util.spec_from_file_location("plain_rule", rule.__file__)
+    spec = util.spec_from_file_location("plain_rule", backprop_kernel.__file__)
     assert spec is not None
     assert spec.loader is not None
     module = util.module_from_spec(spec)
@@ -222,9 +221,9 @@ def test_a_block_moves_the_weights_down_the_exact_gradient(points: int, method: 
 def present(method: Method) -> Any:
     if method == "blocks":
         return blocks.present
-    from neurocal_cli.training import rule
+    from neurocal_cli.training import backprop_kernel
 
-    return rule.present
+    return backprop_kernel.present
 
 
 def test_the_orthogonality_term_moves_v_down_its_exact_gradient(method: Method) -> None:
@@ -243,12 +242,12 @@ def test_compiled_and_plain_kernels_give_the_same_numbers(
     pull: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("numba")
-    from neurocal_cli.training import rule
+    from neurocal_cli.training import backprop_kernel
 
     compiled = kernel_arguments(15, pull, epochs=20)
     compiled["free_W"][1, 0] = compiled["free_V"][2, 1] = False
     plain = copies(compiled)
-    rule.present(**compiled)
+    backprop_kernel.present(**compiled)
     plain_rule(monkeypatch).present(**plain)
     for name in ("W", "V", "gamma"):
         np.testing.assert_allclose(plain[name], compiled[name], rtol=0, atol=1e-12)
@@ -503,16 +502,16 @@ def run(code: str) -> str:
 
 
 def test_numba_is_imported_only_by_the_compiled_kernel() -> None:
-    load = "import sys; from neurocal_cli.training import backprop, rule_in_blocks;"
+    load = "import sys; from neurocal_cli.training import backprop, backprop_blocks;"
     assert run(f"{load} print('numba' in sys.modules)") == "False\n"
 
 
 def test_without_numba_training_goes_in_blocks() -> None:
     code = (
         "import sys; sys.modules['numba'] = None\n"
-        "from neurocal_cli.training import backprop, rule, rule_in_blocks as blocks\n"
-        "print(rule.COMPILING, backprop._presenter('auto')[0] is blocks.present,"
-        " backprop._presenter('patterns')[0] is rule.present)"
+        "from neurocal_cli.training import backprop, backprop_kernel, backprop_blocks as blocks\n"
+        "print(backprop_kernel.COMPILING, backprop._presenter('auto')[0] is blocks.present,"
+        " backprop._presenter('patterns')[0] is backprop_kernel.present)"
     )
     assert run(code) == "False True True\n"
 

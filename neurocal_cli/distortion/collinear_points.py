@@ -103,8 +103,7 @@ def _along_edges(points: Correspondences, row: Index, first: Index) -> tuple[Ind
     after = np.minimum(place + 1, (first + counts - 1)[line])
     n = unit(points.across)[row]
     slant = np.abs((n * unit(pixels[row[after]] - pixels[row[before]])).sum(axis=1))
-    keep = ~np.logical_or.reduceat(slant > _ALONG, first)
-    return row[np.repeat(keep, counts)], np.cumsum(counts[keep]) - counts[keep]
+    return _kept(row, counts, ~np.logical_or.reduceat(slant > _ALONG, first))
 
 
 def _run_starts(sorted_labels: NDArray[np.int64]) -> Index:
@@ -116,7 +115,11 @@ def _run_starts(sorted_labels: NDArray[np.int64]) -> Index:
 def _enough(row: Index, first: Index, fewest: int) -> tuple[Index, Index]:
     """Drop lines with too few points."""
     counts = np.diff(first, append=len(row))
-    keep = counts >= fewest
+    return _kept(row, counts, counts >= fewest)
+
+
+def _kept(row: Index, counts: Index, keep: NDArray[np.bool_]) -> tuple[Index, Index]:
+    """Rows and first entries of the lines to keep."""
     kept = counts[keep]
     return row[np.repeat(keep, counts)], np.cumsum(kept) - kept
 
@@ -125,10 +128,7 @@ def _thinned(row: Index, first: Index) -> CollinearPoints:
     """An even choice of the lines where there are very many."""
     every = -(-len(row) // _MOST_PLACES)
     if every > 1:
-        counts = np.diff(first, append=len(row))
-        keep = np.arange(len(first)) % every == 0
-        row, kept = row[np.repeat(keep, counts)], counts[keep]
-        first = np.cumsum(kept) - kept
+        row, first = _kept(row, np.diff(first, append=len(row)), np.arange(len(first)) % every == 0)
     return CollinearPoints(row, first)
 
 

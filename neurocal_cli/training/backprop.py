@@ -150,11 +150,11 @@ _Entry = TypeVar("_Entry", bound=np.generic)
 def _presenter(method: str) -> tuple[_Present, _Bound | None]:
     """Functions that present the patterns and bound the rates; only this imports numba."""
     if method != "blocks":
-        from neurocal_cli.training import rule
+        from neurocal_cli.training import backprop_kernel as kernel
 
-        if rule.COMPILING or method == "patterns":
-            return rule.present, None
-    from neurocal_cli.training import rule_in_blocks as blocks
+        if kernel.COMPILING or method == "patterns":
+            return kernel.present, None
+    from neurocal_cli.training import backprop_blocks as blocks
 
     return blocks.present, blocks.stable_rate
 

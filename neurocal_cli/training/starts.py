@@ -63,7 +63,7 @@ class Learnt:
     iterations : int
         Of all the starts together.
     in_front : (K,) bool array
-        Whether all points lie on one side of the camera.
+        Whether all points are on one side of the camera.
     curve : (J,) array
         Rms error of the best start of the first view along its training.
     """
@@ -104,7 +104,7 @@ def learn(
     fixed : FixedWeights, optional
     agreement : Agreement, optional
     """
-    search = _Search(patterns, fixed or FixedWeights(), agreement or Agreement())
+    search = _BestStarts(patterns, fixed or FixedWeights(), agreement or Agreement())
     open_views = np.arange(len(patterns.weights))
     round_size = 2
     while open_views.size:
@@ -118,7 +118,7 @@ def learn(
     return search.result()
 
 
-class _Search:
+class _BestStarts:
     def __init__(self, patterns: Patterns, fixed: FixedWeights, agreement: Agreement) -> None:
         K = len(patterns.weights)
         self.patterns, self.fixed, self.agreement = patterns, fixed, agreement

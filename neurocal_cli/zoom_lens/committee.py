@@ -27,7 +27,8 @@ from neurocal_cli.zoom_lens.setting_normals import Normal
 
 __all__ = ["TOPOLOGIES", "Budget", "fit_committee", "suitable_topologies"]
 
-# The two slow tests of tests/test_zoom_lens.py measure the errors that these choices reach between settings.
+# Two slow tests of tests/test_zoom_lens.py, with 45 settings and of a real lens, measure the errors that
+# these choices, `Budget` and `Schedule` reach between settings.
 # (own, hidden): tanh units of the first layer for each control, units of the second.
 TOPOLOGIES = ((0, 0), (1, 0), (2, 0), (3, 0), (1, 1), (2, 1), (1, 2), (2, 2), (1, 3), (2, 3))
 # Three values of a control determine no more than its rational unit, so it has no tanh units of its own.

@@ -17,6 +17,7 @@ from neurocal_cli.zoom_lens.initialisation import (
     Progress,
     calibrate_settings,
     check_settings,
+    may_reject,
     without,
 )
 from neurocal_cli.zoom_lens.joint_training import Joint
@@ -114,7 +115,7 @@ def _train(
     """Steps 2 and 3, with rejection of settings that contradict all others."""
     while True:
         joints = train_all(start, options, options.budget, report)
-        if not reject or len(start.rejected) >= max(1, start.lens.n_settings // 5):
+        if not reject or not may_reject(start.rejected, start.lens):
             return start, joints
         errors = left_out_errors(start, joints[0])
         suspect = most_suspect(errors.pixels, errors.normalised)

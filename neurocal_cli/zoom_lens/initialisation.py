@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,7 +22,15 @@ from neurocal_cli.zoom_lens.static_calibration import (
 )
 from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting
 
-__all__ = ["CalibratedSettings", "FitOptions", "Progress", "calibrate_settings", "check_settings", "without"]
+__all__ = [
+    "CalibratedSettings",
+    "FitOptions",
+    "Progress",
+    "calibrate_settings",
+    "check_settings",
+    "may_reject",
+    "without",
+]
 
 Progress = Callable[[str, float], None]
 
@@ -92,12 +100,17 @@ def calibrate_settings(
                 "moved, give several views of the board at each setting, and --camera moving"
             )
         bad = bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if reject else None
-        if bad is None or len(rejected) >= max(1, lens.n_settings // 5):
+        if bad is None or not may_reject(rejected, lens):
             return CalibratedSettings(lens, data, static, tables, tuple(rejected))
         setting, reason = bad
         rejected.append(RejectedSetting(tuple(lens.settings[setting].tolist()), reason))
         keep = np.arange(lens.n_settings) != setting
         lens, data, static = without(lens, static, keep, model, options)
+
+
+def may_reject(rejected: Sequence[RejectedSetting], lens: LensPoints) -> bool:
+    """Whether fewer than a fifth of the settings are rejected; one always may be."""
+    return len(rejected) < max(1, lens.n_settings // 5)
 
 
 def without(

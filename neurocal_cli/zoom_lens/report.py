@@ -18,6 +18,12 @@ from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 __all__ = ["camera_report", "evaluation_json", "evaluation_report", "lens_report"]
 
 _MOST_SETTINGS = 8
+_SCALES = {"log": "logarithmic", "linear": "linear", "inverse": "reciprocal"}
+_TRAININGS = {
+    "joint": "trained jointly",
+    "alternating": "trained alternately",
+    "one at a time": "trained one at a time",
+}
 _UNITS = {"alpha_u": "px", "alpha_v": "px", "u0": "px", "v0": "px"}
 
 
@@ -39,23 +45,11 @@ def lens_report(lens: ZoomLens) -> str:
             "px; "
             f"cross-validation error, each setting left out in turn: {lens.left_out_px:.3f} px"
         )
-    tail.append(
-        f"networks: committee of {len(lens.members)}, alpha on a {_scale_text(lens)} scale, {_training(lens)}"
-    )
+    scale = _SCALES[lens.members[0].nets.scale]
+    training = _TRAININGS.get(lens.training, lens.training)
+    tail.append(f"networks: committee of {len(lens.members)}, alpha on a {scale} scale, {training}")
     tail.append("converged" if lens.converged else "not converged: training stopped before the error settled")
     return "\n\n".join([*blocks, "\n".join(tail)])
-
-
-def _training(lens: ZoomLens) -> str:
-    return {
-        "joint": "trained jointly",
-        "alternating": "trained alternately",
-        "one at a time": "trained one at a time",
-    }.get(lens.training, lens.training)
-
-
-def _scale_text(lens: ZoomLens) -> str:
-    return {"log": "logarithmic", "linear": "linear", "inverse": "reciprocal"}[lens.members[0].nets.scale]
 
 
 def _scatter_text(lens: ZoomLens, scatter: list[float]) -> str:
@@ -103,7 +97,7 @@ def camera_report(calibration: Calibration) -> str:
 
 def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...]) -> str:
     """Errors of a lens as aligned text: overall, of the baselines, at the worst settings."""
-    shown = sorted(evaluation.settings, key=lambda setting: -_or_zero(setting.rmse_px))[:_MOST_SETTINGS]
+    shown = sorted(evaluation.settings, key=lambda setting: -np.nan_to_num(setting.rmse_px))[:_MOST_SETTINGS]
     settings = [[*controls, "points", "rms [px]", "max [px]"]]
     for setting in shown:
         numbers = [f"{setting.values[name]:.10g}" for name in controls]
@@ -148,10 +142,6 @@ def evaluation_json(evaluation: LensEvaluation) -> dict[str, Any]:
         ],
         "rivals": {name: number_or_none(value) for name, value in evaluation.baselines.items()},
     }
-
-
-def _or_zero(value: float) -> float:
-    return value if math.isfinite(value) else 0.0
 
 
 def _pixels(value: float) -> str:

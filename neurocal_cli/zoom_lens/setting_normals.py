@@ -67,7 +67,7 @@ class Normal:
     cost : (S,) array [px^2]
         Sum of squared residuals.
     sensible : bool
-        Whether all points lie in front of the camera and the distortion is monotonic there.
+        Whether all points are in front of the camera and the distortion is monotonic there.
     """
 
     H: Array

@@ -35,11 +35,11 @@ def train_all(
     joints = []
     for k, nets in enumerate(members):
 
-        def tell(share: float, k: int = k) -> None:
+        def report_share(share: float, k: int = k) -> None:
             report("all networks together", (k + share) / len(members))
 
         arguments = start.data, x, nets, start.tables.constants, start.variance, scatter
-        joints.append(train_joint(*arguments, tell, descend))
+        joints.append(train_joint(*arguments, report_share, descend))
     joints = [joint for joint in joints if np.isfinite(joint.evidence)]
     if not joints:
         raise DegenerateGeometryError(

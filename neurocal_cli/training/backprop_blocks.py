@@ -48,7 +48,7 @@ def present(
     rate_weights: Array, rate_gamma: Array, pull: float, a: float, epochs: int, used: NDArray[np.int64],
     active: Mask,
 ) -> None:  # fmt: skip
-    """Train the active networks of a stack in place; the arguments are those of `rule.present`."""
+    """Train the active networks of a stack in place; the arguments are those of `backprop_kernel.present`."""
     W_, V_, gamma_ = W[active], V[active], gamma[active]
     rate, rate_factor = rate_weights[active, None, None], rate_gamma[active, None]
     move_W, move_V = rate * free_W, rate * free_V
