@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.errors import UsageError
 
@@ -83,10 +84,11 @@ def triangulate(
             "RIGHT.yaml MATCHES.csv"
         )
     check_one_stdin(*inputs)
+    check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
-    from neurocal_cli.io.files import write_chunks
     from neurocal_cli.io.matches_csv import read_matches
     from neurocal_cli.io.points_in_space_csv import format_space_points
+    from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
 
     sigma = rig.sigma if sigma is None else sigma
