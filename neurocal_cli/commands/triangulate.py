@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["triangulate"]
 
+_LARGEST_SIGMA = 1e6  # px; no image is that large
 _MANY_OFF = 0.5  # share of the points that no bad luck explains
 
 
@@ -83,6 +84,8 @@ def triangulate(
             f"{len(inputs)} file{'s' * (len(inputs) > 1)} given; give RIG.yaml MATCHES.csv, or LEFT.yaml "
             "RIGHT.yaml MATCHES.csv"
         )
+    if sigma is not None and sigma > _LARGEST_SIGMA:
+        raise UsageError(f"--sigma is {sigma:g}; give the standard deviation of the pixels, such as 0.3")
     check_one_stdin(*inputs)
     check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
