@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import gc
+import signal
 import sys
 import warnings
 
@@ -20,6 +21,8 @@ def main() -> None:
     # time on 1000 views; looking once more at the exit, through every module, took 25 ms of any command.
     gc.set_threshold(300_000, 20, 20)
     atexit.register(gc.freeze)
+    # Ended as if interrupted: what is half written is cleared away.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         from neurocal_cli.commands import neurocal
 

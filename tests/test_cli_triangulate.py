@@ -235,3 +235,9 @@ def test_memory_does_not_grow_with_the_rows(folder: Path, tmp_path: Path) -> Non
         subprocess.run([*command, "-o", tmp_path / "xyz.csv"], check=True, capture_output=True)
         peaks.append(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
     assert peaks[1] < 1.1 * peaks[0]
+
+
+def test_a_standard_deviation_that_no_image_has_is_refused(folder: Path) -> None:
+    result = run("triangulate", folder / "rig.yaml", folder / "matches.csv", "--sigma", "1e308")
+    assert result.exit_code == 2
+    assert "give the standard deviation of the pixels" in result.stderr

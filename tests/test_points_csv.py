@@ -363,3 +363,12 @@ def test_any_junk_is_read_or_refused_in_one_line(data):
         message = str(error)
     assert message.startswith("junk.csv")
     assert message.isprintable()
+
+
+def test_a_million_columns_do_not_hang(tmp_path: Path) -> None:
+    """Comparing each name with all others would take hours."""
+    file = tmp_path / "wide.csv"
+    names = ",".join(f"c{k}" for k in range(1_000_000))
+    file.write_text(f"{names}\n{'1,' * 999_999}1\n")
+    with pytest.raises(NeurocalError, match="columns X, Y, Z, u, v missing"):
+        read_points(file)

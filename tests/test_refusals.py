@@ -133,7 +133,7 @@ def test_the_refusal_of_parallel_boards_says_that_they_are_and_what_to_do() -> N
 @pytest.mark.parametrize(
     ("type", "skew", "n", "words"),
     [
-        (1, True, 5, "10 equations for 11 unknowns; give at least 6 points, or more"),
+        (1, True, 5, "10 equations for 11 unknowns; give at least 6 points, or known"),
         (1, False, 5, "10 equations for 10 unknowns; give at least 6 points"),
         (2, True, 4, "8 equations for 9 unknowns; give at least 5 points"),
         (2, False, 4, "8 equations for 8 unknowns; give at least 5 points"),
@@ -453,5 +453,7 @@ def test_all_but_one_point_in_a_plane_do_not_determine_a_camera(skew: bool) -> N
 )
 def test_values_of_the_wrong_kind_are_named(options: dict[str, Any]) -> None:
     points = Correspondences(FOLDED, FOLDED[:, :2])
-    with pytest.raises(NeurocalError, match=r"whole number|intrinsics|image centre|type must be"):
+    with pytest.raises(
+        NeurocalError, match=r"whole number|camera must be|intrinsics|image centre|type must be"
+    ):
         calibrate(points, **options)

@@ -71,7 +71,9 @@ class _LazyGroup(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command."""
-        with _one_line_errors():
+        from neurocal_cli.io.outputs import all_or_none
+
+        with _one_line_errors(), all_or_none(finishing=(click.exceptions.Exit,)):
             return super().invoke(ctx)
 
     def _load(self, name: str) -> None:

@@ -9,6 +9,7 @@ import click
 
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.options import Command, check_plot, output_option, plot_option, points_argument
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.errors import UsageError
@@ -76,6 +77,7 @@ def calibrate(
     estimation.check()
     check_one_stdin(*points, *estimation.stdin_candidates)
     _check_outputs(output, plot, camera_name)
+    check_outputs((output, plot), (*points, estimation.intrinsics, estimation.extrinsics))
     calibration = _estimate(points, estimation, camera_name)
     _write(calibration, output, plot)
     _report(calibration)
@@ -108,7 +110,7 @@ def _write(calibration: Calibration, output: str, plot: str | None) -> None:
     from neurocal_cli.io.calibration_yaml import write_calibration
 
     if plot is not None:
-        from neurocal_cli.io.files import write_whole
+        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.plots import draw_calibration
 
         write_whole(plot, draw_calibration(calibration, os.path.splitext(plot)[1][1:].lower()))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, one_line, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
@@ -134,7 +135,7 @@ def detect(
     check_one_stdin(*images, board)
     compute_in_one_thread()
     target = _board(board, cols, rows, square, unit)
-    outcomes = _examined(images, target, points, gamma, overlay, jobs)
+    outcomes = _examined(images, target, board, output, points, gamma, overlay, jobs)
     _report(outcomes)
     _write(outcomes, target, overlay, output)
 
@@ -163,6 +164,8 @@ def _board(
 def _examined(
     words: tuple[str, ...],
     board: Board,
+    board_file: str | None,
+    output: str,
     points: str,
     gamma: float | None,
     overlay: str | None,
@@ -174,6 +177,7 @@ def _examined(
 
     paths = find_images(words)
     names = view_names(paths)
+    check_outputs((output,), (*paths, board_file))
     if overlay is not None:
         _check_overlay(overlay, paths)
     strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
@@ -225,8 +229,8 @@ def _some(names: Sequence[str]) -> str:
 
 def _write(outcomes: Sequence[tuple[str, Outcome]], board: Board, overlay: str | None, output: str) -> None:
     from neurocal_cli.detection.detect import gather
-    from neurocal_cli.io.files import write_whole
     from neurocal_cli.io.points_csv import format_points
+    from neurocal_cli.io.writing import write_whole
 
     found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
     text = format_points(gather(found, board.unit))

@@ -17,6 +17,7 @@ from neurocal_cli.commands.options import (
     json_option,
     output_option,
 )
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
@@ -172,6 +173,7 @@ def fit(
     compute_in_one_thread()
     check_one_stdin(*points)
     _check_plot(plot, output)
+    check_outputs((output, plot), points)
     learnt = _learn(points, distortion, training, camera, hidden, outliers, no_skew, seed)
     _write(learnt, output, plot)
     from neurocal_cli.zoom_lens.report import lens_report
@@ -235,7 +237,7 @@ def _write(learnt: ZoomLens, output: str, plot: str | None) -> None:
     from neurocal_cli.io.lens_yaml import write_lens
 
     if plot is not None:
-        from neurocal_cli.io.files import write_whole
+        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.zoom_lens.plots import draw_lens
 
         write_whole(plot, draw_lens(learnt, os.path.splitext(plot)[1][1:].lower()))
@@ -283,6 +285,7 @@ def camera(
     compute_in_one_thread()
     if not camera_name.strip() or not camera_name.isprintable():
         raise UsageError("--camera-name must hold printable characters only; give another name")
+    check_outputs((output,), (lens_file,))
     from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.lens_yaml import read_lens
     from neurocal_cli.zoom_lens.camera_at import camera_at
@@ -328,6 +331,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     compute_in_one_thread()
     check_one_stdin(lens_file, points)
     _check_plot(plot, None)
+    check_outputs((plot,), (lens_file, points))
     from neurocal_cli.io.lens_points import read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens
     from neurocal_cli.zoom_lens.evaluation import evaluate_lens
@@ -339,7 +343,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     note(notes)
     evaluation = evaluate_lens(learnt, data)
     if plot is not None:
-        from neurocal_cli.io.files import write_whole
+        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.zoom_lens.plots import draw_evaluation
 
         write_whole(plot, draw_evaluation(evaluation, learnt.controls, os.path.splitext(plot)[1][1:].lower()))

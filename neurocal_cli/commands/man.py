@@ -68,7 +68,7 @@ def man(ctx: click.Context, directory: str) -> None:
     Examples:
       neurocal man man
     """  # noqa: D301 - as in the group
-    from neurocal_cli.io.files import write_whole
+    from neurocal_cli.io.writing import write_whole
 
     os.makedirs(directory, exist_ok=True)
     for name, page in man_pages(ctx.find_root().command).items():

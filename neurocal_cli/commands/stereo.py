@@ -10,6 +10,7 @@ import click
 
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
 from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option, plot_option
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.errors import UsageError
@@ -117,6 +118,7 @@ def stereo(
     check_one_stdin(left, right, left_intrinsics, right_intrinsics)
     check_plot(plot, output)
     _check_outputs(output, ros)
+    check_outputs((output, plot, *(ros or ())), (left, right, left_intrinsics, right_intrinsics))
     rig = _estimate((left, right), sides, estimation)
     _write(rig, output, alpha, ros, plot)
     _report(rig)
@@ -181,8 +183,8 @@ def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], esti
 
 def _write(rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plot: str | None) -> None:
     """Write all files, the picture drawn before any is touched."""
-    from neurocal_cli.io.files import write_whole
     from neurocal_cli.io.rig_yaml import format_ros_pair, write_rig
+    from neurocal_cli.io.writing import write_whole
 
     if plot is not None:
         from neurocal_cli.plots import draw_rig

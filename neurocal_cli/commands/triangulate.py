@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.errors import UsageError
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["triangulate"]
 
+_LARGEST_SIGMA = 1e6  # px; no image is that large
 _MANY_OFF = 0.5  # share of the points that no bad luck explains
 
 
@@ -82,11 +84,14 @@ def triangulate(
             f"{len(inputs)} file{'s' * (len(inputs) > 1)} given; give RIG.yaml MATCHES.csv, or LEFT.yaml "
             "RIGHT.yaml MATCHES.csv"
         )
+    if sigma is not None and sigma > _LARGEST_SIGMA:
+        raise UsageError(f"--sigma is {sigma:g}; give the standard deviation of the pixels, such as 0.3")
     check_one_stdin(*inputs)
+    check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
-    from neurocal_cli.io.files import write_chunks
     from neurocal_cli.io.matches_csv import read_matches
     from neurocal_cli.io.points_in_space_csv import format_space_points
+    from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
 
     sigma = rig.sigma if sigma is None else sigma

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, is_terminal, note, one_line, say
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
@@ -110,6 +111,7 @@ def undistort(
     folder = _folder(paths, output)
     outputs = [output] if folder is None else [os.path.join(folder, _name(path)) for path in paths]
     _check_outputs(camera, paths, outputs, new_camera)
+    check_outputs((new_camera, *(outputs if folder is None else ())), (camera, *paths))
     work = _Work(read_intrinsics(camera), alpha, interpolation, folder)
     done = _correct_all(work, paths, outputs)
     note(f"{_some(names)}: {text}" for text, names in work.notes.items())
@@ -208,7 +210,7 @@ class _Work:
             What is wrong with it.
         """
         content = self._image(path, output) if _is_image(path) else self._points(path)
-        from neurocal_cli.io.files import write_whole
+        from neurocal_cli.io.writing import write_whole
 
         if self.folder is not None:
             os.makedirs(self.folder, exist_ok=True)
@@ -256,7 +258,7 @@ class _Work:
         """Write the camera of what was corrected."""
         from neurocal_cli.distortion.undistortion import undistorted_camera
         from neurocal_cli.io.camera_info import format_camera_info
-        from neurocal_cli.io.files import write_whole
+        from neurocal_cli.io.writing import write_whole
 
         new = undistorted_camera(self.camera, self.alpha, self.size)
         write_whole(path, format_camera_info(new.name, self.size, new.A))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -161,5 +162,14 @@ def keep_memory() -> None:
 def _start_worker() -> None:
     """Prepare a worker process: its parent handles interrupts, and it uses one core."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     cv2.setNumThreads(1)
     keep_memory()
+
+
+def _end_with_parent() -> None:
+    """End when the parent was killed: a worker would wait for work for ever, and hold its pipes open."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

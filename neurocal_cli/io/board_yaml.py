@@ -9,8 +9,8 @@ import numpy as np
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.io.files import write_whole
 from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, mapping, number, text
 from neurocal_cli.io.yaml_tree import parse_yaml, read_yaml
 

@@ -19,9 +19,9 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
 from neurocal_cli.io.camera_info import camera_info_lines
-from neurocal_cli.io.files import write_whole
 from neurocal_cli.io.rejected_yaml import rejected_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
+from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, flows, mapping, number, quoted, text
 from neurocal_cli.points import Correspondences
 

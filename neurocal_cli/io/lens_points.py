@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.files import read_bytes, write_whole
+from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.lens_cameras import names_cameras, read_cameras, require_setting
 from neurocal_cli.io.points_csv import POINTS, format_points
 from neurocal_cli.io.points_join import correspondences
 from neurocal_cli.io.table import Table, parse_table
+from neurocal_cli.io.writing import write_whole
 from neurocal_cli.zoom_lens.fit_cameras import LensCameras
 from neurocal_cli.zoom_lens.settings import LensPoints, describe
 

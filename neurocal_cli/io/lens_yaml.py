@@ -12,8 +12,8 @@ from neurocal_cli import __version__
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.files import write_whole
 from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import read_yaml
 from neurocal_cli.zoom_lens.mlfn import Topology

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.io.files import write_whole
 from neurocal_cli.io.points_join import ACROSS, COVARIANCE, SETTINGS, correspondences
 from neurocal_cli.io.table import Schema, read_table
+from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
 
 __all__ = ["POINTS", "format_points", "read_points", "write_points"]

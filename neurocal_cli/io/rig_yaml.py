@@ -16,8 +16,8 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.calibration_yaml import calibration_lines
-from neurocal_cli.io.files import write_whole
 from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import read_yaml
 from neurocal_cli.stereo.rectification import Rectification, rectify

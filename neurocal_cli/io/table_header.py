@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
@@ -247,8 +248,8 @@ def _headerless_names(
 
 
 def _check_names(names: list[str], source: str, number: int, schema: Schema) -> None:
-    for name in names:
-        if name and names.count(name) > 1:
+    for name, count in Counter(names).items():
+        if name and count > 1:
             raise FormatError(
                 f"the column {one_line(name[:40])} appears twice; rename or remove one", source, number
             )

@@ -1,0 +1,122 @@
+"""What a command writes: all of it or nothing, and never over a file that it reads.
+
+Within `all_or_none` every file is written beside its place, and all take their places together at the end.
+Files are told apart by their identity on the disk, not by their names: links lead to the same file.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+
+from neurocal_cli.errors import UsageError
+
+__all__ = ["Outputs", "all_or_none", "held_back"]
+
+_Identity = tuple[int, int]  # device and inode
+
+
+class Outputs:
+    """The files that are read and written between the beginning and the end of one command."""
+
+    def __init__(self) -> None:
+        self._inputs: set[_Identity] = set()
+        self._staged: list[tuple[str, str]] = []
+        self._stdout: list[bytes] = []
+
+    def protect(self, *paths: str | None) -> None:
+        """Never write over these files; the ones that do not exist are left to their readers."""
+        for path in paths:
+            if path is not None and path != "-":
+                with suppress(OSError, ValueError):
+                    self.protect_status(os.stat(path))
+
+    def protect_status(self, status: os.stat_result) -> None:
+        """Never write over the file of this status."""
+        self._inputs.add((status.st_dev, status.st_ino))
+
+    def check(self, shown: str, former: os.stat_result | None) -> None:
+        """Refuse to write over an input.
+
+        Raises
+        ------
+        UsageError
+        """
+        if former is not None and (former.st_dev, former.st_ino) in self._inputs:
+            raise UsageError(f"{shown} is an input and would be overwritten; give another output")
+
+    def stage(self, temporary: str, target: str) -> None:
+        """Let a written file take its place at the end."""
+        self._staged.append((temporary, target))
+
+    def hold(self, data: bytes) -> None:
+        """Let this go to stdout at the end."""
+        self._stdout.append(data)
+
+    def commit(self) -> list[bytes]:
+        """Put all files into their places; return what is for stdout."""
+        while self._staged:
+            temporary, target = self._staged[0]
+            os.replace(temporary, target)
+            del self._staged[0]
+        held, self._stdout = self._stdout, []
+        return held
+
+    def discard(self) -> None:
+        """Leave everything as it was."""
+        for temporary, _ in self._staged:
+            with suppress(OSError):
+                os.unlink(temporary)
+        self._staged, self._stdout = [], []
+
+
+_CURRENT: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
+
+
+def held_back() -> Outputs | None:
+    """The outputs of the command that runs; None outside of `all_or_none`: files are written at once."""
+    return _CURRENT.get()
+
+
+@contextmanager
+def all_or_none(finishing: Iterable[type[BaseException]] = ()) -> Iterator[Outputs]:
+    """Hold back everything that is written until the end of the block; leave nothing when it fails.
+
+    Within such a block this one is its part.
+
+    Parameters
+    ----------
+    finishing : exception types
+        That end the block with its work done.
+    """
+    outer = _CURRENT.get()
+    if outer is not None:
+        yield outer
+        return
+    outputs = Outputs()
+    token = _CURRENT.set(outputs)
+    try:
+        yield outputs
+    except tuple(finishing):
+        _finish(outputs)
+        raise
+    except BaseException:
+        outputs.discard()
+        raise
+    else:
+        _finish(outputs)
+    finally:
+        _CURRENT.reset(token)
+
+
+def _finish(outputs: Outputs) -> None:
+    from neurocal_cli.io.writing import write_stdout
+
+    try:
+        for data in outputs.commit():
+            write_stdout(data)
+    except BaseException:
+        outputs.discard()
+        raise

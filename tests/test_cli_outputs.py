@@ -1,0 +1,152 @@
+"""No command writes over what it reads, and of several outputs all are written or none."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.command_line import run
+
+SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one file of each kind."""
+    folder = tmp_path_factory.mktemp("made")
+    for name in ("flat.csv", "board01.png", "matches.csv", "stereo_left.csv", "stereo_right.csv"):
+        (folder / name).write_bytes((SAMPLES / name).read_bytes())
+    quick = ("--no-skew", "--distortion", "none", "--outliers", "keep")
+    assert run("calibrate", folder / "flat.csv", *quick, "-o", folder / "camera.yaml").exit_code == 0
+    left, right = folder / "stereo_left.csv", folder / "stereo_right.csv"
+    assert run("stereo", left, right, *quick, "-o", folder / "rig.yaml").exit_code == 0
+    return folder
+
+
+BOARD = ("--cols", 9, "--rows", 6, "--square", 25)
+OVERWRITING = {
+    "detect": ("detect", "board01.png", *BOARD, "-o", "board01.png"),
+    "calibrate": ("calibrate", "flat.csv", "-o", "flat.csv"),
+    "calibrate through a link": ("calibrate", "flat.csv", "-o", "link.csv"),
+    "calibrate, the same file by another name": ("calibrate", "hard.csv", "-o", "flat.csv"),
+    "calibrate --plot": ("calibrate", "flat.csv", "-o", "new.yaml", "--plot", "picture.png"),
+    "calibrate --intrinsics": (
+        "calibrate", "flat.csv", "--type", 3, "--intrinsics", "camera.yaml", "-o", "camera.yaml",
+    ),
+    "stereo": ("stereo", "stereo_left.csv", "stereo_right.csv", "-o", "stereo_left.csv"),
+    "stereo --ros": (
+        "stereo", "stereo_left.csv", "stereo_right.csv", "-o", "new.yaml",
+        "--ros", "stereo_left.csv", "stereo_right.csv",
+    ),
+    "triangulate": ("triangulate", "rig.yaml", "matches.csv", "-o", "rig.yaml"),
+    "undistort": ("undistort", "camera.yaml", "flat.csv", "-o", "flat.csv"),
+    "undistort --camera": (
+        "undistort", "camera.yaml", "flat.csv", "-o", "new.csv", "--camera", "camera.yaml",
+    ),
+}  # fmt: skip
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+@pytest.mark.parametrize("words", OVERWRITING.values(), ids=OVERWRITING.keys())
+def test_an_input_is_never_written_over(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    for path in made.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    monkeypatch.chdir(tmp_path)
+    os.symlink("flat.csv", "link.csv")
+    os.link("flat.csv", "hard.csv")
+    os.symlink("flat.csv", "picture.png")
+    before = contents(tmp_path)
+    result = run(*words)
+    assert result.exit_code == 2
+    assert "is an input and would be overwritten; give another output" in result.stderr
+    assert contents(tmp_path) == before
+
+
+INCOMPLETE = {
+    "undistort": ("undistort", "camera.yaml", "flat.csv", "-o", "us.csv", "--camera", "zz/c.yaml"),
+    "calibrate": ("calibrate", "flat.csv", "--plot", "p.png", "-o", "zz/x.yaml"),
+    "stereo": (
+        "stereo",
+        "stereo_left.csv",
+        "stereo_right.csv",
+        "-o",
+        "r.yaml",
+        "--ros",
+        "a.yaml",
+        "zz/b.yaml",
+    ),
+    "detect": ("detect", "board01.png", *BOARD, "--overlay", "overlays", "-o", "zz/p.csv"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", INCOMPLETE.values(), ids=INCOMPLETE.keys())
+def test_of_several_outputs_none_is_written_when_one_cannot_be(
+    made: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[object, ...]
+) -> None:
+    monkeypatch.chdir(made)
+    before = contents(made)
+    result = run(*words)
+    assert result.exit_code == 1
+    assert result.stderr.count("Error: zz/") == 1
+    assert "its folder does not exist; create it first" in result.stderr
+    assert "parameter" not in result.stderr  # it was known before the work
+    assert contents(made) == before
+
+
+def test_a_failure_at_the_end_leaves_the_other_outputs_as_they_were(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ros, rig = tmp_path / "left.yaml", tmp_path / "rig.yaml"
+    ros.write_text("former")
+    left, right = made / "stereo_left.csv", made / "stereo_right.csv"
+
+    def fail(*args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("neurocal_cli.io.rig_yaml.format_rig", fail)
+    quick = ("--no-skew", "--distortion", "none", "--outliers", "keep")
+    result = run("stereo", left, right, *quick, "-o", rig, "--ros", ros, tmp_path / "right.yaml")
+    assert result.exit_code == 1
+    assert contents(tmp_path) == {"left.yaml": b"former"}
+
+
+def test_two_outputs_in_one_place_are_refused(made: Path, tmp_path: Path) -> None:
+    place = tmp_path / "x.csv"
+    result = run("undistort", made / "camera.yaml", made / "flat.csv", "-o", place, "--camera", place)
+    assert result.exit_code == 2
+    assert not place.exists()
+
+
+def test_a_pipe_that_nobody_reads_is_said_to_be_one(made: Path, tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    words = ["undistort", str(made / "camera.yaml"), str(made / "flat.csv"), "-o", str(pipe)]
+    done = subprocess.run(
+        [sys.executable, "-m", "neurocal_cli", *words],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr == f"Error: {pipe}: nothing reads this pipe; start its reader first\n"
+
+
+def test_a_pipe_that_is_read_gets_everything(made: Path, tmp_path: Path) -> None:
+    pipe, few = tmp_path / "pipe", tmp_path / "few.csv"
+    few.write_text("\n".join((SAMPLES / "flat.csv").read_text().splitlines()[:20]) + "\n")
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        result = run("undistort", made / "camera.yaml", few, "-o", pipe)
+        read = os.read(reader, 1 << 16)
+    finally:
+        os.close(reader)
+    assert result.exit_code == 0
+    assert read.decode() == run("undistort", made / "camera.yaml", few).stdout

@@ -1,0 +1,58 @@
+"""A command that is killed leaves no process behind."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
+
+
+def descendants(pid: int) -> set[int]:
+    """Processes that a process has started, and those that these have."""
+    parents: dict[int, list[int]] = {}
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:  # it has just ended
+            continue
+        if fields[0] != "Z":
+            parents.setdefault(int(fields[1]), []).append(int(stat.parent.name))
+    found, new = set[int](), parents.get(pid, [])
+    while new:
+        found |= set(new)
+        new = [child for one in new for child in parents.get(one, [])]
+    return found
+
+
+def alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="there is no /proc to see processes in")
+@pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGKILL])
+def test_workers_end_with_a_detection_that_is_killed(tmp_path: Path, how: signal.Signals) -> None:
+    picture = (SAMPLES / "board01.png").read_bytes()
+    for k in range(200):
+        (tmp_path / f"{k}.png").write_bytes(picture)
+    words = ["detect", str(tmp_path), "--cols", "9", "--rows", "6", "--square", "25", "--jobs", "2"]
+    command = [sys.executable, "-m", "neurocal_cli", *words, "-o", os.devnull]
+    with subprocess.Popen(command, stderr=subprocess.DEVNULL) as process:
+        end = time.monotonic() + 60
+        while len(started := descendants(process.pid)) < 3:  # two workers and what keeps account of them
+            assert process.poll() is None
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        process.send_signal(how)
+        process.wait(60)
+    end = time.monotonic() + 60
+    while left := {pid for pid in started if alive(pid)}:
+        assert time.monotonic() < end, left
+        time.sleep(0.05)
