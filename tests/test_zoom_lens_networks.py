@@ -81,7 +81,7 @@ def test_a_network_without_weights_under_priors_is_a_plane() -> None:
 
 
 @given(pole=st.floats(1.02, 50), side=st.sampled_from([-1, 1]))
-def test_plane_and_bow_are_any_homographic_function(pole: float, side: int) -> None:
+def test_plane_and_rational_unit_are_any_homographic_function(pole: float, side: int) -> None:
     """1 / (p - x) over the range, p beyond it; and along its tangent, not through the pole, outside."""
     topology = Topology(1, 0, 0)
     x = np.linspace(-1, 1, 21)[:, None]
@@ -279,7 +279,7 @@ def test_the_joint_step_goes_down_the_derivative_of_the_joint_error(scale: str) 
         assert -0.5 * (there - back) / (2 * size) == pytest.approx(downhill[P + q], rel=1e-4)
 
 
-def test_scatter_loosens_the_normal_matrices_as_an_offset_that_is_fitted() -> None:
+def test_scatter_enters_the_normal_matrices_as_an_offset_that_is_fitted() -> None:
     lens, data = still()
     local, constants = begun(lens, data)
     normal, _ = data.linearise(local, constants)

@@ -41,9 +41,9 @@ __all__ = ["PlumbLine", "fit_plumb_line", "lines_in_pixels"]
 _MODEL = "k1k2"
 _CENTRE, _COEFFICIENTS = [3, 4], [5, 6]  # columns of the derivatives
 # Starting values of k1, in units of s. The strongest barrel distortion is a fisheye whose circle is half the
-# image wide. test_wide_lenses_come_close_to_the_joint_fit in tests/test_plumb_line.py needs all of them.
+# image wide. test_wide_lenses_come_close_to_the_joint_fit checks strong distortion.
 _STRENGTHS = (0.0, -0.2, -0.5, -1.0, -2.0, -4.0, -8.0, 0.3, 1.0)
-_CENTRE_STD = 0.25  # of the centre, in units of s; test_the_centre_is_not_biased repeats its effect
+_CENTRE_STD = 0.25  # of the centre, in units of s; test_the_centre_is_not_biased checks it
 _FEWEST_EQUATIONS = 12  # points on lines, less two for each line
 _OPTIONS = DescentOptions(tolerance=1e-10, flat=1e-10, largest_damping=1e8, max_iterations=50)
 _FLOOR = 1e-13  # rms error of rounding alone, in units of s

@@ -22,7 +22,7 @@ from neurocal_cli.stereo.reprojection import Frames, Observations, RigState
 __all__ = ["RigProblem", "free_parameters", "rig_problem"]
 
 # Smaller noise, as a share of the other camera's and in normalised pixels, is rounding in data without noise;
-# test_without_noise_the_truth_comes_back repeats it.
+# test_without_noise_the_truth_comes_back checks such data.
 _LEAST_SHARE = 1e-3
 _LEAST_NOISE = 1e-12
 # Parameters that the entries A11, A12, A22, A13, A23 determine.

@@ -7,9 +7,9 @@ one iteration. With
     p' = p + eta g / h        g = J^T r, h = diag(J^T J): the step,
     w' = argmin sum_s (h_s / eta) (y(x_s; w) - p'_s)^2 / sigma^2 + sum_g a_g |w_g|^2    (one iteration)
 
-the gradient of a network's error is that of the pixel error, so
-alternating training converges to the minimum of `joint_training`, more slowly. All settings take their turn
-at once. The rate eta keeps the networks from all correcting the same error.
+the gradient of a network's error is that of the pixel error, so alternating training converges to the minimum
+of `joint_training`, more slowly. All settings take their turn at once. The rate eta keeps the networks from
+all correcting the same error.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.joint_training import JointLearner
 from neurocal_cli.zoom_lens.parameter_networks import LensNets, outputs_to_local
-from neurocal_cli.zoom_lens.setting_normals import Normal
 
 __all__ = ["take_turns"]
 
@@ -52,11 +51,9 @@ def take_turns(learner: JointLearner) -> float:
 
 def _turn(learner: JointLearner, nets: LensNets, shared: Array, rate: float) -> tuple[LensNets, Array]:
     """One step of the calibrating network at every setting and one iteration of each other network."""
-    normal: Normal = learner.normal
-    local = nets.local(learner.x)
+    normal, local = learner.normal, nets.local(learner.x)
     L = local.shape[1]
-    d = np.column_stack([local - learner.reference, np.broadcast_to(shared, (len(local), len(shared)))])
-    pull = normal.g - (normal.H @ d[..., None])[..., 0]
+    pull = normal.g - learner.error.offset(local, shared)[1]
     _, by_output = outputs_to_local(nets.scale, np.column_stack([net.output(learner.x) for net in nets.nets]))
     # On the scales of the networks' outputs: gradients, second derivatives, and the step.
     gradient = (np.swapaxes(by_output, 1, 2) @ pull[:, :L, None])[..., 0] / learner.variance

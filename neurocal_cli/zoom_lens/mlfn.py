@@ -31,7 +31,8 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["Topology", "respond", "respond_with_jacobian"]
 
-# Keeps the pole 1 % of half the range outside it; test_five_values_tell_close_focus needs a pole so near.
+# Keeps the pole 1 % of half the range outside it or farther. The poles of
+# test_plane_and_rational_unit_are_any_homographic_function come as near as 2 %.
 _LARGEST_TILT = 0.99
 
 

@@ -71,14 +71,14 @@ class QuadraticError:
     normal: Normal
     variance: float
 
-    def _offset(self, local: Array, shared: Array) -> tuple[Array, Array]:
+    def offset(self, local: Array, shared: Array) -> tuple[Array, Array]:
         """Differences from the reference (S, L + Q), and H times these."""
         d = np.column_stack([local - self.reference, np.broadcast_to(shared, (len(local), len(shared)))])
         return d, (self.normal.H @ d[..., None])[..., 0]
 
     def cost(self, model: LocalModel, shared: Array) -> float:
         """2 E after a step `shared` (Q,) of the constants."""
-        d, Hd = self._offset(model.local(self.x), shared)
+        d, Hd = self.offset(model.local(self.x), shared)
         fit = self.normal.cost.sum() + ((Hd - 2 * self.normal.g) * d).sum()
         return float(fit / self.variance + (model.prior * model.weights**2).sum())
 
@@ -86,7 +86,7 @@ class QuadraticError:
         """Gauss-Newton matrix and downhill direction of E over all weights and the constants."""
         local, jacobians = model.local_with_jacobians(self.x)
         J, prior = np.concatenate(jacobians, axis=2), model.prior
-        pull = (self.normal.g - self._offset(local, shared)[1]) / self.variance
+        pull = (self.normal.g - self.offset(local, shared)[1]) / self.variance
         L, P = J.shape[1:]
         rhs = np.empty(P + pull.shape[1] - L)
         rhs[:P] = J.reshape(-1, P).T @ pull[:, :L].ravel() - prior * model.weights
