@@ -121,19 +121,20 @@ def undistort(
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if distortion.is_identity:
         return x, y
+    radius = monotonic_radius(distortion)
     if near is None:
-        sx, sy, good = _newton(distortion, x, y, *_radially(distortion, x, y))
+        sx, sy, good = _newton(distortion, radius, x, y, *_radially(distortion, radius, x, y))
         return np.where(good, sx, np.nan), np.where(good, sy, np.nan)
-    sx, sy, good = _newton(distortion, x, y, *near)
+    sx, sy, good = _newton(distortion, radius, x, y, *near)
     if not good.all():
         sx[~good], sy[~good] = undistort(distortion, x[~good], y[~good])
     return sx, sy
 
 
 def _newton(
-    distortion: Distortion, x: Array, y: Array, sx: Array, sy: Array
+    distortion: Distortion, radius: float, x: Array, y: Array, sx: Array, sy: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Undistorted points by Newton's method from (sx, sy), and which of them are true."""
+    """Undistorted points by Newton's method from (sx, sy), and which are true: within `radius`, and exact."""
     model, k = distortion.model, distortion.coefficients
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
@@ -141,21 +142,21 @@ def _newton(
             dx, dy, det = x - bx, y - by, xx * yy - xy * yx
             step = (yy * dx - xy * dy) / det, (xx * dy - yx * dx) / det
             sx, sy = sx + step[0], sy + step[1]
-            if not np.nanmax(np.hypot(*step) / (1 + np.hypot(sx, sy)), initial=0.0) > _STEP:
+            if not np.fmax.reduce(np.hypot(*step) / (1 + np.hypot(sx, sy)), axis=None, initial=0.0) > _STEP:
                 break
         (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(model, k, sx, sy)
         good = np.hypot(bx - x, by - y) < _ACCURACY * (1 + np.hypot(x, y))
-        good &= (sx * sx + sy * sy < monotonic_radius(distortion) ** 2) & (xx * yy - xy * yx > 0)
+        good &= (sx * sx + sy * sy < radius**2) & (xx * yy - xy * yx > 0)
     return sx, sy, good
 
 
-def _radially(distortion: Distortion, x: Array, y: Array) -> tuple[Array, Array]:
-    """Undistorted points without the tangential terms, nearly: by a table of radii."""
+def _radially(distortion: Distortion, radius: float, x: Array, y: Array) -> tuple[Array, Array]:
+    """Undistorted points without the tangential terms, nearly: by a table of radii up to `radius`."""
     names = coefficient_names(distortion.model)
     k = distortion.coefficients
     radial = [0.0 if name in ("p1", "p2") else k for name, k in zip(names, k, strict=True)]
     # Even steps of the angle reach any radius.
-    last = min(np.arctan(monotonic_radius(distortion)), np.arctan(_FARTHEST))
+    last = np.arctan(min(radius, _FARTHEST))
     r = np.tan(np.linspace(0, last, _TABLE, endpoint=False))  # at a pole there is no image
     with np.errstate(all="ignore"):
         distorted, _ = distort(distortion.model, radial, r, np.zeros(_TABLE))
