@@ -118,11 +118,12 @@ class Views:
         s, (u, v) = self.pixel_scale, self.pixel_centre
         return np.array([[s, 0.0, u], [0.0, s, v], [0.0, 0.0, 1.0]])
 
-    def S2(self, view: int) -> Array:
-        """(4, 4) real to normalised world coordinates of a view, eq. (12)."""
-        S2 = np.eye(4) / self.scale[view]
-        S2[:3, 3] = -self.centre[view] / self.scale[view]
-        S2[3, 3] = 1.0
+    @property
+    def S2(self) -> Array:
+        """(V, 4, 4) real to normalised world coordinates of each view, eq. (12)."""
+        S2 = np.eye(4) / self.scale[:, None, None]
+        S2[:, :3, 3] = -self.centre / self.scale[:, None]
+        S2[:, 3, 3] = 1.0
         return S2
 
     def subset(self, views: NDArray[np.intp]) -> Views:
