@@ -57,7 +57,7 @@ def find_outlier_view(solution: Solution) -> str | None:
     own_spare = views.equations - 6 - conditions
     if own_spare.min() <= 0:
         return None
-    variance = float(np.median(own / own_spare)) + 1e-24
+    variance = float(np.quantile(own / own_spare, 0.5)) + 1e-24
     contradiction = _contradictions(quadratics, own, conditions) / variance
     view = int(np.argmax(contradiction))
     if not contradiction[view] > _OUTLIER:
@@ -65,7 +65,7 @@ def find_outlier_view(solution: Solution) -> str | None:
     rest = np.delete(np.arange(V), view)
     others = adjust(views.subset(rest).batches, _of(adjusted.state, rest), problem.free_camera, True, _STEPS)
     left = reduced(others.normal, problem.free_camera, True)
-    among = float(np.median(_contradictions(left, own[rest], conditions[rest]))) / variance
+    among = float(np.quantile(_contradictions(left, own[rest], conditions[rest]), 0.5)) / variance
     return views.names[view] if contradiction[view] > _OUTLIER * max(among, 1.0) else None
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, distort_with_jacobian
 from neurocal_cli.geometry import Array
 
-__all__ = ["is_monotonic", "monotonic_radius", "nearly_undistorted", "radial_slope", "undistort"]
+__all__ = ["is_monotonic", "monotonic_radius", "nearly_undistorted", "radial_slope", "reaches", "undistort"]
 
 # Where Newton's method starts, and when it ends: random models of tests/test_monotonic.py, up to 95 % of
 # the radius where they cease to be monotonic, come back to 1e-8.
@@ -24,6 +24,8 @@ _STEP = 1e-9  # of Newton's: the next one, its square, is rounding
 _ACCURACY = 1e-11  # of the point distorted again: more is no inverse
 _SMALL_STEP = 0.02  # of Newton's in the image plane: the next one would be a thousandth
 _SMALLEST = 1e-100  # coefficient; what is less overflows, and has no root near any image
+# Radii at which a slope is looked at: what it falls short of the margin between them is far less.
+_RADII, _BEYOND, _MARGIN = 65, 2.0, 0.02
 _REAL = 1e-6  # imaginary part of a double root, over its real part, that rounding makes
 
 
@@ -88,6 +90,26 @@ def _first_root(coefficients: Array) -> float:
     roots = np.roots(np.where(np.abs(coefficients) > _SMALLEST, coefficients, 0.0)[::-1])
     real = roots.real[(np.abs(roots.imag) <= _REAL * np.abs(roots.real)) & (roots.real > 0)]
     return float(real.min(initial=np.inf))
+
+
+def reaches(distortion: Distortion, farthest: float) -> bool:
+    """Whether the model is certainly monotonic as far as some distorted radius; a quick test, without roots.
+
+    The tangential terms, p = hypot(p1, p2), move a point of radius r by at most 3 p r^2, and the derivatives
+    of that are at most 6 p r. A disc on which the radial part alone grows faster, outwards and across, is
+    mapped without a fold, and covers all that lies within the image of its edge. False says nothing.
+    """
+    k = distortion.coefficients
+    if distortion.model not in ("k1", "k1k2", "k1k2p1p2", "plumb_bob"):
+        return False  # poles, or another radius
+    r = np.linspace(0, _BEYOND * farthest, _RADII)
+    p = np.hypot(*k[2:4]) if len(k) > 2 else 0.0
+    radial = np.array([*k[:2], *k[4:]])
+    n = 2 * np.arange(1, len(radial) + 1)
+    powers = r[:, None] ** n
+    scale, slope = 1 + powers @ radial, 1 + powers @ ((n + 1) * radial)
+    disc = np.minimum.accumulate(np.minimum(slope, scale) - 6 * p * r) > _MARGIN
+    return bool((disc & (scale * r - 3 * p * r**2 > farthest)).any())
 
 
 def is_monotonic(distortion: Distortion, x: Array, y: Array) -> NDArray[np.bool_]:

@@ -90,7 +90,7 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
     told = loose[~np.isnan(loose)]
     if len(told) > 2:
         with np.errstate(invalid="ignore"):
-            hopeless |= (loose > _LOOSE) & (loose > _LOOSER * np.median(told))
+            hopeless |= (loose > _LOOSE) & (loose > _LOOSER * np.quantile(told, 0.5))
     return Consensus(kept, hopeless)
 
 

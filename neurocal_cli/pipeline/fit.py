@@ -139,7 +139,7 @@ def _turned(solution: Solution) -> Solution:
     """
     adjusted, problem = solution.adjusted, solution.problem
     error = adjusted.cost / problem.views.counts
-    if adjusted.state.model == "none" or error.max() <= _FAR_WORSE * np.median(error):
+    if adjusted.state.model == "none" or error.max() <= _FAR_WORSE * np.quantile(error, 0.5):
         return solution
     turned = try_mirrored(problem, adjusted)
     return solution if turned is adjusted else replace(solution, adjusted=turned)

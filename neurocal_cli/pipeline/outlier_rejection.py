@@ -221,7 +221,7 @@ class _Errors:
 
     def sigma(self, rows: NDArray[np.intp]) -> float:
         """Standard deviation that the median error of some points tells."""
-        return float(np.median(self.parts[rows], axis=0).max()) / _ONE
+        return float(np.quantile(self.parts[rows], 0.5, axis=0).max()) / _ONE
 
 
 def _errors(solution: Solution, points: Correspondences) -> _Errors:
