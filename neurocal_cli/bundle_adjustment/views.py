@@ -200,11 +200,11 @@ def arrange(points: Correspondences) -> Views:
     first = np.cumsum(counts) - counts
     centre = np.add.reduceat(world, first) / counts[:, None]
     local = world - np.repeat(centre, counts, axis=0)
-    scale = np.maximum.reduceat(np.abs(local).max(axis=1), first)
+    scale = np.maximum.reduceat(np.abs(local), first).max(axis=1)
     scale = np.where(scale > 0, scale, 1.0)
     local /= np.repeat(scale, counts)[:, None]
     pixel_centre, pixel_scale = similarity(pixels)
-    if np.ptp(pixels, axis=0).max() == 0 and len(pixels) > 1:
+    if len(pixels) > 1 and (pixels == pixels[0]).all():
         raise DegenerateGeometryError(f"{points.source}: all pixels u,v are the same; check the columns")
     basis, extent = _principal_axes(local, counts, first)
     weights, whitening = noise_model(covariance, across)
