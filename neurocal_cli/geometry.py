@@ -34,6 +34,7 @@ __all__ = [
 
 # Below this cosine of R_y the x and z axes coincide and only R_x -/+ R_z is defined.
 _GIMBAL_COSINE = 1e-12
+_SINGULAR = 1e-9  # below it only the combination is taken to move with a rotation
 
 
 def euler_to_rotation(R_x: float, R_y: float, R_z: float) -> Array:
@@ -98,6 +99,16 @@ def euler_jacobian(R: Array) -> Array:
     _, R_y, R_z = np.moveaxis(rotation_to_euler(R), -1, 0)
     cy, sy, cz, sz = np.cos(R_y), np.sin(R_y), np.cos(R_z), np.sin(R_z)
     zero, one = np.zeros_like(cy), np.ones_like(cy)
+    if (cy > _SINGULAR).all():
+        secant, tangent = 1 / cy, sy / cy
+        J = np.array(
+            [
+                [cz * secant, sz * secant, zero],
+                [-sz, cz, zero],
+                [cz * tangent, sz * tangent, one],
+            ]
+        )
+        return np.moveaxis(J, (0, 1), (-2, -1))
     axes = np.stack(
         [
             np.stack([cz * cy, -sz, zero], -1),
@@ -106,7 +117,7 @@ def euler_jacobian(R: Array) -> Array:
         ],
         axis=-2,
     )
-    return np.linalg.pinv(axes, rcond=1e-9)
+    return np.linalg.pinv(axes, rcond=_SINGULAR)
 
 
 def cross_matrix(w: Array) -> Array:

@@ -25,7 +25,7 @@ HOMES = {
 # Rooms, a folder or a module each, from the ground up: each imports from itself and from lower levels only.
 LEVELS = (
     {"errors", "geometry"},
-    {"board", "camera", "least_squares", "network", "points"},
+    {"board", "camera", "least_squares", "median", "network", "points"},
     {"calibration", "training"},
     {"bundle_adjustment"},
     {"verdict", "distortion", "initialisation"},

@@ -44,7 +44,7 @@ def test_points_are_sorted_by_view_and_come_back_by_s1_and_s2() -> None:
     np.testing.assert_allclose(pixels[:, :2], points.pixels[rows], rtol=1e-13)
     for k in range(3):
         mine = views.index == k
-        normal = np.hstack([points.world[rows][mine], one[mine]]) @ views.S2(k).T
+        normal = np.hstack([points.world[rows][mine], one[mine]]) @ views.S2[k].T
         np.testing.assert_allclose(normal[:, :3], views.local[mine], atol=1e-13)
 
 
@@ -177,7 +177,7 @@ def test_a_subset_holds_the_same_views_as_before() -> None:
         np.testing.assert_array_equal(part.local[mine], views.local[was])
         np.testing.assert_array_equal(part.pixels[mine], views.pixels[was])
         np.testing.assert_array_equal(np.asarray(part.whitening)[mine], np.asarray(views.whitening)[was])
-        np.testing.assert_array_equal(part.S2(new), views.S2(old))
+        np.testing.assert_array_equal(part.S2[new], views.S2[old])
     assert part.first.tolist() == [0, views.counts[0]]
 
 

@@ -17,6 +17,7 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
+from neurocal_cli.median import median
 
 __all__ = ["find_outlier_view", "free_networks", "seen_from_behind"]
 
@@ -57,7 +58,7 @@ def find_outlier_view(solution: Solution) -> str | None:
     own_spare = views.equations - 6 - conditions
     if own_spare.min() <= 0:
         return None
-    variance = float(np.median(own / own_spare)) + 1e-24
+    variance = float(median(own / own_spare)) + 1e-24
     contradiction = _contradictions(quadratics, own, conditions) / variance
     view = int(np.argmax(contradiction))
     if not contradiction[view] > _OUTLIER:
@@ -65,7 +66,7 @@ def find_outlier_view(solution: Solution) -> str | None:
     rest = np.delete(np.arange(V), view)
     others = adjust(views.subset(rest).batches, _of(adjusted.state, rest), problem.free_camera, True, _STEPS)
     left = reduced(others.normal, problem.free_camera, True)
-    among = float(np.median(_contradictions(left, own[rest], conditions[rest]))) / variance
+    among = float(median(_contradictions(left, own[rest], conditions[rest]))) / variance
     return views.names[view] if contradiction[view] > _OUTLIER * max(among, 1.0) else None
 
 

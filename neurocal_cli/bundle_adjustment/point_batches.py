@@ -131,7 +131,8 @@ def _batch_size(counts: NDArray[np.intp]) -> int:
     most = int(counts.max())
     if most <= _LARGEST_BATCH and most == counts.min():
         return most
-    candidates = {min(int(c), _LARGEST_BATCH) for c in np.quantile(counts, [0, 0.25, 0.5, 0.75, 1])}
-    candidates |= {-(-int(c) // -(-int(c) // _LARGEST_BATCH)) for c in (most, np.median(counts))}
+    quartiles = np.quantile(counts, [0, 0.25, 0.5, 0.75, 1])
+    candidates = {min(int(c), _LARGEST_BATCH) for c in quartiles}
+    candidates |= {-(-int(c) // -(-int(c) // _LARGEST_BATCH)) for c in quartiles[[2, 4]]}
     overhead = 16
     return min(sorted(candidates), key=lambda n: float((-(-counts // n)).sum() * (n + overhead)))

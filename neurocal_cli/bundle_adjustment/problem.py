@@ -25,7 +25,6 @@ from neurocal_cli.points import Correspondences
 __all__ = ["Problem", "intrinsic_matrix", "problem_for"]
 
 _LARGEST = 1e9  # px; no image is larger
-_PINHOLE_STEPS = 2  # enough to make the points agree on a camera; a distorted image has no exact one
 _MAX_ITERATIONS = 200
 
 
@@ -137,24 +136,17 @@ class Problem:
     def adjust(self, start: CameraState | Adjusted, max_iterations: int = _MAX_ITERATIONS) -> Adjusted:
         """Minimise the reprojection error (3) from a state; see `adjust`.
 
-        A distortion that is to be estimated joins after a few steps of the pinhole, with coefficients
-        that leave it one. Iterations are counted on from a start that is itself an adjustment.
+        A pinhole whose distortion is to be estimated begins with coefficients that leave it one. Iterations
+        are counted on from a start that is itself an adjustment.
         """
         done = start.iterations if isinstance(start, Adjusted) else 0
         state = start.state if isinstance(start, Adjusted) else start
         if self.free_distortion and state.model == "none":
-            pinhole = self._adjusted(state, _PINHOLE_STEPS)
-            done += pinhole.iterations
             model = self.distortion.model
-            state = replace(pinhole.state, model=model, k=pinhole_coefficients(model))
-        adjusted = self._adjusted(state, max_iterations)
+            state = replace(state, model=model, k=pinhole_coefficients(model))
+        free = self.free if state.model == "none" else self.free_camera
+        adjusted = adjust(self.views.batches, state, free, self.free_poses, max_iterations, self.restraint)
         return replace(adjusted, iterations=done + adjusted.iterations)
-
-    def _adjusted(self, state: CameraState, steps: int) -> Adjusted:
-        batches = self.views.batches
-        if state.model == "none":
-            return adjust(batches, state, self.free, self.free_poses, steps)
-        return adjust(batches, state, self.free_camera, self.free_poses, steps, self.restraint)
 
 
 def intrinsic_matrix(entries: Array) -> Array:

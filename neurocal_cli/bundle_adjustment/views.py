@@ -118,11 +118,12 @@ class Views:
         s, (u, v) = self.pixel_scale, self.pixel_centre
         return np.array([[s, 0.0, u], [0.0, s, v], [0.0, 0.0, 1.0]])
 
-    def S2(self, view: int) -> Array:
-        """(4, 4) real to normalised world coordinates of a view, eq. (12)."""
-        S2 = np.eye(4) / self.scale[view]
-        S2[:3, 3] = -self.centre[view] / self.scale[view]
-        S2[3, 3] = 1.0
+    @property
+    def S2(self) -> Array:
+        """(V, 4, 4) real to normalised world coordinates of each view, eq. (12)."""
+        S2 = np.eye(4) / self.scale[:, None, None]
+        S2[:, :3, 3] = -self.centre / self.scale[:, None]
+        S2[:, 3, 3] = 1.0
         return S2
 
     def subset(self, views: NDArray[np.intp]) -> Views:
@@ -199,11 +200,11 @@ def arrange(points: Correspondences) -> Views:
     first = np.cumsum(counts) - counts
     centre = np.add.reduceat(world, first) / counts[:, None]
     local = world - np.repeat(centre, counts, axis=0)
-    scale = np.maximum.reduceat(np.abs(local).max(axis=1), first)
+    scale = np.maximum.reduceat(np.abs(local), first).max(axis=1)
     scale = np.where(scale > 0, scale, 1.0)
     local /= np.repeat(scale, counts)[:, None]
     pixel_centre, pixel_scale = similarity(pixels)
-    if np.ptp(pixels, axis=0).max() == 0 and len(pixels) > 1:
+    if len(pixels) > 1 and (pixels == pixels[0]).all():
         raise DegenerateGeometryError(f"{points.source}: all pixels u,v are the same; check the columns")
     basis, extent = _principal_axes(local, counts, first)
     weights, whitening = noise_model(covariance, across)

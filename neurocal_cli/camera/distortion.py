@@ -131,7 +131,11 @@ def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Arr
     -------
     x', y' : arrays of that shape
     """
-    return distort_with_jacobian(model, k, x, y)[0]
+    if model == "fisheye":
+        return _fisheye(k, x, y)[0]
+    r2 = x * x + y * y
+    R, _ = _radial(k, r2)
+    return (x * R, y * R) if len(k) <= 2 else _tangential(k, x, y, r2, R)[1]
 
 
 def distort_with_jacobian(model: str, k: Coefficients, x: Array, y: Array) -> Distorted:
@@ -150,37 +154,56 @@ def distort_with_jacobian(model: str, k: Coefficients, x: Array, y: Array) -> Di
     return _polynomial(k, x, y)
 
 
+def _radial(k: Coefficients, r2: Array) -> tuple[Array, Any]:
+    """R, and one over its denominator."""
+    k1, k2, _, _, k3, k4, k5, k6 = _all(k)
+    R = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if len(k) <= 5:
+        return R, 1.0
+    inverse = 1.0 / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return R * inverse, inverse
+
+
+def _tangential(
+    k: Coefficients, x: Array, y: Array, r2: Array, R: Array
+) -> tuple[Array, tuple[Array, Array]]:
+    """Q = R + 2 (p1 y + p2 x), and the distorted point (x Q + p2 r^2, y Q + p1 r^2)."""
+    p1, p2 = k[2], k[3]
+    Q = R + (2 * p1) * y + (2 * p2) * x
+    return Q, (x * Q + p2 * r2, y * Q + p1 * r2)
+
+
 def _polynomial(k: Coefficients, x: Array, y: Array) -> Distorted:
     count = len(k)
-    full: list[Any] = [*k, *[0.0] * (8 - count)]
-    k1, k2, p1, p2, k3, k4, k5, k6 = full
-    r2 = x * x + y * y
+    k1, k2, p1, p2, k3, k4, k5, k6 = _all(k)
+    x2, y2 = x * x, y * y
+    r2 = x2 + y2
     r4 = r2 * r2
-    r6 = r4 * r2
-    R = 1 + k1 * r2 + k2 * r4 + k3 * r6
-    slope = k1 + 2 * k2 * r2 + 3 * k3 * r4  # dR / d(r^2)
-    by_radial = [(x * power, y * power) for power in (r2, r4, r6)[: 3 if count > 4 else min(count, 2)]]
+    R, inverse = _radial(k, r2)
+    slope = k1 + r2 * (2 * k2 + r2 * (3 * k3))  # dR / d(r^2)
+    powers = (r2, r4, r4 * r2) if count > 4 else (r2, r4)[:count]
+    by_radial = [(x * power, y * power) for power in powers]
     if count > 5:
-        inverse = 1.0 / (1 + k4 * r2 + k5 * r4 + k6 * r6)
-        R = R * inverse
-        slope = (slope - R * (k4 + 2 * k5 * r2 + 3 * k6 * r4)) * inverse
+        slope = (slope - R * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) * inverse
         by_radial = [(dx * inverse, dy * inverse) for dx, dy in by_radial]
-    xx2, xy2, yy2 = 2 * x * x, 2 * x * y, 2 * y * y
-    cross, xx, yy = xy2 * slope, R + xx2 * slope, R + yy2 * slope
-    distorted = x * R, y * R
+    twice = 2 * slope
+    xy = x * y
+    cross = xy * twice
     if count <= 2:
-        return distorted, (xx, cross, cross, yy), by_radial
-    by_p1, by_p2 = (xy2, r2 + yy2), (r2 + xx2, xy2)
-    distorted = (
-        distorted[0] + p1 * by_p1[0] + p2 * by_p2[0],
-        distorted[1] + p1 * by_p1[1] + p2 * by_p2[1],
-    )
-    cross = cross + 2 * (p1 * x + p2 * y)
-    xx, yy = xx + 2 * p1 * y + 6 * p2 * x, yy + 6 * p1 * y + 2 * p2 * x
-    by = [*by_radial[:2], by_p1, by_p2, *by_radial[2:]]
+        return (x * R, y * R), (R + x2 * twice, cross, cross, R + y2 * twice), by_radial
+    Q, distorted = _tangential(k, x, y, r2, R)
+    cross = cross + (2 * p1) * x + (2 * p2) * y
+    xx, yy = Q + x2 * twice + (4 * p2) * x, Q + y2 * twice + (4 * p1) * y
+    xy2 = 2 * xy
+    by = [*by_radial[:2], (xy2, r2 + 2 * y2), (r2 + 2 * x2, xy2), *by_radial[2:]]
     if count > 5:
         by += [(-R * dx, -R * dy) for dx, dy in by_radial]
     return distorted, (xx, cross, cross, yy), by
+
+
+def _all(k: Coefficients) -> list[Any]:
+    """All eight coefficients, 0 where a model has none."""
+    return [*k, *[0.0] * (8 - len(k))]
 
 
 def _fisheye(k: Coefficients, x: Array, y: Array) -> Distorted:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, distort_with_jacobian
 from neurocal_cli.geometry import Array
 
-__all__ = ["is_monotonic", "monotonic_radius", "nearly_undistorted", "radial_slope", "undistort"]
+__all__ = ["is_monotonic", "monotonic_radius", "nearly_undistorted", "radial_slope", "reaches", "undistort"]
 
 # Where Newton's method starts, and when it ends: random models of tests/test_monotonic.py, up to 95 % of
 # the radius where they cease to be monotonic, come back to 1e-8.
@@ -24,6 +24,8 @@ _STEP = 1e-9  # of Newton's: the next one, its square, is rounding
 _ACCURACY = 1e-11  # of the point distorted again: more is no inverse
 _SMALL_STEP = 0.02  # of Newton's in the image plane: the next one would be a thousandth
 _SMALLEST = 1e-100  # coefficient; what is less overflows, and has no root near any image
+# Radii at which a slope is looked at: what it falls short of the margin between them is far less.
+_RADII, _BEYOND, _MARGIN = 65, 2.0, 0.02
 _REAL = 1e-6  # imaginary part of a double root, over its real part, that rounding makes
 
 
@@ -90,6 +92,26 @@ def _first_root(coefficients: Array) -> float:
     return float(real.min(initial=np.inf))
 
 
+def reaches(distortion: Distortion, farthest: float) -> bool:
+    """Whether the model is certainly monotonic as far as some distorted radius; a quick test, without roots.
+
+    The tangential terms, p = hypot(p1, p2), move a point of radius r by at most 3 p r^2, and the derivatives
+    of that are at most 6 p r. A disc on which the radial part alone grows faster, outwards and across, is
+    mapped without a fold, and covers all that lies within the image of its edge. False says nothing.
+    """
+    k = distortion.coefficients
+    if distortion.model not in ("k1", "k1k2", "k1k2p1p2", "plumb_bob"):
+        return False  # poles, or another radius
+    r = np.linspace(0, _BEYOND * farthest, _RADII)
+    p = np.hypot(*k[2:4]) if len(k) > 2 else 0.0
+    radial = np.array([*k[:2], *k[4:]])
+    n = 2 * np.arange(1, len(radial) + 1)
+    powers = r[:, None] ** n
+    scale, slope = 1 + powers @ radial, 1 + powers @ ((n + 1) * radial)
+    disc = np.minimum.accumulate(np.minimum(slope, scale) - 6 * p * r) > _MARGIN
+    return bool((disc & (scale * r - 3 * p * r**2 > farthest)).any())
+
+
 def is_monotonic(distortion: Distortion, x: Array, y: Array) -> NDArray[np.bool_]:
     """Whether undistorted normalised points lie where the model is monotonic."""
     with np.errstate(all="ignore"):
@@ -121,19 +143,20 @@ def undistort(
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if distortion.is_identity:
         return x, y
+    radius = monotonic_radius(distortion)
     if near is None:
-        sx, sy, good = _newton(distortion, x, y, *_radially(distortion, x, y))
+        sx, sy, good = _newton(distortion, radius, x, y, *_radially(distortion, radius, x, y))
         return np.where(good, sx, np.nan), np.where(good, sy, np.nan)
-    sx, sy, good = _newton(distortion, x, y, *near)
+    sx, sy, good = _newton(distortion, radius, x, y, *near)
     if not good.all():
         sx[~good], sy[~good] = undistort(distortion, x[~good], y[~good])
     return sx, sy
 
 
 def _newton(
-    distortion: Distortion, x: Array, y: Array, sx: Array, sy: Array
+    distortion: Distortion, radius: float, x: Array, y: Array, sx: Array, sy: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Undistorted points by Newton's method from (sx, sy), and which of them are true."""
+    """Undistorted points by Newton's method from (sx, sy), and which are true: within `radius`, and exact."""
     model, k = distortion.model, distortion.coefficients
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
@@ -141,21 +164,21 @@ def _newton(
             dx, dy, det = x - bx, y - by, xx * yy - xy * yx
             step = (yy * dx - xy * dy) / det, (xx * dy - yx * dx) / det
             sx, sy = sx + step[0], sy + step[1]
-            if not np.nanmax(np.hypot(*step) / (1 + np.hypot(sx, sy)), initial=0.0) > _STEP:
+            if not np.fmax.reduce(np.hypot(*step) / (1 + np.hypot(sx, sy)), axis=None, initial=0.0) > _STEP:
                 break
         (bx, by), (xx, xy, yx, yy), _ = distort_with_jacobian(model, k, sx, sy)
         good = np.hypot(bx - x, by - y) < _ACCURACY * (1 + np.hypot(x, y))
-        good &= (sx * sx + sy * sy < monotonic_radius(distortion) ** 2) & (xx * yy - xy * yx > 0)
+        good &= (sx * sx + sy * sy < radius**2) & (xx * yy - xy * yx > 0)
     return sx, sy, good
 
 
-def _radially(distortion: Distortion, x: Array, y: Array) -> tuple[Array, Array]:
-    """Undistorted points without the tangential terms, nearly: by a table of radii."""
+def _radially(distortion: Distortion, radius: float, x: Array, y: Array) -> tuple[Array, Array]:
+    """Undistorted points without the tangential terms, nearly: by a table of radii up to `radius`."""
     names = coefficient_names(distortion.model)
     k = distortion.coefficients
     radial = [0.0 if name in ("p1", "p2") else k for name, k in zip(names, k, strict=True)]
     # Even steps of the angle reach any radius.
-    last = min(np.arctan(monotonic_radius(distortion)), np.arctan(_FARTHEST))
+    last = np.arctan(min(radius, _FARTHEST))
     r = np.tan(np.linspace(0, last, _TABLE, endpoint=False))  # at a pole there is no image
     with np.errstate(all="ignore"):
         distorted, _ = distort(distortion.model, radial, r, np.zeros(_TABLE))

@@ -27,8 +27,8 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort
-from neurocal_cli.camera.monotonic import monotonic_radius, radial_slope
-from neurocal_cli.camera.projection import undistorted_pixels
+from neurocal_cli.camera.monotonic import monotonic_radius, radial_slope, reaches
+from neurocal_cli.camera.projection import ENTRIES, normalised_points, undistorted_pixels
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -121,6 +121,9 @@ def _border(image_size: tuple[int, int], distortion: Distortion) -> Array:
 
 def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:
     """Whether all the pixels lie where the distortion is monotonic."""
+    x, y = normalised_points(A[ENTRIES].tolist(), *pixels.T)
+    if reaches(distortion, float(np.hypot(x, y).max(initial=0.0))):
+        return True
     return bool(np.isfinite(undistorted_pixels(distortion, A, pixels)).all())
 
 

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
+from neurocal_cli.median import median
 from neurocal_cli.network import Patterns, random_weights
 from neurocal_cli.training import Task
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
@@ -90,7 +91,7 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
     told = loose[~np.isnan(loose)]
     if len(told) > 2:
         with np.errstate(invalid="ignore"):
-            hopeless |= (loose > _LOOSE) & (loose > _LOOSER * np.median(told))
+            hopeless |= (loose > _LOOSE) & (loose > _LOOSER * median(told))
     return Consensus(kept, hopeless)
 
 

@@ -17,7 +17,7 @@ from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.view_networks import Group
 
 __all__ = [
@@ -150,4 +150,4 @@ def _mirrored(R: Array, t: Array, basis: Array) -> Array:
     normal = basis[:, :, 2]
     across_ray = np.eye(3) - 2 * ray[:, :, None] * ray[:, None, :]
     across_plane = np.eye(3) - 2 * normal[:, :, None] * normal[:, None, :]
-    return nearest_rotation(across_ray @ R @ across_plane)
+    return np.asarray(across_ray @ R @ across_plane)

@@ -105,50 +105,57 @@ class _Conditions:
 
     def __init__(self, solid: Array, flat: Array, free: NDArray[np.bool_]) -> None:
         self.free = np.flatnonzero(free)
-        columns, pairs = [], []
-        for group, which in ((solid, ((0, 1), (0, 2), (1, 2))), (flat, ((0, 1),))):
+        self.columns, self.pairs = [], []
+        for group, pairs in ((solid, ((0, 1), (0, 2), (1, 2))), (flat, ((0, 1),))):
             if len(group):
                 unit = group / np.linalg.norm(group, axis=(1, 2))[:, None, None]
-                columns.append(np.swapaxes(unit, 1, 2))
-                pairs.append(which)
-        self.columns, self.pairs = columns, pairs
+                # Products of each column with itself, then those of the pairs.
+                both = np.array([*((n, n) for n in range(group.shape[2])), *pairs]).T
+                self.columns.append(np.ascontiguousarray(unit[:, :, both].transpose(1, 2, 3, 0)))
+                self.pairs.append(pairs)
 
     def __call__(self, p: Array) -> tuple[Array, Array]:
-        """Residuals (B, m) and derivatives (B, m, f) of B parameter sets (B, 5)."""
+        """Residuals (B, m) and derivatives (B, f, m) of B parameter sets (B, 5)."""
         residuals, derivatives = [], []
         for columns, pairs in zip(self.columns, self.pairs, strict=True):
-            y, dy = _through_inverse(p, columns)
-            norm = (y * y).sum(-1)  # (B, K, c)
-            slope = (y[..., None, :] @ np.swapaxes(dy, -1, -2))[..., 0, :] / norm[..., None]
-            for i, j in pairs:
-                length = np.sqrt(norm[:, :, i] * norm[:, :, j])
-                cosine = (y[:, :, i] * y[:, :, j]).sum(-1) / length
-                by = (dy[:, :, i] @ y[:, :, j, :, None])[..., 0] + (dy[:, :, j] @ y[:, :, i, :, None])[..., 0]
-                residuals += [cosine, 0.5 * np.log(norm[:, :, i] / norm[:, :, j])]
+            product, by_p = _products(p, columns)
+            for n, (i, j) in enumerate(pairs, start=product.shape[1] - len(pairs)):
+                one, two = product[:, i], product[:, j]
+                length = np.sqrt(one * two)
+                cosine = product[:, n] / length
+                residuals += [cosine, 0.5 * np.log(one / two)]
+                by_one, by_two = (0.5 * by_p[:, :, k] / product[:, None, k] for k in (i, j))  # of log lengths
                 derivatives += [
-                    by / length[..., None] - cosine[..., None] * (slope[:, :, i] + slope[:, :, j]),
-                    slope[:, :, i] - slope[:, :, j],
+                    by_p[:, :, n] / length[:, None] - cosine[:, None] * (by_one + by_two),
+                    by_one - by_two,
                 ]
-        return np.concatenate(residuals, axis=1), np.concatenate(derivatives, axis=1)[..., self.free]
+        return np.concatenate(residuals, axis=1), np.concatenate(derivatives, axis=2)[:, self.free]
 
 
-def _through_inverse(p: Array, h: Array) -> tuple[Array, Array]:
-    """Y = W^-1 h and its derivatives; p (B, 5), h (K, c, 3) -> (B, K, c, 3) and (B, K, c, 5, 3)."""
+def _products(p: Array, h: Array) -> tuple[Array, Array]:
+    """Scalar products of columns W^-1 h and their derivatives.
+
+    Parameters
+    ----------
+    p : (B, 5) array
+        log W11, W12, log W22, W13, W23.
+    h : (3, 2, q, K) array
+        Both columns of q products of each of K views.
+
+    Returns
+    -------
+    product : (B, q, K) array
+    by_p : (B, 5, q, K) array
+    """
     la, s, lb, u, v = (p[:, n, None, None] for n in range(5))
     a, b = np.exp(la), np.exp(lb)
-    y = np.empty((len(p), *h.shape))
-    y[..., 2] = h[..., 2]
-    y[..., 1] = (h[..., 1] - v * y[..., 2]) / b
-    y[..., 0] = (h[..., 0] - s * y[..., 1] - u * y[..., 2]) / a
-    dy = np.zeros((*y.shape[:-1], 5, 3))
-    dy[..., 0, 0] = -y[..., 0]  # by log W11
-    dy[..., 1, 0] = -y[..., 1] / a
-    dy[..., 2, 1] = -y[..., 1]  # by log W22
-    dy[..., 2, 0] = s * y[..., 1] / a
-    dy[..., 3, 0] = -y[..., 2] / a
-    dy[..., 4, 1] = -y[..., 2] / b
-    dy[..., 4, 0] = s * y[..., 2] / (a * b)
-    return y, dy
+    (z, z_), by_b = h[2], s / b
+    y, y_ = ((h[1, n] - v * h[2, n]) / b for n in range(2))
+    x, x_ = ((h[0, n] - u * h[2, n] - s * column) / a for n, column in enumerate((y, y_)))
+    xx, yy = x * x_, y * y_
+    xy, xz, yz = (x * y_ + y * x_) / a, (x * z_ + z * x_) / a, (y * z_ + z * y_) / b
+    by_p = np.stack([-2 * xx, -xy, s * xy - 2 * yy, -xz, by_b * xz - yz], axis=1)
+    return xx + yy + z * z_, by_p
 
 
 _Trial = tuple[Array, Array, Array]  # parameters, their residuals and derivatives
@@ -170,8 +177,8 @@ class _Starts:
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
         """Steps damped by the mean of the diagonal, none too long, and what they promise."""
         J, f = self.J[active], len(self.conditions.free)
-        H = np.swapaxes(J, 1, 2) @ J
-        g = -(np.swapaxes(J, 1, 2) @ self.r[active][..., None])[..., 0]
+        H = J @ np.swapaxes(J, 1, 2)
+        g = -(J @ self.r[active][..., None])[..., 0]
         ridge = damping * (np.trace(H, axis1=1, axis2=2) / f + 1e-12)
         step = np.linalg.solve(H + ridge[:, None, None] * np.eye(f), g[..., None])[..., 0]
         step = np.minimum(np.maximum(step, -_LONGEST), _LONGEST)

@@ -239,17 +239,21 @@ class LevenbergMarquardt:
         self.damping = np.maximum(self.damping * np.where(better, shrink, self.growth), options.least_damping)
         self.growth = np.where(better, 2.0, 2 * self.growth)
         self.cost = np.where(better, after, before)
-        converged = (promised if options.by_promise else gained) < self._last_gain(before)
-        flat = sensible & (np.abs(promised) < options.flat * before)
-        settled, exact = np.where(better, converged, flat), self.cost <= self.floor
-        stuck = (self.damping > options.largest_damping) & ~better
-        done = settled | exact | stuck
+        exact = self.cost <= self.floor
+        converged = better & ((promised if options.by_promise else gained) < self._last_gain(before))
+        done = exact | converged
         if self.iteration >= self.soonest:
             done |= self.limit <= self.iteration
+        failed = not better.all()
+        if failed:
+            flat = ~better & sensible & (np.abs(promised) < options.flat * before)
+            stuck = ~better & (self.damping > options.largest_damping)
+            done |= flat | stuck
         if done.any():
             stop = np.zeros(len(done), dtype=np.int8)
-            stop[stuck], stop[settled & ~better] = Stop.STUCK, Stop.FLAT
-            stop[settled & better], stop[exact] = Stop.CONVERGED, Stop.EXACT
+            if failed:
+                stop[stuck], stop[flat] = Stop.STUCK, Stop.FLAT
+            stop[converged], stop[exact] = Stop.CONVERGED, Stop.EXACT
             self._retire(done, stop)
 
     def _last_gain(self, cost: Array) -> Array:

@@ -60,24 +60,25 @@ def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple
     gain : float
         By how much the step should lower the sum of squares.
     """
-    f = shared
-    # Sums of what is needed only: the whole matrices are larger.
-    U, g = N[:, f[:, None], f].sum(axis=0), N[:, f, -1].sum(axis=0)
-    g_own = N[:, own, -1]
-    ridge = damping * (np.diagonal(U) + NOTHING)
-    B = N[:, own[:, None], own]
+    # Own unknowns first, then what is left of the matrix without them.
+    p, f = len(own), len(shared)
+    columns = np.concatenate([own, shared, [N.shape[-1] - 1]])
+    M = N[:, columns[:, None], columns]
+    B, C = M[:, :p, :p], M[:, :p, p:]  # C (V, p, f + 1), with the right side
     ridge_own = damping * (np.diagonal(B, axis1=1, axis2=2) + NOTHING)
-    places = np.arange(len(own))
+    places = np.arange(p)
     B[:, places, places] += ridge_own
-    C = N[:, f[:, None], own]  # (V, f, p)
-    solved = solve_scaled(B, np.concatenate([np.swapaxes(C, 1, 2), g_own[..., None]], axis=2))
-    # (f, p V) times (p V, f + 1): one product sums over blocks and own unknowns.
-    flat_C = np.swapaxes(C, 0, 1).reshape(len(f), C.shape[0] * C.shape[2])
-    eliminated = flat_C @ solved.reshape(-1, len(f) + 1)
-    S = U + np.diag(ridge) - eliminated[:, :-1]
-    step = solve_scaled(S, (g - eliminated[:, -1])[:, None])[:, 0]
+    solved = solve_scaled(B, C)
+    # (f, V p) times (V p, f + 1): one product sums over blocks and own unknowns.
+    flat = C.reshape(-1, f + 1)
+    S = M[:, p:-1, p:].sum(axis=0)
+    g = S[:, -1].copy()
+    ridge = damping * (np.diagonal(S) + NOTHING)
+    S -= flat[:, :-1].T @ solved.reshape(-1, f + 1)
+    S[np.arange(f), np.arange(f)] += ridge
+    step = solve_scaled(S[:, :-1], S[:, -1:])[:, 0]
     by_own = solved[:, :, -1] - solved[:, :, :-1] @ step
-    gain = (by_own * (g_own + ridge_own * by_own)).sum() + step @ (g + ridge * step)
+    gain = (by_own * (C[:, :, -1] + ridge_own * by_own)).sum() + step @ (g + ridge * step)
     return step, by_own, float(gain)
 
 

@@ -22,6 +22,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import try_mirrored
 from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.initialisation.options import Options
+from neurocal_cli.median import median
 from neurocal_cli.points import Correspondences
 
 __all__ = ["fit", "fit_again"]
@@ -139,7 +140,7 @@ def _turned(solution: Solution) -> Solution:
     """
     adjusted, problem = solution.adjusted, solution.problem
     error = adjusted.cost / problem.views.counts
-    if adjusted.state.model == "none" or error.max() <= _FAR_WORSE * np.median(error):
+    if adjusted.state.model == "none" or error.max() <= _FAR_WORSE * median(error):
         return solution
     turned = try_mirrored(problem, adjusted)
     return solution if turned is adjusted else replace(solution, adjusted=turned)

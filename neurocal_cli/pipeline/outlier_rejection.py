@@ -32,6 +32,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.consensus import find_consensus
 from neurocal_cli.initialisation.options import Options
+from neurocal_cli.median import median
 from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.points import Correspondences
 
@@ -221,7 +222,7 @@ class _Errors:
 
     def sigma(self, rows: NDArray[np.intp]) -> float:
         """Standard deviation that the median error of some points tells."""
-        return float(np.median(self.parts[rows], axis=0).max()) / _ONE
+        return float(median(self.parts[rows]).max()) / _ONE
 
 
 def _errors(solution: Solution, points: Correspondences) -> _Errors:

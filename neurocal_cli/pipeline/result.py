@@ -126,9 +126,9 @@ def _network_record(solution: Solution, rmse: float) -> NetworkRecord:
     px, n = views.pixel_scale, len(views.index)
     return NetworkRecord(
         W=intrinsic_matrix(state.entries[0]),
-        V={name: np.column_stack([state.R[k], state.t[k]]) for k, name in enumerate(views.names)},
+        V=dict(zip(views.names, np.concatenate([state.R, state.t[..., None]], axis=2), strict=True)),
         S1=views.S1,
-        S2={name: views.S2(k) for k, name in enumerate(views.names)},
+        S2=dict(zip(views.names, views.S2, strict=True)),
         starts=record.starts,
         agreed=int(record.agreed.min()),
         iterations=record.iterations,

@@ -131,12 +131,13 @@ class _Normal:
         self.dt = np.ascontiguousarray(np.swapaxes(d, -1, -2))
         a, b = np.triu_indices(self.n_inputs)
         self.ZZ = Z[..., a] * Z[..., b]
-        # Where entry (k, a), (l, b) of the matrix is found among 9 output pairs x input pairs.
+        # Where entry (k, a), (l, b) of the matrix is found among 6 output pairs x input pairs.
         inputs = np.zeros((self.n_inputs, self.n_inputs), dtype=np.intp)
         inputs[a, b] = inputs[b, a] = np.arange(len(a))
+        outputs = np.array([[0, 3, 4], [3, 1, 5], [4, 5, 2]])
         self.free = np.flatnonzero(free)
         row, column = np.divmod(self.free, self.n_inputs)
-        self.place = (3 * row[:, None] + row) * len(a) + inputs[column[:, None], column]
+        self.place = outputs[row[:, None], row] * len(a) + inputs[column[:, None], column]
 
     def __call__(self, product: Array, mu: float, networks: NDArray[np.intp]) -> tuple[Array, Array, Array]:
         """E (K,), gradient (K, n) and matrix (K, n, n) of some networks, in their order."""
@@ -152,9 +153,12 @@ class _Normal:
         gradient = -(error * wg[:, None]) @ self.Z[rows]
         # gamma^2 (I - o o^T / (o.o + mu)): the weight of each pattern after the elimination.
         wgg = wg * gamma
-        share = (o * (wgg / -norm)[:, None])[:, :, None] * o[:, None]  # (K, 3, 3, N)
-        share = share.reshape(len(product), 9, -1)
-        share[:, ::4] += wgg[:, None]
+        scaled = o * (wgg / -norm)[:, None]
+        share = np.empty((len(o), 6, o.shape[2]))
+        np.multiply(scaled, o, out=share[:, :3])
+        share[:, :3] += wgg[:, None]
+        np.multiply(scaled[:, :1], o[:, 1:], out=share[:, 3:5])
+        np.multiply(scaled[:, 1], o[:, 2], out=share[:, 5])
         moments = (share @ self.ZZ[rows]).reshape(len(product), -1)
         return loss, gradient.reshape(len(product), -1)[:, self.free], moments[:, self.place]
 

@@ -27,6 +27,7 @@ from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.median import median
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.projection_uncertainty import (
@@ -144,7 +145,7 @@ class _AtMinimum:
             return None
         view = self.points.view_index
         depth = (self.given.R[view, 2] * self.points.world).sum(axis=1) + self.given.t[view, 2]
-        depths = np.append(np.quantile(depth, [0.0, 0.5, 1.0]), _DISTANT * depth.max())
+        depths = np.array([depth.min(), median(depth), depth.max(), _DISTANT * depth.max()])
         return projection_uncertainty(
             self.views, self.state, self.camera, self.normal, self.free, self.free_poses,
             self.cost / self.spare, image_grid(self.points.image_size), depths,

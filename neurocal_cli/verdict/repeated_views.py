@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.median import median
 from neurocal_cli.points import Correspondences
 
 __all__ = ["repeated_views", "scaled_views"]
@@ -12,7 +13,6 @@ __all__ = ["repeated_views", "scaled_views"]
 _SAME = 1e-3  # px
 _SCALED = 1.2  # times the distance of neighbouring points in the other views
 _MOST_POINTS = 400  # of a view that are looked at
-# Medians are quantiles here: `np.median` imports numpy.ma, 10 ms of a command.
 
 
 def repeated_views(points: Correspondences) -> tuple[str, ...]:
@@ -47,7 +47,7 @@ def scaled_views(points: Correspondences) -> tuple[str, ...]:
             steps[key] = _step(world)
         keys.append(key)
     step = np.array([steps[key] for key in keys])
-    ratio = step / np.quantile(step, 0.5)
+    ratio = step / median(step)
     off = (ratio > _SCALED) | (ratio < 1 / _SCALED)
     return tuple(np.array(points.view_names)[off].tolist())
 
@@ -56,7 +56,7 @@ def _step(world: Array) -> float:
     """Median distance of a point's nearest neighbour."""
     squares = ((world[:, None] - world[None]) ** 2).sum(axis=-1)
     squares[squares == 0] = np.inf
-    return float(np.quantile(np.sqrt(squares.min(axis=1)), 0.5))
+    return float(median(np.sqrt(squares.min(axis=1))))
 
 
 def _by_view(points: Correspondences, rows: Array) -> list[Array]:
