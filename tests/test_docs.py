@@ -38,7 +38,17 @@ def test_the_readme_is_short_and_shows_a_picture() -> None:
     assert README.index("![") < README.index("```")
 
 
-@pytest.mark.parametrize("page", MANY_BLOCKS, ids=name)
+# Fitting a zoom lens takes as long as all the others together.
+SLOW_PAGES = {"docs/how-to/zoom-lens.md"}
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=name(page), marks=[pytest.mark.slow] * (name(page) in SLOW_PAGES))
+        for page in MANY_BLOCKS
+    ],
+)
 def test_what_a_page_shows_runs_and_prints_that(page: Path, tmp_path: Path) -> None:
     for shown, printed in run_page(page.read_text(encoding="utf-8"), tmp_path):
         assert agrees(shown.output, printed), (

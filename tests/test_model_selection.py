@@ -39,7 +39,10 @@ def judged(model: str, seed: int) -> tuple[bool, bool, bool, bool]:
     return found.distortion_model == model, told <= len(MODELS[model]) + 2, well, everywhere
 
 
-@pytest.mark.parametrize("model", BENT)
+@pytest.mark.parametrize(
+    "model",
+    [pytest.param(one, marks=[pytest.mark.slow] * (one in ("k1", "k1k2", "plumb_bob"))) for one in BENT],
+)
 def test_the_choice_predicts_new_views_as_well_as_any_model(model: str) -> None:
     results = [judged(model, 7000 + seed) for seed in range(2)]
     assert any(right for right, *_ in results)

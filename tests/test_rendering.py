@@ -412,7 +412,10 @@ def test_a_condition_can_be_rendered(name: str) -> None:
     assert time.process_time() - start < 4 + 2 * megapixels  # ten times what it takes
 
 
-@pytest.mark.parametrize("name", CONDITIONS)
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(one, marks=[pytest.mark.slow] * (k % 3 > 0)) for k, one in enumerate(CONDITIONS)],
+)
 def test_the_images_of_a_condition_are_all_different_and_always_the_same(name: str) -> None:
     scenes = [condition(name, seed) for seed in range(IMAGES)]
     again = [condition(name, seed) for seed in range(IMAGES)]

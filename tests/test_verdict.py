@@ -29,7 +29,7 @@ def moved_pixels(true: Calibration, other: Calibration, pixels: np.ndarray, dept
     return seen - pixels
 
 
-@pytest.mark.parametrize("lens", ["none", "k1k2"])
+@pytest.mark.parametrize("lens", [pytest.param("none", marks=pytest.mark.slow), "k1k2"])
 def test_the_projection_uncertainty_is_that_of_200_calibrations(lens: str) -> None:
     scene, _ = bent_set(lens, 12)
     truth = calibrate(scene.points(), distortion=lens, skew=False, outliers="keep")

@@ -123,6 +123,7 @@ def test_a_setting_with_wrong_pixels_is_left_out() -> None:
     assert kept.rmse_px > 3 * lens.rmse_px
 
 
+@pytest.mark.slow
 def test_a_setting_under_a_wrong_name_is_left_out() -> None:
     points = seen("c", grid(6, 3), seed=14, side=5)
     named = columns(points)
