@@ -155,7 +155,9 @@ def test_boards_in_large_pictures_are_found(name: str) -> None:
     assert missed(name, range(FIRST, FIRST + 2)) == []
 
 
-@pytest.mark.parametrize("name", FOLDED)
+@pytest.mark.parametrize(
+    "name", [pytest.param(one, marks=[pytest.mark.slow] * (k % 2)) for k, one in enumerate(FOLDED)]
+)
 def test_planes_at_a_fold_are_separate_grids(name: str) -> None:
     assert missed(name, range(FIRST, FIRST + 2)) == []
 
