@@ -20,10 +20,12 @@ from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.cross_validation import disagreement, held_out
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
+from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
@@ -86,6 +88,13 @@ class _AtMinimum:
         self.cost = float(self.normal[:, -1, -1].sum())
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
         self.spare = max(self.views.n_equations - self.unknowns, 1)
+        self.errors = point_residuals(self.views, self.state)
+        self.repeated = repeated_poses(self.views, self.state, self.errors)
+        cov = covariance(self.normal, self.free, self.free_poses, self.views.n_equations)
+        self.condition = 1.0 / cov.smallest if cov.smallest > 0 else np.inf
+        self.covariance = counting_views(
+            cov, self.normal, self.free, self.free_poses, self.views.n_equations, self.repeated
+        ).entries
 
     def _arranged(self) -> Views:
         if self.points.covariance is None:
@@ -94,9 +103,7 @@ class _AtMinimum:
         return weighed(self.points, self.points.pixels - predicted)
 
     def evidence(self) -> Evidence:
-        views, free, poses = self.views, self.free, self.free_poses
-        errors = point_residuals(views, self.state)
-        cov = covariance(self.normal, free, poses, views.n_equations)
+        views = self.views
         precision, contradiction = self._precision()
         return Evidence(
             rmse_px=self.calibration.rmse_px,
@@ -104,17 +111,18 @@ class _AtMinimum:
             precision_px=precision,
             contradiction=contradiction,
             disagreement=self._disagreement(),
-            correlation=correlation(views, errors),
-            condition=1.0 / cov.smallest if cov.smallest > 0 else np.inf,
+            correlation=correlation(views, self.errors),
+            condition=self.condition,
             coverage=cover(self.points, views, self.state),
             projection=self._projection(),
             repeated=repeated_views(self.points),
+            poses=self.repeated.n_poses,
             scaled=scaled_views(self.points),
             mirrored=tuple(seen_from_behind(views, self.state)),
         )
 
     def _held_out(self) -> float:
-        lost = held_out(self.views, self.state, self.normal, self.free, self.free_poses)
+        lost = held_out(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
 
     def _precision(self) -> tuple[float, float]:
@@ -132,7 +140,9 @@ class _AtMinimum:
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:
             return np.nan
-        difference, cov = disagreement(self.views, self.state, self.normal, self.free, self.free_poses)
+        difference, cov = disagreement(
+            self.views, self.state, self.normal, self.free, self.free_poses, self.repeated
+        )
         if not np.isfinite(cov).all():
             return np.nan
         scale = np.sqrt(np.diagonal(cov))
@@ -148,7 +158,7 @@ class _AtMinimum:
         depths = np.array([depth.min(), median(depth), depth.max(), _DISTANT * depth.max()])
         return projection_uncertainty(
             self.views, self.state, self.camera, self.normal, self.free, self.free_poses,
-            self.cost / self.spare, image_grid(self.points.image_size), depths,
+            self.cost / self.spare, image_grid(self.points.image_size), depths, self.covariance,
         )  # fmt: skip
 
 

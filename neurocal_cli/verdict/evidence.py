@@ -39,6 +39,8 @@ class Evidence:
     repeated, scaled, mirrored : tuple of str
         Views that are copies of others; whose points lie farther apart than the others'; that show the
         target from its other side.
+    poses : int
+        Different poses among the views (`repeated_poses`).
     """
 
     rmse_px: float
@@ -53,3 +55,4 @@ class Evidence:
     repeated: tuple[str, ...]
     scaled: tuple[str, ...]
     mirrored: tuple[str, ...]
+    poses: int
