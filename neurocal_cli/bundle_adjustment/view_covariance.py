@@ -28,7 +28,7 @@ from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 
-__all__ = ["counting_views"]
+__all__ = ["counting_views", "scores_of_poses"]
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty
 _FEWEST = 3  # poses, of which one can be left out and two still differ
@@ -72,6 +72,19 @@ def counting_views(
     return replace(found, entries=entries, poses=_followed(found, normal, free, free_poses, entries))
 
 
+def scores_of_poses(
+    normal: Array, free: NDArray[np.bool_], free_poses: bool, repeated: RepeatedPoses
+) -> Quadratics:
+    """Quadratics of the different poses at their minimum, weighed so that cov(g) is variance times S."""
+    return _weighed(_by_pose(reduced(normal, free, free_poses), repeated), repeated.variance)
+
+
+def _weighed(q: Quadratics, times: Array) -> Quadratics:
+    S, g = q.S / times[:, None, None], q.g / times[:, None]
+    step = np.linalg.solve(S.sum(axis=0), g.sum(axis=0))
+    return Quadratics(S, g - S @ step, q.cost / times)
+
+
 def _by_pose(q: Quadratics, repeated: RepeatedPoses) -> Quadratics:
     """Of groups of views, with the scores at the minimum of all, which a restraint may keep one from."""
     if not repeated.none:
@@ -93,10 +106,9 @@ def _contradict(q: Quadratics, times: Array, variance: float) -> bool:
     views v and w, W_v being S^-1/2 S_v S^-1/2: its mean and variance follow, and Satterthwaite's (1946)
     chi-squared has the same.
     """
-    S, g = q.S / times[:, None, None], q.g / times[:, None]
-    whole = S.sum(axis=0)
-    g = g - S @ np.linalg.solve(whole, g.sum(axis=0))
-    scaled, scale = unit_diagonal(whole)
+    weighed = _weighed(q, times)
+    S, g = weighed.S, weighed.g
+    scaled, scale = unit_diagonal(S.sum(axis=0))
     try:
         root = np.linalg.inv(np.linalg.cholesky(scaled)) * scale
     except np.linalg.LinAlgError:

@@ -25,11 +25,12 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_p
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.bundle_adjustment.view_covariance import counting_views
+from neurocal_cli.bundle_adjustment.view_covariance import counting_views, scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.median import median
+from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.projection_uncertainty import (
@@ -39,6 +40,7 @@ from neurocal_cli.verdict.projection_uncertainty import (
 )
 from neurocal_cli.verdict.repeated_views import repeated_views, scaled_views
 from neurocal_cli.verdict.rules import Verdict, reach_verdict
+from neurocal_cli.verdict.view_change import ViewChange, view_change
 
 __all__ = ["assess", "gather_evidence"]
 
@@ -117,6 +119,8 @@ class _AtMinimum:
             projection=self._projection(),
             repeated=repeated_views(self.points),
             poses=self.repeated.n_poses,
+            change=self._change(),
+            board=self._board(),
             scaled=scaled_views(self.points),
             mirrored=tuple(seen_from_behind(views, self.state)),
         )
@@ -136,6 +140,21 @@ class _AtMinimum:
         ratio = np.sqrt((self.cost / self.spare + floor) / (own + floor))
         of_point = self.views.n_equations / len(self.points)
         return float(np.sqrt(of_point * own)) * px, float(ratio)
+
+    def _change(self) -> ViewChange | None:
+        if not self.free.any() or self.repeated.n_poses < 2:
+            return None
+        scores = scores_of_poses(self.normal, self.free, self.free_poses, self.repeated)
+        return view_change(
+            self.views, self.state, self.free, scores, self.repeated.group, self.cost / self.spare, self.spare
+        )
+
+    def _board(self) -> BoardShape | None:
+        if not self.free[0] or not self.free_poses:
+            return None
+        std = float(np.sqrt(self.covariance[0, 0]))
+        times = float(self.repeated.variance.mean())
+        return board_shape(self.views, self.state, self.free, self.cost / self.spare, self.spare, times, std)
 
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:

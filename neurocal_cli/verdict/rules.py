@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 
 __all__ = ["Verdict", "reach_verdict"]
@@ -75,6 +76,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[_Finding]:
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
+    yield from common_errors(evidence, calibration.unit)
     yield from _errors(calibration, evidence)
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
