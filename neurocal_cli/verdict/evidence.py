@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.coverage import Coverage
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
+from neurocal_cli.verdict.view_change import ViewChange
 
 __all__ = ["Evidence"]
 
@@ -39,6 +41,12 @@ class Evidence:
     repeated, scaled, mirrored : tuple of str
         Views that are copies of others; whose points lie farther apart than the others'; that show the
         target from its other side.
+    poses : int
+        Different poses among the views (`repeated_poses`).
+    change : ViewChange or None
+        How the camera differs between views; None where it does not.
+    board : BoardShape or None
+        How a target that is said to be flat seems to be bent; None where it does not.
     """
 
     rmse_px: float
@@ -53,3 +61,6 @@ class Evidence:
     repeated: tuple[str, ...]
     scaled: tuple[str, ...]
     mirrored: tuple[str, ...]
+    poses: int
+    change: ViewChange | None
+    board: BoardShape | None

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 
 __all__ = ["Verdict", "reach_verdict"]
@@ -36,8 +37,9 @@ _UNCOVERED = _Limit(0.6, 0.9)  # share of the image
 _FLAT = _Limit(-20.0, -5.0)  # degrees of tilt, negative
 _ALPHA = _Limit(0.01, 0.05)  # std over the value
 _CENTRE = _Limit(0.01, 0.05)  # std over alpha
-_PROJECTION = _Limit(0.0025, 0.02)  # worst std in the image over its diagonal
+_PROJECTION = _Limit(0.004, 0.05)  # worst std in the image over its diagonal
 _REJECTED = _Limit(0.02, 0.2)  # share of the points
+_FEW_POSES = 10  # where views repeat them
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
 _TOLD = 3.0  # standard deviations
 
@@ -74,6 +76,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[_Finding]:
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
+    yield from common_errors(evidence, calibration.unit)
     yield from _errors(calibration, evidence)
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
@@ -133,6 +136,13 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
     )
     if e.repeated:
         yield 1, f"{_names(e.repeated)}: the rows are those of another view", "give each view once"
+    views = len(calibration.views)
+    if e.poses < min(views, _FEW_POSES):
+        yield (
+            1,
+            f"{views} views show only {e.poses} different poses; views that repeat a pose count as one",
+            "add views of other poses instead of more frames of the same ones",
+        )
     if e.scaled:
         yield (
             1,
