@@ -38,8 +38,10 @@ _MOST_POINTS = 400  # that are triangulated to find the uncertainty of depth
 
 def assess_rig(rig: Rig) -> Verdict | None:
     """Good, usable or poor, with the reasons; None for a rig that holds no points of its own."""
-    for camera in (rig.left, rig.right):
-        if not camera.views or set(camera.points.view_names) != set(camera.views):
+    pairs = (*rig.pairs, *rig.left_out)
+    for side, camera in enumerate((rig.left, rig.right)):
+        names = set(camera.points.view_names)
+        if not pairs or names != set(camera.views) or not names >= {pair[side] for pair in pairs}:
             return None
     return reach_rig_verdict(rig, gather_rig_evidence(rig))
 

@@ -10,7 +10,7 @@ from neurocal_cli.calibration import Verdict
 from neurocal_cli.stereo.contradiction import Contradiction
 from neurocal_cli.stereo.evidence import RigEvidence
 from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.stereo.sound_pairs import MOVED, pair_name, told_of_move
+from neurocal_cli.stereo.sound_pairs import MOVED, pair_name, told_of_faults, told_of_move
 from neurocal_cli.verdict.limits import Limit
 
 __all__ = ["reach_rig_verdict"]
@@ -81,12 +81,14 @@ def _pairs(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
         yield 1, "the rig rests on one pair of views, and nothing checks it", "add pairs of views"
     if e.moved is not None:
         yield _rig_moved(rig, e, e.moved)
-    odd = [pair for pair, reason in rig.left_out.items() if not (e.moved and reason.startswith(MOVED))]
+    odd = {
+        pair: why for pair, why in rig.left_out.items() if not (e.moved is not None and why.startswith(MOVED))
+    }
     if odd:
         yield (
             _LEFT_OUT.grade(len(odd) / len(e.names)),
-            f"{len(odd)} of {len(e.names)} pairs of views contradict the others and were left out",
-            "look at the pairs that are listed with the reason, and remove them or take them again",
+            f"{told_of_faults(odd, len(e.names))} and were left out",
+            "look at the views of these pairs, and take them again",
         )
     found = e.contradiction
     if found is None:

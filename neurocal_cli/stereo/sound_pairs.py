@@ -19,7 +19,7 @@ from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.problem import estimated_parameters, rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
 
-__all__ = ["MOVED", "SoundPairs", "pair_name", "sound_pairs", "span", "told_of_move"]
+__all__ = ["MOVED", "SoundPairs", "pair_name", "sound_pairs", "span", "told_of_faults", "told_of_move"]
 
 MOVED = "taken"  # the reason of a pair that shows the rig before or after it moved begins so
 _OTHER_SIZE = 1.2  # times; targets of one series are alike, and units differ by far more
@@ -51,17 +51,22 @@ class SoundPairs:
         """Message with the pairs that are left out and their faults."""
         if self.moved:
             return self.moved
-        by_reason: dict[str, list[str]] = {}
-        for pair, reason in self.left_out.items():
-            by_reason.setdefault(reason, []).append(pair_name(pair))
-        parts = []
-        for reason, names in by_reason.items():
-            more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-            parts.append(f"{', '.join(names[:_SHOWN])}{more}: {reason}")
-        found = f"{len(self.left_out)} of {n_pairs} pairs of views contradict the rig ({'; '.join(parts)})"
+        found = told_of_faults(self.left_out, n_pairs)
         if outliers == "keep" and 2 * len(self.left_out) < n_pairs:
             return f"{found}; remove them, or use --outliers reject"
         return f"{found}; check that the views of a pair show one target at one moment, in the same order"
+
+
+def told_of_faults(left_out: Mapping[Pair, str], n_pairs: int) -> str:
+    """What to say of pairs that are left out: how many they are, and the faults with the pairs of each."""
+    by_reason: dict[str, list[str]] = {}
+    for pair, reason in left_out.items():
+        by_reason.setdefault(reason, []).append(pair_name(pair))
+    parts = []
+    for reason, names in by_reason.items():
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        parts.append(f"{', '.join(names[:_SHOWN])}{more}: {reason}")
+    return f"{len(left_out)} of {n_pairs} pairs of views contradict the rig ({'; '.join(parts)})"
 
 
 def pair_name(pair: Pair) -> str:
@@ -142,11 +147,14 @@ def told_of_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pai
         The part that determines the rig; none where both do.
     """
     this = f"; this is that of {span(kept)}" if kept else ""
-    ratio = float(median(size[:at]) / median(size[at:]))
-    if not 1 / _OTHER_SIZE < ratio < _OTHER_SIZE:
+    (large, larger), (small, smaller) = sorted(
+        ((float(median(size[part])), span(names[part])) for part in (slice(at), slice(at, None))),
+        reverse=True,
+    )
+    if large > _OTHER_SIZE * small:
         return (
-            f"the targets in {span(names[:at])} are {ratio:.3g} times as large as in {span(names[at:])}, so "
-            f"the rig has two sizes{this}",
+            f"the targets in {larger} are {large / small:.3g} times as large as in {smaller}, so the rig has "
+            f"two sizes{this}",
             "check the unit of X,Y,Z and the size of the squares",
         )
     return (

@@ -177,7 +177,7 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
     "right images of the previous pair": (
         lambda: right_rows(seen(scene()), np.roll(ALL, 1), SAME), "right view of the next"),
     "one pair of different moments": (
-        lambda: in_parts(scene(), turned(scene(), 0.0, 3.0), 11), "same moment|contradict"),
+        lambda: in_parts(scene(), turned(scene(), 0.0, 3.0), 11), "left12/right12: .*same moment"),
     "rig bumped by 0.1 degrees half way": (
         lambda: in_parts(scene(), turned(scene(), 0.1), 6), "moved between left06/right06"),
     "rig bumped by 0.5 degrees and 1 mm half way": (
@@ -194,11 +194,11 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
         lambda: in_parts(scene(), zoomed(scene(), 0, 1.02), 8, right_only=False),
         "focal length of the left"),
     "images of one pair exchanged": (
-        lambda: exchanged(seen(scene()), [3]), "left03|left04.*exchanged|contradict"),
+        lambda: exchanged(seen(scene()), [3]), "left04/right04: the left and the right image are exchanged"),
     "images of every other pair exchanged": (
-        lambda: exchanged(seen(scene()), [1, 3, 5, 7, 9, 11]), "exchanged|camera"),
+        lambda: exchanged(seen(scene()), [1, 3, 5, 7, 9, 11]), "exchanged"),
     "board turned round in one right image": (
-        lambda: half_turned(seen(scene()), [5]), "contradict"),
+        lambda: half_turned(seen(scene()), [5]), "left06/right06: the target is turned by 180"),
     "board turned round in every right image": (
         lambda: half_turned(seen(scene()), list(range(12))), "turned by 180 degrees"),
     "right views in another order": (
@@ -218,7 +218,7 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
         lambda: of_targets_moved(folded(), lambda _, pose: Pose(pose.R, pose.t + np.array([0.0, 4.0, 0.0]))),
         "one pair"),
     "two pairs, the rig bumped between them": (
-        lambda: in_parts(scene(2), turned(scene(2), 0.5), 1), "contradict|pair to pair"),
+        lambda: in_parts(scene(2), turned(scene(2), 0.5), 1), "not fixed to each other"),
 }  # fmt: skip
 
 
