@@ -187,11 +187,12 @@ def _explains(one: _Explanation, squares: float, n: int) -> bool:
 
 def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explanation]:
     """A second rig, or a second focal length, from each pair on: the best place of each."""
-    S, g = poses.normal(used)
-    x = solve_scaled(S, g[:, None])[:, 0]
     places = np.flatnonzero(used)
     if len(places) < 2 * _LEAST_PAIRS:
         return
+    S, g = poses.normal(used)
+    inverse = solve_scaled(S, np.eye(len(S)), ROUNDING)
+    x = inverse @ g
     starts = places[_LEAST_PAIRS : len(places) - _LEAST_PAIRS + 1]
     pairs = np.where(used[:, None, None], poses.pairs.S, 0.0), np.where(used[:, None], poses.pairs.g, 0.0)
     after_S, after_g = (np.cumsum(block[::-1], axis=0)[::-1][starts] for block in pairs)
@@ -205,7 +206,7 @@ def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explana
             kinds.append((kind, columns, after_S + own_S, after_g + own_g))
     for kind, columns, S2, g2 in kinds:
         cross = S2[:, :, columns]
-        follow = solve_scaled(np.broadcast_to(S, (len(S2), *S.shape)), cross, ROUNDING)
+        follow = inverse @ cross
         block = S2[:, columns[:, None], columns] - np.swapaxes(cross, 1, 2) @ follow
         right = g2[:, columns] - np.swapaxes(cross, 1, 2) @ x
         values = solve_scaled(block, right[..., None], ROUNDING)[..., 0]

@@ -67,17 +67,14 @@ def fit_rig(
     sound = sound_pairs(left, right, views)
     if sound.left_out and outliers == "keep":
         raise DegenerateGeometryError(sound.contradiction(len(views.both), outliers))
-    kept = tuple(pair for pair in views.both if pair not in sound.left_out)
-    problem = rig_problem(left, right, ViewPairs(kept, (), ()))
+    problem = sound.problem
+    if sound.left_out:
+        kept = tuple(pair for pair in views.both if pair not in sound.left_out)
+        problem = rig_problem(left, right, ViewPairs(kept, (), ()))
     adjusted, free, warnings = _adjusted(problem, (left, right), sound.rig, refine_cameras)
-    rig = assemble_rig(
-        problem,
-        (left, right),
-        adjusted,
-        free,
-        sound.left_out,
-        _covariance(problem, (left, right), adjusted, free),
-    )
+    luck = sound.luck and not sound.left_out
+    least = _covariance(problem, (left, right), adjusted, free, luck)
+    rig = assemble_rig(problem, (left, right), adjusted, free, sound.left_out, least)
     _refuse_one_place(rig)
     if sound.left_out:
         warnings.insert(0, sound.contradiction(len(views.both)))
@@ -121,17 +118,21 @@ def _covariance(
     calibrations: tuple[Calibration, Calibration],
     adjusted: AdjustedRig,
     free: NDArray[np.bool_],
+    luck: bool,
 ) -> Array | None:
     """Covariance of the shared parameters where that of independent points is too small."""
     sides = estimated_parameters(calibrations[0]), estimated_parameters(calibrations[1])
+    estimated = np.concatenate([*sides, np.ones(6, dtype=bool)])
+    held = bool((free != estimated).any())
+    if luck and not held:
+        return None
     rig = Pose(adjusted.state.R, adjusted.state.t * problem.frames.unit)
     poses = relative_poses(problem, sides, rig)
     if poses is None:
         return None
     used = np.ones(len(poses), dtype=bool)
-    estimated = np.concatenate([*sides, np.ones(6, dtype=bool)])
     found = contradiction(poses, used)
-    if (free == estimated).all() and not is_significant(found.scatter**2 * found.degrees, found.degrees):
+    if not held and not is_significant(found.scatter**2 * found.degrees, found.degrees):
         return None
     moved = free[estimated]
     return rig_covariance(poses, used, found)[np.ix_(moved, moved)]

@@ -130,13 +130,14 @@ class _RigAssembly:
         pose = Pose(state.R, state.t * frames.unit)
         block, std = self._rig_covariance(pose)
         n_points = sum(observed.n_points for observed in self.problem.observations)
+        pairs = self.problem.pairs
         return Rig(
             left,
             right,
             pose,
             std,
             block,
-            tuple(self.problem.pairs[k] for k in np.argsort(self.problem.paired)),
+            tuple(pairs[k] for k in np.argsort(self.problem.paired)),
             dict(left_out),
             rmse_px=float(np.sqrt(sum(s.sum() for s in sums) / n_points)),
             max_px=float(np.sqrt(max(e.max() for e in errors))),

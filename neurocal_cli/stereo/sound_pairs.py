@@ -14,9 +14,9 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.median import median
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
-from neurocal_cli.stereo.contradiction import contradiction
+from neurocal_cli.stereo.contradiction import contradiction, is_significant
 from neurocal_cli.stereo.pairing import ViewPairs
-from neurocal_cli.stereo.problem import estimated_parameters, rig_problem
+from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
 
 __all__ = ["MOVED", "SoundPairs", "pair_name", "sound_pairs", "span", "told_of_faults", "told_of_move"]
@@ -35,17 +35,23 @@ class SoundPairs:
 
     Attributes
     ----------
+    problem : RigProblem
+        Of all pairs.
     rig : Pose
         The rig of most pairs, where an adjustment starts.
     left_out : dict of str by (left name, right name)
         Pairs that do not determine the rig, with the reason.
     moved : str
         What to say of a rig that moved between two pairs; empty if it did not.
+    luck : bool
+        Whether the pairs differ by no more than luck.
     """
 
+    problem: RigProblem
     rig: Pose
     left_out: Mapping[Pair, str] = field(default_factory=dict)
     moved: str = ""
+    luck: bool = False
 
     def contradiction(self, n_pairs: int, outliers: str = "reject") -> str:
         """Message with the pairs that are left out and their faults."""
@@ -93,7 +99,7 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
     reasons = dict(zip(problem.pairs, consensus.reasons, strict=True))
     # A fault that has a name is certain. The others may belong to a rig that moved.
     named = {pair: reason for pair, reason in reasons.items() if reason not in ("", UNSYNCHRONISED)}
-    found = SoundPairs(consensus.rig, {pair: reason for pair, reason in reasons.items() if reason})
+    found = SoundPairs(problem, consensus.rig, {pair: reason for pair, reason in reasons.items() if reason})
     free = estimated_parameters(left), estimated_parameters(right)
     poses = relative_poses(problem, free, consensus.rig)
     if poses is not None:
@@ -112,7 +118,8 @@ def _explained(poses: RelativePoses, used: NDArray[np.bool_], found: SoundPairs)
     if why.kind == "moved":
         found = replace(found, left_out={**found.left_out, **odd})
         return _larger_part(poses, used & ~why.odd, why.at, found)
-    return replace(found, left_out={**odd, **found.left_out})
+    luck = not is_significant(why.scatter**2 * why.degrees, why.degrees)
+    return replace(found, left_out={**odd, **found.left_out}, luck=luck)
 
 
 def _larger_part(poses: RelativePoses, used: NDArray[np.bool_], at: int, found: SoundPairs) -> SoundPairs:
@@ -129,7 +136,7 @@ def _larger_part(poses: RelativePoses, used: NDArray[np.bool_], at: int, found: 
     start = poses.solution(sides[kept])[-6:]
     rig = Pose(rotation_step(start[:3]) @ found.rig.R, found.rig.t + start[3:] * poses.unit)
     text, advice = told_of_move(poses.names, poses.size, at, poses.names[at:] if kept else poses.names[:at])
-    return SoundPairs(rig, left_out, f"{text}; {advice}")
+    return SoundPairs(found.problem, rig, left_out, f"{text}; {advice}")
 
 
 def told_of_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pair] = ()) -> tuple[str, str]:
