@@ -3,27 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.limits import Limit as _Limit
 
 __all__ = ["Verdict", "reach_verdict"]
-
-
-@dataclass(frozen=True)
-class _Limit:
-    """From where on a quantity is no longer good, and from where on it is poor."""
-
-    good: float
-    poor: float
-
-    def grade(self, value: float) -> int:
-        """0 good, 1 usable, 2 poor; what is unknown is good."""
-        return int(value > self.good) + int(value > self.poor)
 
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and tests/test_verdict.py, in
