@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from support.campaign import scene
 from support.grouped_views import ALPHA, photographed, poses
 from support.real_data import RealFiles
 from support.scenes import table_1
@@ -15,6 +18,27 @@ from neurocal_cli.verdict.assessment import gather_evidence
 def curled(by: float, seed: int, n: int = 14) -> Calibration:
     rng = np.random.default_rng([seed, 77])
     return calibrate(photographed(poses(n, rng), rng, curl=by))
+
+
+def stretched(by: float, seed: int, n: int = 14) -> Calibration:
+    """The print is longer along X than its points say."""
+    rng = np.random.default_rng([seed, 78])
+    points = photographed(poses(n, rng), rng)
+    return calibrate(replace(points, world=points.world / [1 + by, 1, 1]))
+
+
+@pytest.mark.parametrize("by", [0.003, -0.002])
+def test_a_print_that_is_stretched_is_measured(by: float) -> None:
+    cal = stretched(by, 1)
+    board = gather_evidence(cal).board
+    assert board is not None
+    assert board.stretch == pytest.approx(by, rel=0.2)
+
+
+@pytest.mark.slow
+def test_no_flat_board_is_called_bent_or_stretched() -> None:
+    for seed in range(200):
+        assert gather_evidence(stretched(0.0, seed, 4 + seed % 30)).board is None, seed
 
 
 @pytest.mark.parametrize("by", [0.3, 0.6])
@@ -45,6 +69,16 @@ def test_curls_of_all_sizes(by: float) -> None:
         assert not (wrong and cal.verdict.word == "good")
         named += any("it seems bent by" in reason for reason in cal.verdict.reasons)
     assert named >= 27 - 6 * (by < 0.3)
+
+
+@pytest.mark.parametrize(
+    ("seed", "says"), [(621, "stretched by 0.27 % along Y"), (593, "shrunk by 0.31 % along X")]
+)
+def test_a_stretch_that_makes_the_focal_length_wrong_is_the_reason(seed: int, says: str) -> None:
+    verdict = calibrate(scene(seed)[0]).verdict
+    assert verdict is not None
+    assert verdict.word != "good"
+    assert says in verdict.reasons[0]
 
 
 def test_solid_targets_and_single_views_have_no_such_shape() -> None:

@@ -1,9 +1,11 @@
-"""Whether the residuals repeat on the board: the signature of a flat target that is not flat.
+"""Whether the residuals repeat on the board: the signature of a flat target that is not as its points say.
 
 A board that leaves its plane by d(x, y) moves each point's pixel by d times the derivative along the board's
 normal, in every view alike. Let d be a polynomial of the second and third degree. Its seven coefficients are
 unknowns of one more Gauss-Newton step, from the minimum and together with the camera and all poses. What they
-gain tells whether the board is bent, and the step of the camera how wrong it is for that.
+gain tells whether the board is bent, and the step of the camera how wrong it is for that. A print that is
+stretched along one of its sides, or whose sides are not at right angles, is told in the same way by two
+coefficients of displacements in the plane.
 """
 
 from __future__ import annotations
@@ -29,6 +31,8 @@ __all__ = ["BoardShape", "board_shape"]
 
 # Of x and y: what bends a board smoothly. Lower ones are its plane.
 _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
+_BENT = np.arange(len(_POWERS))
+_STRETCHED = len(_POWERS) + np.arange(2)  # displacements along x by x and by y
 _CHANCE = 4.75  # sigmas: one clean set in a million
 _FLAT = 0.02  # of its size: more is no board that happens to be bent
 _FEWEST = 3  # views
@@ -39,12 +43,17 @@ _ACROSS = 11  # points of a grid on the board
 
 @dataclass(frozen=True)
 class BoardShape:
-    """How a target that is said to be flat seems to be bent.
+    """How a target that is said to be flat seems to be bent, or stretched.
 
     Attributes
     ----------
     bend : float
-        Between its highest and its lowest point, over its mean plane [world unit].
+        Between its highest and its lowest point, over its mean plane [world unit]; 0 where it is stretched.
+    stretch, shear : float
+        By which share it is longer along its longer side than stated, against the shorter side; angle [rad]
+        by which its sides are off a right one. 0 where it is bent.
+    side : str
+        Axis of the world that is nearest to its longer side.
     focal_length : float
         By which share the focal length would change if the board were taken as it seems to be.
     sigmas : float
@@ -54,6 +63,9 @@ class BoardShape:
     """
 
     bend: float
+    stretch: float
+    shear: float
+    side: str
     focal_length: float
     sigmas: float
     explained: float
@@ -68,7 +80,7 @@ def board_shape(
     times: float,
     std: float,
 ) -> BoardShape | None:
-    """See whether the board is bent; None where it is not, or where that cannot be told.
+    """See whether the board is bent or stretched; None where it is not, or where that cannot be told.
 
     Parameters
     ----------
@@ -96,22 +108,47 @@ def board_shape(
         views, state = views.subset(some), replace(state, R=state.R[some], t=state.t[some])
     shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     N = _with_shape(views, state, frame)
-    f, n = len(shared), len(_POWERS)
+    f, n = len(shared), len(_BENT) + len(_STRETCHED)
     width = N.shape[-1] - n
     kept = np.concatenate([shared, np.arange(width - 1, width + n)])
     reduced = eliminate(N, kept, np.arange(POSE.start, POSE.stop), _RIDGE)[0].sum(axis=0)
     H, g = reduced[:-1, :-1], reduced[:-1, -1]
-    inverse = inverse_or_nan(H)
-    step = inverse @ g
-    if not np.isfinite(step).all() or not variance > 0:
+    if not variance > 0:
         return None
-    shape = step[f:]
-    chi = float(shape @ np.linalg.solve(inverse[f:, f:], shape)) / (variance * times)
-    if chi / n < exceeded_by_chance(n, _CHANCE):
+    found = [(_step(H, g, f, group), group) for group in (_BENT, _STRETCHED)]
+    (step, gain), group = max(found, key=lambda one: one[0][1] / _least(len(one[1])))
+    chi = gain / (variance * times)
+    if not chi >= _least(len(group)):
         return None
     moved = float(step[0])
     explained = chi * times * seen / views.n_views / spare
-    return BoardShape(frame.bend(shape), moved / float(state.entries[0, 0]), abs(moved) / std, explained)
+    bent = group is _BENT
+    stretch, shear = (0.0, 0.0) if bent else (float(value) for value in step[f:])
+    return BoardShape(
+        bend=frame.bend(step[f:]) if bent else 0.0,
+        stretch=stretch,
+        shear=shear,
+        side="XYZ"[int(np.argmax(np.abs(frame.axes[:, 0])))],
+        focal_length=moved / float(state.entries[0, 0]),
+        sigmas=abs(moved) / std,
+        explained=explained,
+    )
+
+
+def _step(H: Array, g: Array, f: int, group: NDArray[np.intp]) -> tuple[Array, float]:
+    """Gauss-Newton step of f shared parameters and a group of the shape's, and what the group gains."""
+    some = np.concatenate([np.arange(f), f + group])
+    inverse = inverse_or_nan(H[np.ix_(some, some)])
+    step = inverse @ g[some]
+    if not np.isfinite(step).all():
+        return step, -np.inf
+    shape = step[f:]
+    return step, float(shape @ np.linalg.solve(inverse[f:, f:], shape))
+
+
+def _least(n: int) -> float:
+    """Chi-squared of n coefficients from which on they are no chance."""
+    return n * float(exceeded_by_chance(n, _CHANCE))
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,8 +195,8 @@ def _powers(x: Array, y: Array) -> Array:
 
 
 def _with_shape(views: Views, state: CameraState, frame: _Frame) -> Array:
-    """Normal matrices (V, 12 + K + 7, 12 + K + 7) with the shape's columns before the residual's."""
-    batches, n = views.batches, len(_POWERS)
+    """Normal matrices (V, 12 + K + 9, 12 + K + 9) with the shape's columns before the residual's."""
+    batches, n = views.batches, len(_BENT) + len(_STRETCHED)
     width = 12 + len(state.k)
     found = np.empty((len(batches.view), width + n, width + n))
     for chunk in batches.chunks():
@@ -173,9 +210,15 @@ def _with_shape(views: Views, state: CameraState, frame: _Frame) -> Array:
             / frame.size
         )
         # The derivative by tau is that by the point in front of the camera.
-        normal = state.R[view] @ frame.axes[:, 2] * (frame.size / scale)[:, None]
-        lifted = np.einsum("ti,tiun->tun", normal, J[:, POSE.start + 3 : POSE.stop])
-        shape = np.moveaxis(_powers(x, y), 0, 1)[:, :, None] * lifted[:, None]
-        whole = np.concatenate([J[:, :-1], shape, J[:, -1:]], axis=1).reshape(len(view), width + n, -1)
+        along, _, normal = np.moveaxis(state.R[view] @ frame.axes * (frame.size / scale)[:, None, None], 2, 0)
+        drawn, lifted = (
+            np.einsum("ti,tiun->tun", axis, J[:, POSE.start + 3 : POSE.stop])[:, None]
+            for axis in (along, normal)
+        )
+        bent = np.moveaxis(_powers(x, y), 0, 1)[:, :, None] * lifted
+        stretched = np.stack([x, y], axis=1)[:, :, None] * drawn
+        whole = np.concatenate([J[:, :-1], bent, stretched, J[:, -1:]], axis=1).reshape(
+            len(view), width + n, -1
+        )
         found[chunk] = whole @ np.swapaxes(whole, 1, 2)
     return batches.sum_by_view(found)

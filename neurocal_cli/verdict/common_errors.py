@@ -78,7 +78,16 @@ def _bent(board: BoardShape, unit: str) -> Finding:
     off = abs(board.focal_length)
     return (
         max(int(board.sigmas > _SIGMAS), int(off > _OFF) + int(off > _MUCH_OFF)),
-        f"the residuals repeat on the board in all views: it seems bent by {board.bend:.2g} {unit}, which "
+        f"the residuals repeat on the board in all views: it seems {_shape(board, unit)}, which "
         f"makes the focal length {100 * off:.2g} % too {'short' if board.focal_length > 0 else 'long'}",
         "use a board that is flat, or measure its shape and give X,Y,Z as measured",
     )
+
+
+def _shape(board: BoardShape, unit: str) -> str:
+    if board.bend:
+        return f"bent by {board.bend:.2g} {unit}"
+    if abs(board.shear) > abs(board.stretch):
+        return f"printed with sides that are {abs(board.shear):.2g} rad off a right angle"
+    more = "stretched" if board.stretch > 0 else "shrunk"
+    return f"{more} by {100 * abs(board.stretch):.2g} % along {board.side}"
