@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
+
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
@@ -23,7 +25,11 @@ from neurocal_cli.points import Correspondences
 
 __all__ = ["fit", "fit_again"]
 
+# Starts that lead to a pole of the distortion, or into the camera's plane, are told so by what they cost.
+_quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
+
+@_quietly
 def fit(problem: Problem, options: Options) -> Solution:
     """Fit a camera from random weights, with its distortion model.
 
@@ -41,6 +47,7 @@ def fit(problem: Problem, options: Options) -> Solution:
     return _finished(solution, options)
 
 
+@_quietly
 def fit_again(solution: Solution, points: Correspondences, options: Options) -> Solution:
     """Adjust a solution to other points of the same views, or of some of them."""
     if options.distortion == "plumb-line":
