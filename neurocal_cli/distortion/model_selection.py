@@ -198,7 +198,7 @@ def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidat
 def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
     """Say so where a simpler model was taken only because the one that fits folds back."""
     for model, candidate in fitted.items():
-        bad = candidate.not_monotonic is not None and not candidate.noise
+        bad = candidate.not_monotonic is not None and not candidate.noise and candidate.cost < chosen.cost
         if bad and chosen.lost.sum() > _FAR_WORSE**2 * candidate.lost.sum():
             return (
                 f"the distortion is strong, and the model {model} that fits the points is not monotonic "
