@@ -7,6 +7,7 @@ Everything follows from the calibration and its points, so a file can be judged 
   free network (`outlier_views.free_networks`); a common camera that leaves more contradicts the data;
 * how far two halves of the data disagree, in units of their reported uncertainty;
 * whether residuals of neighbours are correlated (`residual_correlation`);
+* whether the points ask for other values of parameters that were given (`given_parameters`);
 * how much of the image and how many directions the points cover (`coverage`);
 * how far projected pixels would move with other noise (`projection_uncertainty`).
 """
@@ -30,6 +31,7 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.median import median
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.given_parameters import asked_for
 from neurocal_cli.verdict.projection_uncertainty import (
     ProjectionUncertainty,
     image_grid,
@@ -111,6 +113,7 @@ class _AtMinimum:
             repeated=repeated_views(self.points),
             scaled=scaled_views(self.points),
             mirrored=tuple(seen_from_behind(views, self.state)),
+            asked_for=asked_for(views, self.state, self.calibration.fixed, poses),
         )
 
     def _held_out(self) -> float:

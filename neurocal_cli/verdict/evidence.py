@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from neurocal_cli.verdict.coverage import Coverage
+from neurocal_cli.verdict.given_parameters import AskedFor
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
 
 __all__ = ["Evidence"]
@@ -39,6 +40,8 @@ class Evidence:
     repeated, scaled, mirrored : tuple of str
         Views that are copies of others; whose points lie farther apart than the others'; that show the
         target from its other side.
+    asked_for : tuple of AskedFor
+        Given parameters as the points would have them.
     """
 
     rmse_px: float
@@ -53,3 +56,4 @@ class Evidence:
     repeated: tuple[str, ...]
     scaled: tuple[str, ...]
     mirrored: tuple[str, ...]
+    asked_for: tuple[AskedFor, ...]

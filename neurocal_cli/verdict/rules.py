@@ -2,19 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.given_parameters import AskedFor
 
-__all__ = ["Verdict", "reach_verdict"]
+__all__ = [
+    "ERROR",
+    "WORDS",
+    "Finding",
+    "Limit",
+    "Verdict",
+    "given_parameters",
+    "image_diagonal",
+    "pixel_spread",
+    "reach_verdict",
+]
+
+WORDS = ("good", "usable", "poor")
 
 
 @dataclass(frozen=True)
-class _Limit:
+class Limit:
     """From where on a quantity is no longer good, and from where on it is poor."""
 
     good: float
@@ -27,21 +42,24 @@ class _Limit:
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and tests/test_verdict.py, in
 # which real and simulated good data are; the errors, angles and shares are what a user would call large.
-_ERROR = _Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
-_CONTRADICTION = _Limit(1.6, 2.3)
-_HELD_OUT = _Limit(1.3, 2.0)  # over the rms error
-_DISAGREEMENT = _Limit(6.0, 40.0)
-_CORRELATION = _Limit(0.5, 0.85)
-_UNCOVERED = _Limit(0.6, 0.9)  # share of the image
-_FLAT = _Limit(-20.0, -5.0)  # degrees of tilt, negative
-_ALPHA = _Limit(0.01, 0.05)  # std over the value
-_CENTRE = _Limit(0.01, 0.05)  # std over alpha
-_PROJECTION = _Limit(0.0025, 0.02)  # worst std in the image over its diagonal
-_REJECTED = _Limit(0.02, 0.2)  # share of the points
+ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
+_CONTRADICTION = Limit(1.6, 2.3)
+_HELD_OUT = Limit(1.3, 2.0)  # over the rms error
+_DISAGREEMENT = Limit(6.0, 40.0)
+_CORRELATION = Limit(0.5, 0.85)
+_UNCOVERED = Limit(0.6, 0.9)  # share of the image
+_FLAT = Limit(-20.0, -5.0)  # degrees of tilt, negative
+_ALPHA = Limit(0.01, 0.05)  # std over the value
+_CENTRE = Limit(0.01, 0.05)  # std over alpha
+_PROJECTION = Limit(0.0025, 0.02)  # worst std in the image over its diagonal
+_REJECTED = Limit(0.02, 0.2)  # share of the points
+_GIVEN = Limit(0.01, 0.05)  # difference over alpha; 100 cameras given truly stay below 5 std
+_TOLD_APART = 5.0  # standard deviations
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
 _TOLD = 3.0  # standard deviations
 
-_Finding = tuple[int, str, str]  # grade, reason, advice
+Finding = tuple[int, str, str]
+"""Grade (0 good, 1 usable, 2 poor), reason, advice."""
 
 
 def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
@@ -53,7 +71,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
     """
     findings = [f for f in _findings(calibration, evidence) if f[0] > 0]
     findings.sort(key=lambda f: -f[0])
-    word = ("good", "usable", "poor")[max((f[0] for f in findings), default=0)]
+    word = WORDS[max((f[0] for f in findings), default=0)]
     advice = tuple(dict.fromkeys(f[2] for f in findings if f[2]))
     projection = evidence.projection
     worst = float(np.nanmax(projection.std[1])) if projection is not None else float("nan")
@@ -71,22 +89,31 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
     return Verdict(word, tuple(f[1] for f in findings), advice, measures)
 
 
-def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[_Finding]:
+def image_diagonal(points: Correspondences) -> float:
+    """Diagonal of the image [px], or of what the points span of it."""
+    return float(np.hypot(*(points.image_size or np.ptp(points.pixels, axis=0))))
+
+
+def pixel_spread(points: Correspondences) -> float:
+    """Rms distance of the pixels from their mean [px]."""
+    return float(np.sqrt(points.pixels.var(axis=0).sum()))
+
+
+def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
     yield from _errors(calibration, evidence)
+    yield from given_parameters(evidence.asked_for, calibration.intrinsics, calibration.std)
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
     yield from _parameters(calibration, evidence)
 
 
-def _errors(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
-    points = calibration.points
-    spread = float(np.sqrt(points.pixels.var(axis=0).sum()))
-    size = points.image_size or np.ptp(points.pixels, axis=0)
+def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    spread = pixel_spread(calibration.points)
     pairing = "check that each pixel belongs to its point, and that X,Y,Z are those of the true target"
     yield (
-        _ERROR.grade(e.rmse_px / float(np.hypot(*size))),
+        ERROR.grade(e.rmse_px / image_diagonal(calibration.points)),
         f"the rms reprojection error of {e.rmse_px:.3g} px is large",
         pairing,
     )
@@ -122,7 +149,23 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
         )
 
 
-def _data(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
+def given_parameters(
+    asked_for: tuple[AskedFor, ...], given: Intrinsics, std: Mapping[str, float]
+) -> Iterator[Finding]:
+    """Given parameters, of these standard deviations, that the points contradict."""
+    told = [a for a in asked_for if abs(a.found - a.given) > _TOLD_APART * np.hypot(a.std, std[a.name])]
+    if not told:
+        return
+    off = max(abs(a.found - a.given) for a in told) / given.alpha_u
+    texts = [f"{a.name} = {a.given:.5g} is given, but the points ask for {a.found:.5g} px" for a in told]
+    yield (
+        _GIVEN.grade(off),
+        ", ".join(texts),
+        "check that what is given is of the same camera at the same zoom, focus and image size",
+    )
+
+
+def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     rejected = calibration.rejected
     total = len(calibration.points) + len(rejected)
     share = len(rejected) / total
@@ -149,7 +192,7 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
         yield 2, f"{e.coverage.outside} points lie outside the image", "correct image_size or the points"
 
 
-def _coverage(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
+def _coverage(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     if calibration.type in (3,):
         return
     cover = e.coverage
@@ -168,7 +211,7 @@ def _coverage(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
         )
 
 
-def _parameters(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
+def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     A, std, fixed = calibration.intrinsics, calibration.std, calibration.fixed
     more = "add views in which the target is near, tilted and fills the image"
     if "alpha_u" not in fixed:
@@ -204,7 +247,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
     yield from _off_centre(calibration)
 
 
-def _off_centre(calibration: Calibration) -> Iterator[_Finding]:
+def _off_centre(calibration: Calibration) -> Iterator[Finding]:
     A, size = calibration.intrinsics, calibration.image_size
     if size is None or ("u0" in calibration.fixed and calibration.type != 2):
         return
