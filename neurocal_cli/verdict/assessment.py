@@ -7,6 +7,7 @@ Everything follows from the calibration and its points, so a file can be judged 
   free network (`outlier_views.free_networks`); a common camera that leaves more contradicts the data;
 * how far two halves of the data disagree, in units of their reported uncertainty;
 * whether residuals of neighbours are correlated (`residual_correlation`);
+* whether the views are of two cameras, or of a focal length that changes (`view_groups`);
 * whether the points ask for other values of parameters that were given (`given_parameters`);
 * how much of the image and how many directions the points cover (`coverage`);
 * how far projected pixels would move with other noise (`projection_uncertainty`).
@@ -37,8 +38,9 @@ from neurocal_cli.verdict.projection_uncertainty import (
     image_grid,
     projection_uncertainty,
 )
-from neurocal_cli.verdict.repeated_views import repeated_views, scaled_views
+from neurocal_cli.verdict.repeated_views import repeated_views
 from neurocal_cli.verdict.rules import Verdict, reach_verdict
+from neurocal_cli.verdict.view_groups import view_groups
 
 __all__ = ["assess", "gather_evidence"]
 
@@ -111,9 +113,9 @@ class _AtMinimum:
             coverage=cover(self.points, views, self.state),
             projection=self._projection(),
             repeated=repeated_views(self.points),
-            scaled=scaled_views(self.points),
             mirrored=tuple(seen_from_behind(views, self.state)),
             asked_for=asked_for(views, self.state, self.calibration.fixed, poses),
+            groups=view_groups(views, self.state, self.normal, free) if poses and free[:5].any() else None,
         )
 
     def _held_out(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from neurocal_cli.verdict.coverage import Coverage
 from neurocal_cli.verdict.given_parameters import AskedFor
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
+from neurocal_cli.verdict.view_groups import ViewGroups
 
 __all__ = ["Evidence"]
 
@@ -37,11 +38,12 @@ class Evidence:
     projection : ProjectionUncertainty or None
         At the nearest, the middle and the farthest point's distance, and at ten times that; None
         where the image's size is unknown.
-    repeated, scaled, mirrored : tuple of str
-        Views that are copies of others; whose points lie farther apart than the others'; that show the
-        target from its other side.
+    repeated, mirrored : tuple of str
+        Views that are copies of others; that show the target from its other side.
     asked_for : tuple of AskedFor
         Given parameters as the points would have them.
+    groups : ViewGroups or None
+        Two cameras among the views, or a focal length that changes; None where nothing says so.
     """
 
     rmse_px: float
@@ -54,6 +56,6 @@ class Evidence:
     coverage: Coverage
     projection: ProjectionUncertainty | None
     repeated: tuple[str, ...]
-    scaled: tuple[str, ...]
     mirrored: tuple[str, ...]
     asked_for: tuple[AskedFor, ...]
+    groups: ViewGroups | None

@@ -3,42 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.points import Correspondences
+from neurocal_cli.geometry import Array
 from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.findings import WORDS, Finding, Limit, image_diagonal, name_some, pixel_spread
 from neurocal_cli.verdict.given_parameters import AskedFor
+from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
+from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
+from neurocal_cli.verdict.units_of_views import views_of_another_scale
+from neurocal_cli.verdict.view_groups import ViewGroups
 
-__all__ = [
-    "ERROR",
-    "WORDS",
-    "Finding",
-    "Limit",
-    "Verdict",
-    "given_parameters",
-    "image_diagonal",
-    "pixel_spread",
-    "reach_verdict",
-]
-
-WORDS = ("good", "usable", "poor")
-
-
-@dataclass(frozen=True)
-class Limit:
-    """From where on a quantity is no longer good, and from where on it is poor."""
-
-    good: float
-    poor: float
-
-    def grade(self, value: float) -> int:
-        """0 good, 1 usable, 2 poor; what is unknown is good."""
-        return int(value > self.good) + int(value > self.poor)
-
+__all__ = ["ERROR", "Verdict", "given_parameters", "reach_verdict"]
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and tests/test_verdict.py, in
 # which real and simulated good data are; the errors, angles and shares are what a user would call large.
@@ -52,14 +31,10 @@ _FLAT = Limit(-20.0, -5.0)  # degrees of tilt, negative
 _ALPHA = Limit(0.01, 0.05)  # std over the value
 _CENTRE = Limit(0.01, 0.05)  # std over alpha
 _PROJECTION = Limit(0.0025, 0.02)  # worst std in the image over its diagonal
-_REJECTED = Limit(0.02, 0.2)  # share of the points
 _GIVEN = Limit(0.01, 0.05)  # difference over alpha; 100 cameras given truly stay below 5 std
 _TOLD_APART = 5.0  # standard deviations
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
 _TOLD = 3.0  # standard deviations
-
-Finding = tuple[int, str, str]
-"""Grade (0 good, 1 usable, 2 poor), reason, advice."""
 
 
 def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
@@ -89,16 +64,6 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
     return Verdict(word, tuple(f[1] for f in findings), advice, measures)
 
 
-def image_diagonal(points: Correspondences) -> float:
-    """Diagonal of the image [px], or of what the points span of it."""
-    return float(np.hypot(*(points.image_size or np.ptp(points.pixels, axis=0))))
-
-
-def pixel_spread(points: Correspondences) -> float:
-    """Rms distance of the pixels from their mean [px]."""
-    return float(np.sqrt(points.pixels.var(axis=0).sum()))
-
-
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
@@ -117,6 +82,9 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         f"the rms reprojection error of {e.rmse_px:.3g} px is large",
         pairing,
     )
+    # A target that is too long in one direction makes views differ as well.
+    if e.groups is not None and e.rmse_px > 1e-4 * spread and not _oblong(calibration):
+        yield _of_several_cameras(e.groups)
     if e.rmse_px > 1e-4 * spread:
         yield (
             _CONTRADICTION.grade(e.contradiction),
@@ -149,6 +117,39 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         )
 
 
+def _of_several_cameras(groups: ViewGroups) -> Finding:
+    if groups.scale.size:
+        share = float(np.ptp(groups.scale))
+        return (
+            _ALPHA.grade(share),
+            f"the focal length changes from view to view, by {100 * share:.2g} % in all: the zoom or the "
+            "focus moved",
+            "calibrate one zoom and one focus at a time; switch autofocus off",
+        )
+    first, second = groups.cameras[:, [0, 2, 3, 4]]
+    apart = float(np.abs(first - second).max() / second[0])
+    asked = [f"alpha_u = {c[0]:.5g} px and the centre ({c[2]:.0f}, {c[3]:.0f})" for c in (first, second)]
+    return (
+        _ALPHA.grade(apart),
+        f"the images come from two cameras, or {_alternative(first, second)}: {name_some(groups.names[0])} "
+        f"ask for {asked[0]}, the others for {asked[1]}",
+        "calibrate these views and the others separately",
+    )
+
+
+def _alternative(first: Array, second: Array) -> str:
+    """What else than two cameras these are, from alpha_u, alpha_v, u0 and v0."""
+    ratio = first / second
+    near = 2 * _GIVEN.good
+    if np.abs(ratio - ratio[0]).max() < near and abs(ratio[0] - 1) > near:
+        return "are of two sizes"
+    if np.abs(first - second[[1, 0, 3, 2]]).max() < near * second[0]:
+        return "u and v are exchanged in one part"
+    if np.abs(ratio[:2] - 1).max() < near:
+        return "one part is cropped or turned"
+    return "from two zooms"
+
+
 def given_parameters(
     asked_for: tuple[AskedFor, ...], given: Intrinsics, std: Mapping[str, float]
 ) -> Iterator[Finding]:
@@ -166,30 +167,19 @@ def given_parameters(
 
 
 def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
-    rejected = calibration.rejected
-    total = len(calibration.points) + len(rejected)
-    share = len(rejected) / total
-    yield (
-        max(_REJECTED.grade(share), int(bool(rejected.views))),
-        f"{len(rejected)} of {total} points are outliers and were left out",
-        "look at the points and views that are listed as outliers",
-    )
+    points = with_rejected(calibration)
+    yield from rejected_points(calibration)
+    yield from odd_pixels(points)
+    yield from points_given_twice(points)
+    yield from views_of_another_scale(calibration.points)
     if e.repeated:
-        yield 1, f"{_names(e.repeated)}: the rows are those of another view", "give each view once"
-    if e.scaled:
-        yield (
-            1,
-            f"{_names(e.scaled)}: the distances between the points differ from those in most views",
-            "check the unit of X,Y,Z and the size of the squares",
-        )
+        yield 1, f"{name_some(e.repeated)}: the rows are those of another view", "give each view once"
     if e.mirrored:
         yield (
             1,
-            f"{_names(e.mirrored)}: the target is mirrored",
+            f"{name_some(e.mirrored)}: the target is mirrored",
             "check the order of the points in these views",
         )
-    if e.coverage.outside:
-        yield 2, f"{e.coverage.outside} points lie outside the image", "correct image_size or the points"
 
 
 def _coverage(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
@@ -231,8 +221,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     if calibration.type == 3:
         return
     ratio = A.alpha_u / A.alpha_v
-    told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
-    if abs(ratio - 1) > _OBLONG + told:
+    if _oblong(calibration):
         yield (
             1,
             f"the pixels are not square: alpha_u / alpha_v = {ratio:.3f}",
@@ -247,6 +236,13 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     yield from _off_centre(calibration)
 
 
+def _oblong(calibration: Calibration) -> bool:
+    """Whether the pixels are certainly not square."""
+    A, std = calibration.intrinsics, calibration.std
+    told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
+    return abs(A.alpha_u / A.alpha_v - 1) > _OBLONG + told
+
+
 def _off_centre(calibration: Calibration) -> Iterator[Finding]:
     A, size = calibration.intrinsics, calibration.image_size
     if size is None or ("u0" in calibration.fixed and calibration.type != 2):
@@ -259,8 +255,3 @@ def _off_centre(calibration: Calibration) -> Iterator[Finding]:
             f"the image centre ({A.u0:.0f}, {A.v0:.0f}) is far from the middle of the image",
             "a cropped image has such a centre; otherwise check image_size and the order of u and v",
         )
-
-
-def _names(names: tuple[str, ...]) -> str:
-    shown = ", ".join(names[:3])
-    return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")
