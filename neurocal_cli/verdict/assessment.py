@@ -29,10 +29,12 @@ from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.given_parameters import asked_for
+from neurocal_cli.verdict.noise_shape import noise_shape
 from neurocal_cli.verdict.projection_uncertainty import (
     ProjectionUncertainty,
     image_grid,
@@ -40,7 +42,8 @@ from neurocal_cli.verdict.projection_uncertainty import (
 )
 from neurocal_cli.verdict.repeated_views import repeated_views
 from neurocal_cli.verdict.rules import Verdict, reach_verdict
-from neurocal_cli.verdict.view_groups import view_groups
+from neurocal_cli.verdict.stated_noise import stated_noise
+from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
 __all__ = ["assess", "gather_evidence"]
 
@@ -94,14 +97,15 @@ class _AtMinimum:
     def _arranged(self) -> Views:
         if self.points.covariance is None:
             return arrange(self.points)
-        predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
-        return weighed(self.points, self.points.pixels - predicted)
+        return weighed(self.points, -self._residuals())
 
     def evidence(self) -> Evidence:
         views, free, poses = self.views, self.free, self.free_poses
         errors = point_residuals(views, self.state)
         cov = covariance(self.normal, free, poses, views.n_equations)
         precision, contradiction = self._precision()
+        residuals = self._residuals()
+        stated = tuple(stated_noise(self.points, residuals))
         return Evidence(
             rmse_px=self.calibration.rmse_px,
             held_out_px=self._held_out(),
@@ -115,8 +119,19 @@ class _AtMinimum:
             repeated=repeated_views(self.points),
             mirrored=tuple(seen_from_behind(views, self.state)),
             asked_for=asked_for(views, self.state, self.calibration.fixed, poses),
-            groups=view_groups(views, self.state, self.normal, free) if poses and free[:5].any() else None,
+            noise=(*stated, *noise_shape(self.points, residuals)),
+            groups=None if stated else self._groups(),
         )
+
+    def _residuals(self) -> Array:
+        """(N, 2) predicted minus observed [px], in the order of the points."""
+        predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
+        return predicted - self.points.pixels
+
+    def _groups(self) -> ViewGroups | None:
+        if not (self.free_poses and self.free[:5].any()):
+            return None
+        return view_groups(self.views, self.state, self.normal, self.free)
 
     def _held_out(self) -> float:
         lost = held_out(self.views, self.state, self.normal, self.free, self.free_poses)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from neurocal_cli.verdict.coverage import Coverage
+from neurocal_cli.verdict.findings import Finding
 from neurocal_cli.verdict.given_parameters import AskedFor
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.verdict.view_groups import ViewGroups
@@ -42,6 +43,8 @@ class Evidence:
         Views that are copies of others; that show the target from its other side.
     asked_for : tuple of AskedFor
         Given parameters as the points would have them.
+    noise : tuple of Finding
+        Residuals that are not those of measuring, or not as the points state.
     groups : ViewGroups or None
         Two cameras among the views, or a focal length that changes; None where nothing says so.
     """
@@ -58,4 +61,5 @@ class Evidence:
     repeated: tuple[str, ...]
     mirrored: tuple[str, ...]
     asked_for: tuple[AskedFor, ...]
+    noise: tuple[Finding, ...]
     groups: ViewGroups | None

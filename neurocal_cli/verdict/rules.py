@@ -33,6 +33,7 @@ _CENTRE = Limit(0.01, 0.05)  # std over alpha
 _PROJECTION = Limit(0.0025, 0.02)  # worst std in the image over its diagonal
 _GIVEN = Limit(0.01, 0.05)  # difference over alpha; 100 cameras given truly stay below 5 std
 _TOLD_APART = 5.0  # standard deviations
+_SHALLOW = 0.1  # depth over distance: the focal length of 200 points is known to about 1 %
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
 _TOLD = 3.0  # standard deviations
 
@@ -172,6 +173,7 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     yield from odd_pixels(points)
     yield from points_given_twice(points)
     yield from views_of_another_scale(calibration.points)
+    yield from e.noise
     if e.repeated:
         yield 1, f"{name_some(e.repeated)}: the rows are those of another view", "give each view once"
     if e.mirrored:
@@ -207,6 +209,14 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     if "alpha_u" not in fixed:
         share = max(std["alpha_u"] / A.alpha_u, std["alpha_v"] / A.alpha_v)
         yield _ALPHA.grade(share), f"the std of the focal length is {100 * share:.2g} % of its value", more
+    off_centre = list(_off_centre(calibration))
+    if e.coverage.relief < _SHALLOW and (off_centre or std["alpha_u"] > _ALPHA.good * A.alpha_u):
+        yield (
+            1,
+            f"the target is only {100 * e.coverage.relief:.2g} % as deep as it is far away: too shallow to "
+            "tell the focal length and the centre",
+            "use a deeper target, or several views of it from different angles",
+        )
     if "u0" not in fixed:
         centre = max(std["u0"], std["v0"])
         yield _CENTRE.grade(centre / A.alpha_u), f"the std of the image centre is {centre:.2g} px", more
@@ -233,7 +243,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             f"the image axes are not perpendicular: theta = {np.degrees(A.theta):.1f} degrees",
             "hardly any camera has such axes; check the target, or give --no-skew",
         )
-    yield from _off_centre(calibration)
+    yield from off_centre
 
 
 def _oblong(calibration: Calibration) -> bool:
@@ -249,7 +259,13 @@ def _off_centre(calibration: Calibration) -> Iterator[Finding]:
         return
     off = np.abs(np.array([A.u0, A.v0]) - (np.array(size) - 1) / 2)
     uncertain = _TOLD * np.array([calibration.std["u0"], calibration.std["v0"]])
-    if (off > _OFF_CENTRE * np.array(size) + uncertain).any():
+    if (off > np.array(size) / 2).any():
+        yield (
+            2,
+            f"the image centre ({A.u0:.0f}, {A.v0:.0f}) lies outside the image",
+            "add views from other angles, or give the centre with --type 2; check image_size",
+        )
+    elif (off > _OFF_CENTRE * np.array(size) + uncertain).any():
         yield (
             1,
             f"the image centre ({A.u0:.0f}, {A.v0:.0f}) is far from the middle of the image",
