@@ -31,8 +31,8 @@ def main() -> None:
     text = PAGE.read_text(encoding="utf-8")
     made = []
     for name in [*FLAT, *FOLDED]:
-        word, reason = outcome(name)
-        made.append(f"| {name} | {word} | {_reason(reason)} |\n")
+        found = outcome(name)
+        made.append(f"| {name} | {found.word} | {_reason(found.named or found.reasons[0])} |\n")
     head = "| wrong input | ends | because |\n| --- | --- | --- |\n"
     PAGE.write_text(text[: text.index(head)] + head + "".join(made), encoding="utf-8")
 

@@ -104,7 +104,7 @@ class _AtMinimum:
         errors = point_residuals(views, self.state)
         cov = covariance(self.normal, free, poses, views.n_equations)
         precision, contradiction = self._precision()
-        residuals = self._residuals()
+        alike, residuals = correlation(views, errors), self._residuals()
         stated = tuple(stated_noise(self.points, residuals))
         return Evidence(
             rmse_px=self.calibration.rmse_px,
@@ -112,14 +112,14 @@ class _AtMinimum:
             precision_px=precision,
             contradiction=contradiction,
             disagreement=self._disagreement(),
-            correlation=correlation(views, errors),
+            correlation=alike,
             condition=1.0 / cov.smallest if cov.smallest > 0 else np.inf,
             coverage=cover(self.points, views, self.state),
             projection=self._projection(),
             repeated=repeated_views(self.points),
             mirrored=tuple(seen_from_behind(views, self.state)),
             asked_for=asked_for(views, self.state, self.calibration.fixed, poses),
-            noise=(*stated, *noise_shape(self.points, residuals)),
+            noise=(*stated, *noise_shape(self.points, residuals, alike)),
             groups=None if stated else self._groups(),
         )
 

@@ -15,19 +15,22 @@ __all__ = ["noise_shape"]
 # Real sets stay below 1.3 and 3: opencv_stereo, sony_chess, fisheye_stereo, Zhang's.
 _ONE_WAY = 2.5  # rms along u over that along v
 _VIEW = 4.0  # rms of a view over that of the lower quartile of views
+_SYSTEMATIC = 0.5  # correlation of neighbours, from where the target or the lens is at fault
 _FEWEST = 12  # points
 _ROUNDING = 1e-4  # of the pixels' spread
 
 
-def noise_shape(points: Correspondences, residuals: Array) -> Iterator[Finding]:
+def noise_shape(points: Correspondences, residuals: Array, correlation: float) -> Iterator[Finding]:
     """Name a direction, and views, in which the residuals are far larger than otherwise.
 
     Parameters
     ----------
     points : Correspondences
     residuals : (N, 2) array [px]
+    correlation : float
+        Of neighbours' residuals: what is correlated is no error of measuring.
     """
-    if points.covariance is not None or len(points) < _FEWEST:
+    if points.covariance is not None or len(points) < _FEWEST or correlation > _SYSTEMATIC:
         return
     u, v = np.sqrt((residuals**2).mean(axis=0))
     least = _ROUNDING * pixel_spread(points)

@@ -35,6 +35,7 @@ _GIVEN = Limit(0.01, 0.05)  # difference over alpha; 100 cameras given truly sta
 _TOLD_APART = 5.0  # standard deviations
 _SHALLOW = 0.1  # depth over distance: the focal length of 200 points is known to about 1 %
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
+_NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
 _TOLD = 3.0  # standard deviations
 
 
@@ -106,7 +107,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         yield (
             _DISAGREEMENT.grade(e.disagreement),
             f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} standard "
-            "deviations",
+            f"deviations{'' if e.groups is not None else _NO_SINGLE_CAMERA}",
             "expect errors larger than the standard deviations; look for a wrong view or a board that is not "
             "flat",
         )
