@@ -21,7 +21,7 @@ from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, wh
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["Candidate", "falls_short", "fit_candidates", "supported", "worth"]
+__all__ = ["Candidate", "falls_short", "fit_candidates", "is_weak", "supported", "worth"]
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
 # tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
@@ -41,6 +41,7 @@ _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but c
 _SPARE = 1.3  # equations for each unknown
 _WIDE = 0.5  # radius from which on a model can be a fisheye's: 27 degrees off the axis
 _TOLD_APART = 4.0  # squared standard deviations, for each coefficient
+_WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (slow) repeats it
 _LARGEST_TERM = 3.0  # of one coefficient at the farthest point; all terms together are about 1
 
 
@@ -61,6 +62,8 @@ class Candidate:
         Where it is not monotonic: within the "points" or within the "image".
     determined : bool
         Whether the points leave no parameter open.
+    weak : bool
+        Whether they tell a focal length so badly that other minima may be lower.
     """
 
     problem: Problem
@@ -69,6 +72,7 @@ class Candidate:
     noise: bool
     not_monotonic: str | None
     determined: bool
+    weak: bool
 
     @property
     def sound(self) -> bool:
@@ -131,14 +135,15 @@ class _Chain:
 
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
         fitted: dict[str, Candidate] = {}
+        least = self._cost(state)
         for model in ("none", *_CHAIN):
             problem = supported(self.problem, model)
             candidate = None if problem is None else self._fit(problem, state)
             if candidate is None:
                 continue
             fitted[model] = candidate
-            if model != "none" and candidate.not_monotonic is None:
-                state = candidate.adjusted.state
+            if model != "none" and candidate.not_monotonic is None and candidate.cost <= least:
+                state, least = candidate.adjusted.state, candidate.cost
         for simple, more in zip(_CHAIN[-2::-1], _CHAIN[:0:-1], strict=True):
             self._fit_again(simple, more, fitted)
         fisheyes = self._fisheyes(state)
@@ -146,6 +151,12 @@ class _Chain:
         fitted = dict(zip(fitted, found, strict=False))
         best = _fewest_coefficients(found[len(fitted) :], self.problem.views)
         return fitted if best is None else fitted | {"fisheye": best}
+
+    def _cost(self, state: CameraState) -> float:
+        """Of a state that has a distortion; a pinhole is no start to go back to."""
+        if state.model == "none":
+            return np.inf
+        return float((point_residuals(self.problem.views, state) ** 2).sum())
 
     def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
         """A model that is missing, or far behind one with more coefficients, lost its way: begin there."""
@@ -209,13 +220,22 @@ class _Chain:
         noise = _noise(problem.distortion.model, state, self.reach, cov.entries)
         A = problem.matrix(state.entries[0])
         bad = where_not_monotonic(state.distortion, A, problem.points)
-        return Candidate(problem, adjusted, lost, noise, bad, _determined(problem, state, cov))
+        determined = _determined(problem, state, cov)
+        return Candidate(problem, adjusted, lost, noise, bad, determined, is_weak(problem, state, cov))
 
 
 def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
     """Whether every view by itself fits far better than the best of the common cameras."""
     best = min(fitted, key=lambda c: c.cost)
     return best.cost > _SHORT**2 * float(free_networks(views, best.adjusted.state, _STEPS).sum()) + 1e-20
+
+
+def is_weak(problem: Problem, state: CameraState, cov: Covariance) -> bool:
+    """Whether the points tell a focal length so badly that other minima may be lower."""
+    free = np.flatnonzero(problem.free)
+    variance = np.diagonal(cov.entries)[: len(free)]
+    alphas = [(place, entry) for place, entry in enumerate(free) if entry in (0, 2)]
+    return any(not variance[place] < (_WEAK * state.entries[0, entry]) ** 2 for place, entry in alphas)
 
 
 def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate | None:
@@ -280,20 +300,23 @@ def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -
     """Those of another model that distort nearly as this state does, of a fisheye the first `most`."""
     names = coefficient_names(model)
     old = dict(zip(coefficient_names(state.model), state.k.tolist(), strict=True))
-    fisheye, rational = model == "fisheye", state.model == "rational" and model != "rational"
-    if not fisheye and not rational:
-        # Those of a fisheye mean something else.
-        return np.array([old.get(name, 0.0) if state.model != "fisheye" else 0.0 for name in names])
+    fisheye = model == "fisheye"
+    estimated = set(names[:most] if fisheye else names)
+    if fisheye == (state.model == "fisheye") and {name for name, k in old.items() if k} <= estimated:
+        return np.array([old.get(name, 0.0) for name in names])
     # As far out as the points reach, by least squares: q (1 + k1 q^2 + k2 q^4 + ...) is the distorted
     # radius of the undistorted one r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
-    radial = [0.0 if name in ("p1", "p2") else k for name, k in old.items()]
+    tangential = ("p1", "p2")
+    radial = [0.0 if name in tangential else k for name, k in old.items()]
     distorted = distort(state.model, radial, r, np.zeros_like(r))[0]
     q = np.arctan(r) if fisheye else r
-    of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][:most]
+    of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][: most if fisheye else 3]
     powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)
     if not np.isfinite(distorted).all():  # beyond a pole
         return pinhole_coefficients(model)
     found = np.linalg.lstsq(powers, distorted - q, rcond=1e-6)[0]
-    new = {name: old[name] for name in ("p1", "p2") if rational} | dict(zip(of_radius, found, strict=True))
+    new = {name: k for name, k in old.items() if name in tangential} | dict(
+        zip(of_radius, found, strict=True)
+    )
     return np.array([new.get(name, 0.0) for name in names])

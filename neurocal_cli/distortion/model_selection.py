@@ -39,8 +39,7 @@ _CHANCE = 4.6  # standard errors, of five folds, that chance exceeds in one case
 _MORE = 2  # coefficients
 _DECISIVE = 10.0  # of the criterion: odds of 150
 _CORRELATED = 0.3  # correlation of neighbours' residuals
-_MUCH_BETTER = 0.8  # times the squared error
-_FAR_BELOW = 2.0  # times the squared error of the pinhole
+_BETTER, _MUCH_BETTER = 0.999, 0.8  # times the squared error
 
 
 def select_model(solution: Solution, more_starts: Callable[[], Iterable[CameraState]] = tuple) -> Solution:
@@ -68,7 +67,7 @@ def select_model(solution: Solution, more_starts: Callable[[], Iterable[CameraSt
     if not fitted:  # not even the pinhole settled: as it is
         return replace(solution, model_errors={})
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
-    if "none" in fitted and not fitted["none"].determined and _is_enough(fitted["none"], views, fitted):
+    if "none" in fitted and not fitted["none"].determined and _is_enough(views, fitted):
         fitted = {"none": fitted["none"]}  # a distortion would only hide that the camera is undetermined
     chosen = fitted[_best(fitted, views)]
     n, px = len(views.index), views.pixel_scale
@@ -85,12 +84,15 @@ def select_model(solution: Solution, more_starts: Callable[[], Iterable[CameraSt
 def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
     """Squared error below which what another start leads to is of interest; 0: no start is.
 
-    Where every view by itself fits far better, any is; where neighbours err alike, as they do on a board that
-    is not flat too, one that explains much more.
+    Where every view by itself fits far better, or where no model is sound, any is; where the points tell a
+    focal length badly, one that explains more; where neighbours err alike, as they do on a board that is not
+    flat too, one that explains much more.
     """
-    if not fitted or falls_short(views, fitted.values()):
+    if not any(c.sound for c in fitted.values()) or falls_short(views, fitted.values()):
         return np.inf
     closest = min(fitted.values(), key=lambda c: c.cost)
+    if closest.weak:
+        return _BETTER * closest.cost
     alike = correlation(views, point_residuals(views, closest.adjusted.state)) > _CORRELATED
     return _MUCH_BETTER * closest.cost if alike else 0.0
 
@@ -112,10 +114,11 @@ def _views_can_spare_any(solution: Solution) -> bool:
     return bool(np.isfinite(held_out_views(adjusted.normal, free, problem.free_poses)).all())
 
 
-def _is_enough(pinhole: Candidate, views: Views, fitted: dict[str, Candidate]) -> bool:
-    """Whether neither a distortion nor a camera for each view explains far more."""
-    lowest = min(candidate.cost for candidate in fitted.values())
-    return pinhole.cost <= _FAR_BELOW * lowest + 1e-20 and not falls_short(views, [pinhole])
+def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
+    """Whether neither a sound distortion model nor a camera for each view explains decidedly more."""
+    n, pinhole = worth(views, fitted.values()), fitted["none"]
+    lowest = min((c.criterion(n) for c in fitted.values() if c.sound), default=np.inf)
+    return pinhole.criterion(n) < lowest + _DECISIVE and not falls_short(views, [pinhole])
 
 
 def _best(fitted: dict[str, Candidate], views: Views) -> str:

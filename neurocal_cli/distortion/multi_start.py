@@ -1,9 +1,9 @@
 """A given choice of distortion model, fitted from other starts where the first ends in a local minimum.
 
 The minimum of a strong distortion is found only from a start that is near it. Where the residuals of
-neighbours are correlated, as a wrong distortion leaves them (and a board that is not flat), every model is
-fitted, each from the one before it, from this start and from others; the best fit of the wanted model is
-the result.
+neighbours are correlated, as a wrong distortion leaves them (and a board that is not flat), or where the
+points tell a focal length badly, every model is fitted, each from the one before it, from this start and
+from others; the best fit of the wanted model is the result.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
+from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.distortion.candidate_models import fit_candidates
+from neurocal_cli.distortion.candidate_models import fit_candidates, is_weak
 
 __all__ = ["with_more_starts"]
 
@@ -37,7 +38,9 @@ def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[Came
     if not problem.free_distortion:
         return solution
     views = problem.views
-    if best.converged and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
+    cov = covariance(best.normal, problem.free_camera, problem.free_poses, views.n_equations)
+    weak = is_weak(problem, best.state, cov)
+    if best.converged and not weak and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
         return solution
     for start in (best.state, *more_starts()):
         found = fit_candidates(problem, start, by_views=False).get(problem.distortion.model)

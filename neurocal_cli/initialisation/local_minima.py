@@ -9,18 +9,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
+from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.view_networks import Group
+from neurocal_cli.least_squares.leave_out import solve_or_nan
 
 __all__ = [
+    "OnlyMirroredError",
     "better_by_view",
     "reaches_bound",
     "refuse_mirrored",
@@ -36,10 +40,15 @@ _TRIAL_STEPS = 15  # another start must be ahead after so many
 # A mirrored pose is a candidate while its rms error is below so many times the other's: at first, and
 # after a few steps.
 _FLIP_RANGE, _FLIP_STEPS, _FLIP_CLOSE = 10.0, 3, 2.0
+_FLIPS, _FLIPS_TOGETHER = 12, 3  # rounds of turning, and views tried in one
 # Data are taken for mirrored when a mirrored camera's rms error is so many times lower, and there
 # are enough points that chance does not do that.
 _MIRRORED_BETTER, _MIRRORED_POINTS = 3.0, 12
 _FREEDOM = {True: 8, False: 11}  # of a flat and of a solid view's product, up to scale
+
+
+class OnlyMirroredError(DegenerateGeometryError):
+    """Points that a free network fits well, but only as a mirrored camera; or a strong distortion."""
 
 
 def reaches_bound(problem: Problem, adjusted: Adjusted, groups: Sequence[Group]) -> bool:
@@ -76,7 +85,7 @@ def refuse_mirrored(problem: Problem, adjusted: Adjusted, groups: Sequence[Group
 
     Raises
     ------
-    DegenerateGeometryError
+    OnlyMirroredError
         X,Y,Z left-handed, two columns swapped, v upwards.
     """
     for group in groups:
@@ -88,7 +97,7 @@ def refuse_mirrored(problem: Problem, adjusted: Adjusted, groups: Sequence[Group
         mirrored &= problem.views.distinct[group.views] >= _MIRRORED_POINTS
         if mirrored.any():
             name = problem.views.names[group.views[int(np.argmax(mirrored))]]
-            raise DegenerateGeometryError(
+            raise OnlyMirroredError(
                 f"view {name!r}: only a mirrored camera "
                 "could see these points; check the axes of X,Y,Z (right-handed?) and of u,v (v downwards?)"
             )
@@ -111,11 +120,36 @@ def better_by_view(problem: Problem, one: Adjusted, two: Adjusted) -> Adjusted:
 
 
 def try_mirrored(problem: Problem, adjusted: Adjusted) -> Adjusted:
-    """Far flat boards have a second pose, tilted the other way, that fits nearly as well."""
+    """Far flat boards have a second pose, tilted the other way, that fits nearly as well.
+
+    All views whose second pose fits better as the camera is are turned at once. Others are turned one by one,
+    where the camera that goes with the second pose fits all views better: a camera that was found with the
+    wrong pose is drawn towards it.
+    """
+    for _ in range(_FLIPS):
+        found = _turned_alone(problem, adjusted)
+        if found is None:
+            return adjusted
+        turned, others = found
+        if turned is not None:
+            adjusted = turned
+            continue
+        turned = _turned_together(problem, adjusted, others)
+        if turned is None:
+            return adjusted
+        adjusted = turned
+    return adjusted
+
+
+_Second = tuple[NDArray[np.intp], Adjusted]  # views, and their second poses with the camera as it is
+
+
+def _turned_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, _Second] | None:
+    """With every view turned whose second pose is better as the camera is; and all second poses near."""
     views, state = problem.views, adjusted.state
     flat = np.flatnonzero(views.nearly_flat)
     if not flat.size:
-        return adjusted
+        return None
     R, t = state.R.copy(), state.t.copy()
     R[flat] = _mirrored(R[flat], t[flat], views.basis[flat])
     normal, in_front = normal_blocks(views.batches, replace(state, R=R, t=t))
@@ -123,19 +157,46 @@ def try_mirrored(problem: Problem, adjusted: Adjusted) -> Adjusted:
     candidates = np.flatnonzero(near & views.nearly_flat)
     for steps in (_FLIP_STEPS, 200):
         if not candidates.size:
-            return adjusted
+            return None
         posed = _pose_alone(problem, replace(state, R=R[candidates], t=t[candidates]), candidates, steps)
         R[candidates], t[candidates] = posed.state.R, posed.state.t
         close = posed.cost < _FLIP_CLOSE**2 * adjusted.cost[candidates] + 1e-20
         if steps == _FLIP_STEPS:
             candidates = candidates[close]
     better = posed.cost < adjusted.cost[candidates] * (1 - 1e-9)
-    if not better.any():
-        return adjusted
-    moved_R, moved_t = state.R.copy(), state.t.copy()
-    moved_R[candidates[better]], moved_t[candidates[better]] = R[candidates[better]], t[candidates[better]]
-    again = problem.adjust(replace(adjusted, state=replace(state, R=moved_R, t=moved_t)))
-    return again if again.cost.sum() < adjusted.cost.sum() else adjusted
+    again = _with_poses(problem, adjusted, candidates[better], posed, better) if better.any() else None
+    return again, (candidates, posed)
+
+
+def _turned_together(problem: Problem, adjusted: Adjusted, second: _Second) -> Adjusted | None:
+    """With the view turned that promises most when the camera goes along; None when none keeps it."""
+    views, posed = second
+    if not problem.free_camera.any() or not problem.free_poses or problem.restraint is not None:
+        return None
+    free = problem.free if adjusted.state.model == "none" else problem.free_camera
+    one, two = (reduced(normal, free, True) for normal in (adjusted.normal, posed.normal))
+    S, g = one.S.sum(axis=0) - one.S[views] + two.S, one.g.sum(axis=0) - one.g[views] + two.g
+    gain = (g * solve_or_nan(S, g)).sum(axis=1)
+    promised = adjusted.cost.sum() - adjusted.cost[views] + posed.cost - gain
+    order = np.argsort(promised)
+    for place in order[:_FLIPS_TOGETHER]:
+        if not promised[place] < adjusted.cost.sum() * (1 - 1e-9):
+            return None
+        again = _with_poses(problem, adjusted, views[[place]], posed, np.array([place]))
+        if again is not None:
+            return again
+    return None
+
+
+def _with_poses(
+    problem: Problem, adjusted: Adjusted, views: NDArray[np.intp], posed: Adjusted, rows: NDArray[Any]
+) -> Adjusted | None:
+    """Adjusted again with other poses of some views; None where that is no better."""
+    state = adjusted.state
+    R, t = state.R.copy(), state.t.copy()
+    R[views], t[views] = posed.state.R[rows], posed.state.t[rows]
+    again = try_start(problem, adjusted, replace(state, R=R, t=t))
+    return again if again.cost.sum() < adjusted.cost.sum() * (1 - 1e-9) else None
 
 
 def _pose_alone(problem: Problem, state: CameraState, views: NDArray[np.intp], steps: int) -> Adjusted:

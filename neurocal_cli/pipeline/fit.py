@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
-
-import numpy as np
 
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
@@ -14,22 +11,17 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.distortion.candidate_models import supported
+from neurocal_cli.distortion.candidate_models import fit_candidates
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
-from neurocal_cli.errors import DegenerateGeometryError
-from neurocal_cli.initialisation.local_minima import try_mirrored
+from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
 from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.initialisation.options import Options
-from neurocal_cli.median import median
+from neurocal_cli.initialisation.radial_networks import radial_start
 from neurocal_cli.points import Correspondences
 
 __all__ = ["fit", "fit_again"]
-
-# Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
-_FIRST_MODEL = "k1k2"  # where no pinhole can be found, the distortion must be strong
-_FAR_WORSE = 4.0  # times the mean squared error of most views
 
 
 def fit(problem: Problem, options: Options) -> Solution:
@@ -43,16 +35,10 @@ def fit(problem: Problem, options: Options) -> Solution:
     if options.distortion == "plumb-line":
         return _plumb_line_first(problem, options)
     check_points(problem)
+    solution = _first_solution(problem, options)
     if options.distortion != "auto":
-        found = with_more_starts(solve(problem, options), lambda: _distorted_starts(problem, options))
-        return _finished(_turned(found), options)
-    try:
-        return _finished(solve(problem, options), options)
-    except DegenerateGeometryError:
-        first = _with_first_model(problem)
-        if first is None:
-            raise
-        return _finished(solve(first, options), options)
+        solution = _turned(with_more_starts(solution, lambda: _distorted_starts(problem, options)))
+    return _finished(solution, options)
 
 
 def fit_again(solution: Solution, points: Correspondences, options: Options) -> Solution:
@@ -93,29 +79,37 @@ def _with_selected_model(solution: Solution, options: Options) -> Solution:
     )
 
 
-def _with_first_model(problem: Problem) -> Problem | None:
-    first = supported(problem, _FIRST_MODEL)
-    if first is not None:
-        check_points(first)
-    return first
+def _first_solution(problem: Problem, options: Options) -> Solution:
+    """A pinhole, or where points seem mirrored to it, as through a strong distortion, a camera with one.
+
+    Where a distortion is no remedy, the pinhole's reason stands.
+    """
+    try:
+        return solve(problem, options)
+    except OnlyMirroredError:
+        found = _through_distortion(problem, options)
+        if found is None:
+            raise
+        return found
 
 
 def _distorted_starts(problem: Problem, options: Options) -> Iterator[CameraState]:
-    """Other cameras to begin with, that have a distortion from early on; the last with the image's middle."""
-    first = _with_first_model(problem)
-    if first is None:
-        return
-    with suppress(DegenerateGeometryError):
-        yield _turned(solve(first, options)).state
-    size = problem.points.image_size
-    if size is None or not first.free[3:].all():
-        return
-    entries, free = first.entries.copy(), first.free.copy()
-    entries[3:], free[3:] = (np.array(size) - 1) / 2, False
-    centred = replace(first, entries=entries, free=free, fixed=first.fixed | {"u0", "v0"})
-    with suppress(DegenerateGeometryError):
-        found = solve(centred, options)
-        yield _turned(replace(found, problem=first, adjusted=first.adjust(found.adjusted))).state
+    """Other cameras to begin with, that have a distortion from the beginning."""
+    found = radial_start(problem, options)
+    if found is not None:
+        yield found.state
+
+
+def _through_distortion(problem: Problem, options: Options) -> Solution | None:
+    """With the distortion from the beginning; None where none is to be estimated, or that fails too."""
+    wanted = problem.distortion.model
+    if problem.type == 3 or (options.distortion != "auto" and not problem.free_distortion):
+        return None
+    found = radial_start(problem, options)
+    if found is None or options.distortion == "auto":
+        return found
+    fitted = fit_candidates(problem, found.state, by_views=False).get(wanted)
+    return None if fitted is None else replace(found, problem=problem, adjusted=fitted.adjusted)
 
 
 def _plumb_line_first(problem: Problem, options: Options) -> Solution:
@@ -134,13 +128,8 @@ def _plumb_line_first(problem: Problem, options: Options) -> Solution:
 
 
 def _turned(solution: Solution) -> Solution:
-    """With views far worse than the others in the other one of a flat board's two poses, if that is better.
-
-    Before the distortion was known, the wrong one may have looked better.
-    """
-    adjusted, problem = solution.adjusted, solution.problem
-    error = adjusted.cost / problem.views.counts
-    if adjusted.state.model == "none" or error.max() <= _FAR_WORSE * median(error):
+    """With the other one of a flat board's two poses wherever that is better with the distortion."""
+    if solution.state.model == "none":
         return solution
-    turned = try_mirrored(problem, adjusted)
-    return solution if turned is adjusted else replace(solution, adjusted=turned)
+    turned = try_mirrored(solution.problem, solution.adjusted)
+    return solution if turned is solution.adjusted else replace(solution, adjusted=turned)

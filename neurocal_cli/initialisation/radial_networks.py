@@ -1,0 +1,173 @@
+"""A start for strong distortion: free networks that see the pixels through a radial model.
+
+The networks learn a pinhole, and where a lens bends its images much, what they learn is no product of a
+camera and a pose. The division model (Fitzgibbon 2001), with a second term, takes off a radial distortion:
+
+    m_u = c + (m - c) / (1 + lambda_1 (|m - c| / r)^2 + lambda_2 (|m - c| / r)^4),
+
+c being the middle of the image and r the distance of the farthest point. Of many values of the two numbers
+those are taken whose pixels the free networks of all views fit best, in units of the spread of these
+pixels: nothing about the camera need be known for that. The camera that follows from these networks, with
+the distortion expressed by a model's coefficients, is a start for bundle adjustment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.local_minima import try_mirrored
+from neurocal_cli.initialisation.neuro import solve
+from neurocal_cli.initialisation.options import Options, options_for
+from neurocal_cli.initialisation.view_networks import train_networks
+from neurocal_cli.points import Correspondences
+
+__all__ = ["radial_start"]
+
+# lambda_1 = -0.8 is a barrel that shows 5 times the radius of a pinhole at the farthest point, 0.3 a
+# pincushion. Repeated by tests/test_radial_networks.py and the campaign of tests/test_campaign.py (slow).
+_STRENGTHS = (-0.8, -0.65, -0.5, -0.38, -0.27, -0.17, -0.08, 0.08, 0.17, 0.3)
+# The search around the best of them: from one place to the best of six, in steps that become smaller.
+_STEP, _ROUNDS = 0.05, 5
+_WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, -1.0), (-1.0, 1.0)])
+_SCAN_STARTS = 4  # random starts of each network, while the distortion is sought
+
+
+def radial_start(problem: Problem, options: Options) -> Solution | None:
+    """A camera with a distortion, from networks that see undistorted pixels.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of a camera that is to be estimated.
+    options : Options
+
+    Returns
+    -------
+    Solution or None
+        A minimum of the reprojection error, with the distortion model that was nearest to the division
+        model; None where it leads to no camera.
+    """
+    search = _Search(problem, _middle(problem), options)
+    strength = search.best_strength()
+    corrected = search.corrected(strength)
+    best = None
+    for pinhole in _pinholes(corrected, search.middle):
+        with suppress(DegenerateGeometryError):
+            found = solve(pinhole, options)
+            state = _distorted(found.in_pixels, strength, search.reach)
+            distorted = problem.with_model(state.model)
+            adjusted = try_mirrored(distorted, distorted.adjust(normalised(state, problem.views)))
+            if best is None or adjusted.cost.sum() < best.adjusted.cost.sum():
+                best = replace(found, problem=distorted, adjusted=adjusted)
+    return best
+
+
+def _pinholes(problem: Problem, middle: Array) -> Iterator[Problem]:
+    """The problem with the centre in the middle and no skew, which a long lens hardly tells; and as it is."""
+    if problem.free[3:].all():
+        entries, free = problem.entries.copy(), problem.free.copy()
+        entries[3:], free[[1, 3, 4]] = middle, False
+        yield replace(problem, entries=entries, free=free, fixed=problem.fixed | {"theta", "u0", "v0"})
+    yield problem
+
+
+def _middle(problem: Problem) -> Array:
+    """(2,) what the distortion is taken to be radial about [px]."""
+    points = problem.points
+    if problem.given_centre is not None:
+        return problem.given_centre
+    if points.image_size is not None:
+        return (np.array(points.image_size) - 1) / 2
+    return np.asarray(0.5 * (points.pixels.min(axis=0) + points.pixels.max(axis=0)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """For the distortion with which the free networks fit best."""
+
+    problem: Problem
+    middle: Array
+    options: Options
+
+    @property
+    def reach(self) -> float:
+        """Distance of the farthest point [px]."""
+        return float(np.hypot(*(self.problem.points.pixels - self.middle).T).max())
+
+    def best_strength(self) -> Array:
+        """lambda_1 and lambda_2: the best of a row, and from there in steps that become smaller."""
+        best, error = min(
+            ((one, self.error(one)) for one in (np.array([value, 0.0]) for value in _STRENGTHS)),
+            key=lambda tried: tried[1],
+        )
+        step = _STEP
+        for _ in range(_ROUNDS):
+            around = [best + step * way for way in _WAYS]
+            tried = [(self.error(one), one) for one in around if _one_to_one(one)]
+            lowest = min(tried, key=lambda one: one[0], default=(np.inf, best))
+            if lowest[0] < error:
+                error, best = lowest
+            else:
+                step = step / 2
+        return best
+
+    def corrected(self, strength: Array) -> Problem:
+        """The problem of a pinhole that sees the pixels without this distortion."""
+        points = self.problem.points
+        away = points.pixels - self.middle
+        share = (away**2).sum(axis=1, keepdims=True) / self.reach**2
+        pixels = self.middle + away / _divisor(strength, share)
+        seen = Correspondences(points.world, pixels, points.view)
+        return self.problem.with_model("none").with_points(seen)
+
+    def error(self, strength: Array) -> float:
+        """Squared error of all free networks, in units of the spread of the pixels."""
+        problem, scan = self.corrected(strength), options_for("lm", _SCAN_STARTS, self.options.seed)
+        able = np.ones(problem.views.n_views, dtype=bool)
+        groups, _ = train_networks(problem, scan, np.random.default_rng(scan.seed), able)
+        error = sum(float(group.bound.sum()) for group in groups)
+        return error if np.isfinite(error) else np.inf
+
+
+def _divisor(strength: Array, share: Array) -> Array:
+    """Of the division model, at a share of the farthest point's squared distance."""
+    return np.asarray(1 + share * (strength[0] + strength[1] * share))
+
+
+def _one_to_one(strength: Array) -> bool:
+    """Whether the undistorted radius grows with the distorted one, as far as the farthest point."""
+    share = np.linspace(0.0, 1.0, 20)
+    D, slope = _divisor(strength, share), strength[0] + 2 * strength[1] * share
+    return bool((D > 0).all() and (2 * share * slope < D).all())
+
+
+def _distorted(state: CameraState, strength: Array, reach: float) -> CameraState:
+    """The camera [px] that found the undistorted pixels, with coefficients that distort as the model does.
+
+    By least squares over the radii of the points, with the coefficients that a fisheye has or with those of
+    plumb_bob, whichever come closer.
+    """
+    distorted = np.linspace(0.02, 1, 60) * reach / float(np.sqrt(state.entries[0, 0] * state.entries[0, 2]))
+    straight = distorted / _divisor(strength, (distorted / distorted[-1]) ** 2)
+    best = (np.inf, state)
+    for model, argument in (("plumb_bob", straight), ("fisheye", np.arctan(straight))):
+        names = coefficient_names(model)
+        radial = [name for name in names if not name.startswith("p")]
+        powers = argument[:, None] ** np.arange(3, 2 * len(radial) + 3, 2)
+        k = np.linalg.lstsq(powers, distorted - argument, rcond=1e-6)[0]
+        error = float(np.abs(powers @ k - (distorted - argument)).max())
+        found = dict(zip(radial, k.tolist(), strict=True))
+        if error < best[0]:
+            best = error, replace(state, model=model, k=np.array([found.get(name, 0.0) for name in names]))
+    return best[1]

@@ -1,0 +1,46 @@
+"""A thousand scenes of a generator of their own: what can be resolved is, and nothing wrong is good."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+from support.campaign import CONDITIONS, scene
+from support.campaign_reference import reference
+
+from neurocal_cli import calibrate
+from neurocal_cli.errors import DegenerateGeometryError
+
+RESOLVED = 0.02  # std of alpha_u over its value, of a fit that begins at the truth
+WRONG_MINIMUM = 1.005  # times the squared error of a fit of the same model that begins at the truth
+
+
+def judge(seed: int) -> tuple[str, str]:
+    """The scene's condition, and what went wrong with its calibration, if anything did."""
+    points, truth = scene(seed)
+    known = reference(points, truth)
+    try:
+        found = calibrate(points)
+    except DegenerateGeometryError:
+        return truth.condition, "refused" if known.share < RESOLVED else ""
+    if known.excess(found) > WRONG_MINIMUM:
+        return truth.condition, "wrong minimum"
+    assert found.verdict is not None
+    off = abs(found.K[0, 0] - truth.A[0, 0]) / found.std["alpha_u"]
+    return truth.condition, "good" if found.verdict.word == "good" and off > 5 else ""
+
+
+@pytest.mark.parametrize("seed", range(5000, 5014))
+def test_every_condition_is_met(seed: int) -> None:
+    assert judge(seed)[1] == ""
+
+
+@pytest.mark.slow
+def test_a_thousand_scenes() -> None:
+    seeds = range(7000, 8000)
+    wrong = Counter(judge(seed) for seed in seeds)
+    assert not sum(n for (_, what), n in wrong.items() if what == "refused"), wrong
+    assert sum(n for (_, what), n in wrong.items() if what == "wrong minimum") <= 1, wrong
+    for condition in set(CONDITIONS):
+        many = sum(CONDITIONS[seed % len(CONDITIONS)] == condition for seed in seeds)
+        assert wrong[condition, "good"] <= max(many / 200, 1), wrong
