@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 
 from neurocal_cli.points import Correspondences
 
-__all__ = ["WORDS", "Finding", "Limit", "image_diagonal", "name_some", "pixel_spread"]
+__all__ = ["WORDS", "Finding", "image_diagonal", "name_some", "pixel_spread"]
 
 WORDS = ("good", "usable", "poor")
 """By grade."""
@@ -18,18 +17,6 @@ Finding = tuple[int, str, str]
 """Grade (0 good, 1 usable, 2 poor), reason, advice."""
 
 _SHOWN = 3
-
-
-@dataclass(frozen=True)
-class Limit:
-    """From where on a quantity is no longer good, and from where on it is poor."""
-
-    good: float
-    poor: float
-
-    def grade(self, value: float) -> int:
-        """0 good, 1 usable, 2 poor; what is unknown is good."""
-        return int(value > self.good) + int(value > self.poor)
 
 
 def name_some(names: Iterable[object]) -> str:

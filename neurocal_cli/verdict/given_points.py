@@ -8,7 +8,8 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.verdict.assessment import gather_evidence
-from neurocal_cli.verdict.findings import WORDS, Finding, Limit, image_diagonal, pixel_spread
+from neurocal_cli.verdict.findings import WORDS, Finding, image_diagonal, pixel_spread
+from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.verdict.rules import ERROR, given_parameters
 
 __all__ = ["GivenPoints", "judged_by_points"]

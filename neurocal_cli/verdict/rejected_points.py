@@ -8,7 +8,8 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.points import Correspondences
-from neurocal_cli.verdict.findings import Finding, Limit, name_some
+from neurocal_cli.verdict.findings import Finding, name_some
+from neurocal_cli.verdict.limits import Limit
 
 __all__ = ["rejected_points", "with_rejected"]
 
