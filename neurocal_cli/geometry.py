@@ -28,6 +28,7 @@ __all__ = [
     "orthonormalised",
     "rotation_step",
     "rotation_to_euler",
+    "rotation_vector",
     "rq",
     "similarity",
 ]
@@ -140,6 +141,17 @@ def rotation_step(w: Array) -> Array:
     K = cross_matrix(half)
     factor = 2.0 / (1.0 + (half * half).sum(-1))
     return np.eye(3) + factor[..., None, None] * (K + K @ K)
+
+
+def rotation_vector(R: Array) -> Array:
+    """Axis times angle [rad] of rotations by less than pi, the logarithm of R; (..., 3, 3) -> (..., 3)."""
+    R = np.asarray(R, dtype=float)
+    sines = 0.5 * np.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1
+    )
+    sine = np.linalg.norm(sines, axis=-1)
+    angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0))
+    return np.asarray(sines * np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 1.0)[..., None])
 
 
 def orthonormalised(R: Array) -> Array:

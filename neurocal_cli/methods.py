@@ -131,7 +131,7 @@ def calibrate(
     except DegenerateGeometryError as error:
         text, copies = str(error), repeated_views(points)
         if copies:
-            text += f"; {len(copies)} of {points.n_views} views repeat the points of others"
+            text += f"; the rows of {len(copies)} of {points.n_views} views are those of another view"
         # Views and normal matrices do not know the file that the user should look at.
         if points.lines is not None and not text.startswith(points.source):
             text = f"{points.source}: {text}"

@@ -59,7 +59,8 @@ def test_the_summary_says_what_was_found(files: tuple[Path, Path]) -> None:
     assert "note: only the left camera saw left02" in text
     for label in ("alpha_u [px]", "X_right = R X_left + t", "t_z [mm]", "baseline [mm]", "left03 / right03"):
         assert any(line.startswith(label) for line in text.splitlines()), label
-    assert "converged" in text.splitlines()[-1]
+    assert "\nconverged: " in text
+    assert "\nverdict: " in text
 
 
 def test_the_output_goes_on_to_evaluate(files: tuple[Path, Path]) -> None:
@@ -222,6 +223,9 @@ def test_thirteen_real_pairs_are_fitted_better_than_opencv_fits_its_corners(
     assert len(rig.pairs) == 13
     assert rig.rmse_px < 0.18  # OpenCV's stereoCalibrate: 0.215 px
     assert rig.baseline == pytest.approx(83.2, abs=0.1)
+    assert rig.verdict is not None
+    assert rig.verdict.word in ("good", "usable")
+    assert all(reason.startswith(("left camera:", "right camera:")) for reason in rig.verdict.reasons)
     values = json.loads(run("evaluate", "stereo", tmp_path / "rig.yaml", "--json").stdout)
     assert values["rmse"] < 0.4
     assert values["nsce"] < 0.45

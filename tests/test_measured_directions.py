@@ -45,7 +45,7 @@ def rms(values: object) -> float:
 
 
 def test_standard_deviations_of_midpoints_hold() -> None:
-    """Taking the places along the edges for measurements of their own makes them too small."""
+    """And they hold, counting views, where places along the edges are taken for measurements of their own."""
     one_way, both_ways, disagreement = [], [], []
     for seed in range(60):
         camera, points = edge_set(seed)
@@ -54,7 +54,7 @@ def test_standard_deviations_of_midpoints_hold() -> None:
         both_ways.append(sigmas(pinhole(replace(points, across=None), skew=False), camera))
         disagreement.append(gather_evidence(found).disagreement)
     assert 0.85 < rms(one_way) < 1.15
-    assert rms(both_ways) > 2.0
+    assert 0.85 < rms(both_ways) < 1.25  # 2.0 and more for those of the normal matrix
     assert np.mean(disagreement) == pytest.approx(1.0, abs=0.25)
 
 

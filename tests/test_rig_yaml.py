@@ -12,6 +12,7 @@ import yaml
 from support.rigs import random_rig
 
 from neurocal_cli import calibrate
+from neurocal_cli.calibration import Verdict
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.rig_yaml import format_rig, read_rig, write_rig
 from neurocal_cli.stereo.fit_rig import fit_rig
@@ -24,7 +25,9 @@ def rig() -> Rig:
     rng = np.random.default_rng(1)
     cameras = [calibrate(scene.points(side, 0.2, rng), skew=False, camera_name="ab"[side]) for side in (0, 1)]
     found = fit_rig(*cameras)
-    return replace(found, left_out={("left09", "right: 09"): "a reason"}, warnings=("a warning: here",))
+    verdict = Verdict("usable", ("a reason: here",), ("some advice",), {"scatter": 1.25})
+    left_out = {("left09", "right: 09"): "a reason"}
+    return replace(found, left_out=left_out, warnings=("a warning: here",), judgement=verdict)
 
 
 def test_a_rig_reads_back_to_the_last_bit(rig: Rig, tmp_path: Path) -> None:

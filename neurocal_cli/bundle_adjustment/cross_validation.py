@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.point_batches import batches_of
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
@@ -63,7 +64,12 @@ def _shared(free: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 @_quietly
 def held_out(
-    views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], free_poses: bool
+    views: Views,
+    state: CameraState,
+    normal: Array,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    repeated: RepeatedPoses | None = None,
 ) -> Array:
     """Squared error of parts of the data when they are left out, of a calibration at its minimum.
 
@@ -79,13 +85,15 @@ def held_out(
     free : (5 + K,) bool array
         Of A's entries and the distortion coefficients.
     free_poses : bool
+    repeated : RepeatedPoses, optional
+        Views of one pose are left out together.
 
     Returns
     -------
     (parts,) array
     """
     if views.n_views > 1 and free.any():
-        lost = held_out_views(normal, free, free_poses)
+        lost = held_out_views(normal, free, free_poses, repeated=repeated)
         if np.isfinite(lost).all():
             return lost
     return held_out_points(views, state, free, free_poses)
@@ -97,6 +105,7 @@ def held_out_views(
     free: NDArray[np.bool_],
     free_poses: bool,
     restraint: _Restraint | None = None,
+    repeated: RepeatedPoses | None = None,
 ) -> Array:
     """Squared error of each view when it is left out; (V,), nan where the others cannot do without it.
 
@@ -106,9 +115,12 @@ def held_out_views(
         As for `reduced`.
     restraint : (f, f) array and (f,) array, optional
         What is added to the normal matrix of the shared parameters and to its right side.
+    repeated : RepeatedPoses, optional
+        Views of one pose are left out together.
     """
     q = reduced(normal, free, free_poses)
-    return q.held_out(folds_of(len(q.cost), FOLDS), restraint)
+    fold = folds_of(len(q.cost), FOLDS) if repeated is None else repeated.folds(FOLDS)
+    return q.held_out(fold, restraint)
 
 
 @_quietly
@@ -181,11 +193,17 @@ def _whole_steps(
 
 @_quietly
 def disagreement(
-    views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], free_poses: bool
+    views: Views,
+    state: CameraState,
+    normal: Array,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    repeated: RepeatedPoses | None = None,
 ) -> tuple[Array, Array]:
     """How far the shared parameters from two halves of the data lie apart.
 
-    The halves are every other view and the rest, or of points where half of the views cannot do.
+    The halves are every other view, or every other pose, and the rest; or of points where half of the views
+    cannot do.
 
     Returns
     -------
@@ -193,12 +211,17 @@ def disagreement(
     covariance : (f, f) array
         Of the difference, for residuals of unit variance; nan where a half cannot do.
     """
-    if views.n_views >= 4:
+    pose = np.arange(views.n_views) if repeated is None else repeated.group
+    if pose.max() >= 3:
         q = reduced(normal, free, free_poses)
-        S, g = q.summed((np.arange(len(q.cost)) % 2 == np.arange(2)[:, None]).astype(float))
+        half = (pose % 2 == np.arange(2)[:, None]).astype(float)
+        S, g = q.summed(half)
         step = solve_or_nan(S, g)
         if np.isfinite(step).all():
-            return step[0] - step[1], inverse_or_nan(S).sum(axis=0)
+            cov = inverse_or_nan(S)
+            if repeated is not None and not repeated.none:
+                cov = cov @ q.summed(half * repeated.variance[pose])[0] @ cov
+            return step[0] - step[1], cov.sum(axis=0)
     by_fold = _by_fold(views, state, _dealt(views))
     two = np.stack([by_fold[:, :2].sum(axis=1), by_fold[:, 2:4].sum(axis=1)], axis=1)
     q = reduced(two, free, free_poses)

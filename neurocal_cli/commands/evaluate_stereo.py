@@ -66,6 +66,8 @@ def stereo(cameras: tuple[str, ...], points: tuple[str, str] | None, method: str
     Without --points the points of the calibrations themselves are used, and the errors are too optimistic.
     With --points the poses of views that are not in the calibrations are fitted.
 
+    The rig also gets a verdict, as by neurocal stereo. It rests on the points of the calibrations.
+
     \b
     Examples:
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
@@ -144,8 +146,10 @@ def _show(evaluation: StereoEvaluation, as_json: bool) -> None:
         stereo_evaluation_report,
         stereo_evaluation_tables,
     )
+    from neurocal_cli.verdict.report import verdict_lines
 
     if as_json:
         click.echo(json.dumps(stereo_evaluation_json(evaluation), indent=2, allow_nan=False))
     else:
-        show(stereo_evaluation_report(evaluation), stereo_evaluation_tables(evaluation))
+        below = [] if evaluation.verdict is None else verdict_lines(evaluation.verdict)
+        show(stereo_evaluation_report(evaluation), stereo_evaluation_tables(evaluation), below)

@@ -95,6 +95,11 @@ def stereo(
     The command writes the rig as a YAML file: both calibrations, R, t, E, F, the baseline, and the
     rectification as OpenCV defines it. It prints a summary with standard deviations on standard error.
 
+    The summary ends with a verdict: good, usable or poor, with the reasons. It rests on the relative pose of
+    the cameras in each pair of views, on both cameras, on the error of pairs left out and on the uncertainty
+    of depth. It says where the rig moved, where a focal length changed, and where the images of a pair were
+    not taken at the same moment. Where the rig moved, the larger part of the pairs determines it.
+
     \b
     Examples:
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\

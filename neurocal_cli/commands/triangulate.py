@@ -89,6 +89,7 @@ def triangulate(
     check_one_stdin(*inputs)
     check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
+    _warn_of_poor(rig)
     from neurocal_cli.io.matches_csv import read_matches
     from neurocal_cli.io.points_in_space_csv import format_space_points
     from neurocal_cli.io.writing import write_chunks
@@ -122,6 +123,12 @@ def _rig(names: tuple[str, ...]) -> Rig:
     note([f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}"])
     warn(rig.warnings)
     return rig
+
+
+def _warn_of_poor(rig: Rig) -> None:
+    verdict = rig.verdict
+    if verdict is not None and verdict.word == "poor":
+        warn([f"the rig is poor: {'; '.join(verdict.reasons[:1])}; points in space may be far off"])
 
 
 class _Tally:

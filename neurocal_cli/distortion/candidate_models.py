@@ -13,15 +13,17 @@ from neurocal_cli.bundle_adjustment.cross_validation import held_out_points, hel
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import coefficient_names, distort, pinhole_coefficients
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["Candidate", "falls_short", "fit_candidates", "is_weak", "supported", "worth"]
+__all__ = ["Candidate", "falls_short", "fit_candidates", "is_weak", "judged_again", "supported", "worth"]
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
 # tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
@@ -117,6 +119,19 @@ def fit_candidates(problem: Problem, state: CameraState, by_views: bool) -> dict
     return _Chain(problem, by_views, _reach(problem.views, state)).all_from(state)
 
 
+def judged_again(
+    fitted: dict[str, Candidate], by_views: bool, repeated: RepeatedPoses
+) -> dict[str, Candidate]:
+    """The same fits, views that repeat a pose being one view to what they are judged by."""
+    again = {}
+    for model, candidate in fitted.items():
+        reach = _reach(candidate.problem.views, candidate.adjusted.state)
+        chain = _Chain(candidate.problem, by_views, reach, repeated)
+        if (found := chain.assessed(candidate.problem, candidate.adjusted)) is not None:
+            again[model] = found
+    return again
+
+
 @dataclass(frozen=True, eq=False)
 class _Chain:
     """What all fits have in common.
@@ -127,11 +142,13 @@ class _Chain:
     by_views : bool
     reach : float
         Of the points.
+    repeated : RepeatedPoses, optional
     """
 
     problem: Problem
     by_views: bool
     reach: float
+    repeated: RepeatedPoses | None = None
 
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
         fitted: dict[str, Candidate] = {}
@@ -193,7 +210,7 @@ class _Chain:
 
     def _made_monotonic(self, candidate: Candidate) -> Candidate:
         found = fit_monotonic(candidate.problem, candidate.adjusted)
-        return candidate if found is None else self._assessed(*found) or candidate
+        return candidate if found is None else self.assessed(*found) or candidate
 
     def _fit(self, problem: Problem, state: CameraState, most: int = 4) -> Candidate | None:
         """None when it did not settle, or too little is left for it without a part of the data."""
@@ -203,20 +220,24 @@ class _Chain:
         adjusted = problem.adjust(start, steps)
         if not adjusted.converged and model != "none":
             return None
-        return self._assessed(problem, adjusted)
+        return self.assessed(problem, adjusted)
 
-    def _assessed(self, problem: Problem, adjusted: Adjusted) -> Candidate | None:
+    def assessed(self, problem: Problem, adjusted: Adjusted) -> Candidate | None:
+        """A fit with what it is judged by; None where too little is left without a part of the data."""
         views, state, free = problem.views, adjusted.state, problem.free_camera
         held = None if problem.restraint is None else normal_part(problem.restraint, state, free)
         if self.by_views:
-            lost = held_out_views(adjusted.normal, free, problem.free_poses, held)
+            lost = held_out_views(adjusted.normal, free, problem.free_poses, held, self.repeated)
         else:
             lost = held_out_points(views, state, free, problem.free_poses, held)
         if not np.isfinite(lost).all():
             if state.model != "none":
                 return None
             lost = np.full_like(lost, np.inf)
-        cov = covariance(adjusted.normal, free, problem.free_poses, views.n_equations)
+        given = adjusted.normal, free, problem.free_poses, views.n_equations
+        cov = covariance(*given)
+        if self.repeated is not None:
+            cov = counting_views(cov, *given, self.repeated)
         noise = _noise(problem.distortion.model, state, self.reach, cov.entries)
         A = problem.matrix(state.entries[0])
         bad = where_not_monotonic(state.distortion, A, problem.points)

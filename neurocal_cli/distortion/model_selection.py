@@ -4,7 +4,8 @@ Every model is fitted, each from the one before it. The cross-validation error d
 the views, or of the points of a single view. Models whose error is within 0.9 % of the lowest are
 equally good; so are those within the scatter of five folds, for a single view or where the information
 criterion is decidedly for them. Among them the Bayesian information criterion (Schwarz 1978) chooses,
-n log E + p log n, n being the effective number of residuals when neighbours are correlated. Models with
+n log E + p log n, n being the effective number of residuals when neighbours are correlated, and when views
+repeat a pose (`repeated_poses`), which are one view to the folds, too. Models with
 more than two coefficients beyond what the criterion alone would choose take no part. Neither do models
 that did not converge, that have too few points, or that are not monotonic (`monotonic_fit`). Models
 whose coefficients are strongly correlated are kept only when they lower the cross-validation error over
@@ -19,12 +20,19 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.cross_validation import FOLDS, held_out_views
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import MODELS
-from neurocal_cli.distortion.candidate_models import Candidate, falls_short, fit_candidates, worth
+from neurocal_cli.distortion.candidate_models import (
+    Candidate,
+    falls_short,
+    fit_candidates,
+    judged_again,
+    worth,
+)
 from neurocal_cli.geometry import Array
 
 __all__ = ["select_model"]
@@ -69,7 +77,11 @@ def select_model(solution: Solution, more_starts: Callable[[], Iterable[CameraSt
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
     if "none" in fitted and not fitted["none"].determined and _is_enough(views, fitted):
         fitted = {"none": fitted["none"]}  # a distortion would only hide that the camera is undetermined
-    chosen = fitted[_best(fitted, views)]
+    repeated = _repeated(views, fitted)
+    if not repeated.none:
+        by_views = _views_can_spare_any(solution, repeated)
+        fitted = judged_again(fitted, by_views, repeated) or fitted
+    chosen = fitted[_best(fitted, views, repeated)]
     n, px = len(views.index), views.pixel_scale
     iterations = solution.adjusted.iterations + chosen.adjusted.iterations
     return replace(
@@ -106,12 +118,19 @@ def _join(fitted: dict[str, Candidate], others: dict[str, Candidate], limit: flo
             fitted[model] = candidate
 
 
-def _views_can_spare_any(solution: Solution) -> bool:
+def _repeated(views: Views, fitted: dict[str, Candidate]) -> RepeatedPoses:
+    """Views that repeat a pose, as the fit that is closest has them."""
+    state = min(fitted.values(), key=lambda c: c.cost).adjusted.state
+    return repeated_poses(views, state, point_residuals(views, state))
+
+
+def _views_can_spare_any(solution: Solution, repeated: RepeatedPoses | None = None) -> bool:
     problem, adjusted = solution.problem, solution.adjusted
     if problem.views.n_views == 1 or not problem.free_camera.any():
         return False
     free = problem.free_camera if adjusted.state.model == problem.distortion.model else problem.free
-    return bool(np.isfinite(held_out_views(adjusted.normal, free, problem.free_poses)).all())
+    lost = held_out_views(adjusted.normal, free, problem.free_poses, repeated=repeated)
+    return bool(np.isfinite(lost).all())
 
 
 def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
@@ -121,14 +140,14 @@ def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
     return pinhole.criterion(n) < lowest + _DECISIVE and not falls_short(views, [pinhole])
 
 
-def _best(fitted: dict[str, Candidate], views: Views) -> str:
+def _best(fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses) -> str:
     """Of the models whose held-out error is as low as any, the one with the lowest criterion.
 
     What is held out may ask for two coefficients more than the criterion does, but not for more: a few
     folds tell the better of two models, but among many models one is better than it should be by chance.
     """
     sound = _eligible(fitted, views.n_views > 1)
-    n = worth(views, sound.values())
+    n = worth(views, sound.values()) * repeated.worth
     criterion = {name: candidate.criterion(n) for name, candidate in sound.items()}
     most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + _MORE
     pool = {
@@ -141,7 +160,7 @@ def _best(fitted: dict[str, Candidate], views: Views) -> str:
     best = min(pool, key=lambda name: _lost(pool[name]))
     tied = []
     for name, candidate in pool.items():
-        excess = _by_fold(candidate.lost - pool[best].lost)
+        excess = _by_fold(candidate.lost - pool[best].lost, repeated)
         chance = _CHANCE * np.sqrt(len(excess)) * excess.std()
         # Folds of views tell models apart, unless all the data are decidedly of another opinion.
         close = views.n_views == 1 or criterion[name] < criterion[best] - _DECISIVE
@@ -154,8 +173,10 @@ def _lost(candidate: Candidate) -> float:
     return float(candidate.lost.sum())
 
 
-def _by_fold(lost: Array) -> Array:
+def _by_fold(lost: Array, repeated: RepeatedPoses) -> Array:
     """Sums of what each view or fold of points has lost, of those that were left out together."""
+    if len(lost) == len(repeated.group):
+        return np.asarray(np.bincount(repeated.folds(FOLDS), lost))
     if len(lost) <= FOLDS:
         return lost
     return np.array([lost[fold::FOLDS].sum() for fold in range(FOLDS)])

@@ -17,6 +17,7 @@ from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.calibration_yaml import calibration_lines
 from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.verdict_yaml import read_verdict, verdict_lines
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import read_yaml
@@ -110,6 +111,7 @@ def _rig_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
     yield "  warnings:" if rig.warnings else "  warnings: []"
     for warning in rig.warnings:
         yield f"    - {quoted(warning)}"
+    yield from (f"  {line}" for line in verdict_lines(rig.verdict))
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -159,6 +161,7 @@ def rig_from_field(root: Field) -> Rig:
         stop_reason=block["stop_reason"].text(),
         iterations=block["iterations"].integer(),
         warnings=tuple(entry.text() for entry in block["warnings"].items()),
+        judgement=read_verdict(block.get("verdict")),
     )
     _check_consistent(rig, block)
     return rig

@@ -13,9 +13,11 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
     pose_std,
 )
 from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import translations
+from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
@@ -37,16 +39,19 @@ def calibration_of(
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state
-    cov = covariance(
-        adjusted.normal, problem.free_camera, problem.free_poses, views.n_equations, solution.shared
-    )
+    errors = point_residuals(views, state)  # (N, 2), by view
+    repeated = repeated_poses(views, state, errors)
+    normal = adjusted.normal, problem.free_camera, problem.free_poses, views.n_equations
+    cov = covariance(*normal, solution.shared)
     refuse_undetermined(problem, state, cov)
+    if solution.shared is None:
+        cov = counting_views(cov, *normal, repeated)
     A = problem.matrix(state.entries[0])
     intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     if problem.type != 3 and not problem.free[1]:
         intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
     block, std = _camera_covariance(problem, intrinsics, cov)
-    squared = (point_residuals(views, state) ** 2).sum(axis=1) * views.pixel_scale**2  # (N,), by view
+    squared = (errors**2).sum(axis=1) * views.pixel_scale**2
     rmse = float(np.sqrt(squared.mean()))
     free = [n for n, parameter in enumerate(std) if parameter not in problem.fixed]
     reason = StopReason.CONVERGED
@@ -81,6 +86,7 @@ def calibration_of(
         warnings=(
             *parameter_warnings(intrinsics, state.distortion, std, chosen),
             *_corner_warning(problem),
+            *_repeated_warning(repeated),
             *_mirrored_warning(seen_from_behind(views, state)),
             *_rejection_warnings(rejected, len(problem.points)),
         ),
@@ -148,6 +154,16 @@ def _corner_warning(problem: Problem) -> tuple[str, ...]:
         f"the distortion model {problem.distortion.model} that fits the points best is not monotonic (maps "
         "two directions to one pixel) in the image's corners, where there are no points; the best monotonic "
         "fit is used, which is a guess in the corners; add views that show the board there",
+    )
+
+
+def _repeated_warning(repeated: RepeatedPoses) -> tuple[str, ...]:
+    """Many views of few poses know less than they seem to."""
+    if repeated.none:
+        return ()
+    return (
+        f"{len(repeated.group)} views show {repeated.n_poses} different poses; views that repeat a pose "
+        "count as one",
     )
 
 

@@ -6,15 +6,18 @@ All errors are in that frame, with z along the optical axis.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
 from neurocal_cli.points import Correspondences
+from neurocal_cli.stereo.assessment import assess_rig
 from neurocal_cli.stereo.fit_rig import fit_rig, poses_on_rig
 from neurocal_cli.stereo.pairing import Pairs, ViewPairs, pair_points, pair_views
 from neurocal_cli.stereo.rig import Rig
@@ -44,6 +47,8 @@ class StereoEvaluation:
     fitted : tuple of str
         Views of the left camera whose poses were estimated from the same points.
     warnings : tuple of str
+    judgement : Verdict or callable, optional
+        The verdict, or what reaches it; see `verdict`.
     """
 
     unit: str
@@ -54,6 +59,15 @@ class StereoEvaluation:
     alone: tuple[tuple[str, ...], tuple[str, ...]]
     fitted: tuple[str, ...]
     warnings: tuple[str, ...] = ()
+    judgement: Verdict | Callable[[], Verdict | None] | None = None
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """What the data of the calibration say of the rig, reached when it is first read.
+
+        None where there is no rig with points of its own.
+        """
+        return self.judgement() if callable(self.judgement) else self.judgement
 
 
 def evaluate_stereo(
@@ -82,15 +96,18 @@ def evaluate_stereo(
         Cameras at one place, or points that cannot be triangulated.
     """
     warnings: list[str] = []
+    judgement: Verdict | Callable[[], Verdict | None] | None = None
     try:
         rig = fit_rig(left, right)
         warnings += rig.warnings
+        judgement = partial(assess_rig, rig)
     except CoincidentCamerasError:
         raise
     except DegenerateGeometryError as error:
         rig = None
         warnings.append(f"no rig fits all views: {error}")
-    return _Evaluator((left, right), rig, points, method, warnings).evaluation()
+        judgement = Verdict("poor", (warnings[0],), ("calibrate both cameras together: neurocal stereo",), {})
+    return _Evaluator((left, right), rig, points, method, warnings, judgement).evaluation()
 
 
 def evaluate_rig(
@@ -100,7 +117,8 @@ def evaluate_rig(
 
     The views of a rig have one pose for both cameras, so `by_view` and `rig` are equal.
     """
-    return _Evaluator((rig.left, rig.right), rig, points, method, list(rig.warnings)).evaluation()
+    judgement = partial(assess_rig, rig)
+    return _Evaluator((rig.left, rig.right), rig, points, method, list(rig.warnings), judgement).evaluation()
 
 
 class _Evaluator:
@@ -111,7 +129,9 @@ class _Evaluator:
         points: tuple[Correspondences, Correspondences] | None,
         method: str,
         warnings: list[str],
+        judgement: Verdict | Callable[[], Verdict | None] | None,
     ) -> None:
+        self.judgement = judgement
         self.cameras, self.rig, self.method, self.warnings = cameras, rig, method, warnings
         self.points = points or (cameras[0].points, cameras[1].points)
         if points is not None:
@@ -144,6 +164,7 @@ class _Evaluator:
             (self.views.left_only, self.views.right_only),
             tuple(a for a, _ in self.new),
             tuple(self.warnings),
+            self.judgement,
         )
 
     def _fit_new(self) -> tuple[Calibration, Calibration]:

@@ -19,7 +19,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.reprojection import Frames, Observations, RigState
 
-__all__ = ["RigProblem", "free_parameters", "rig_problem"]
+__all__ = ["RigProblem", "estimated_parameters", "free_parameters", "rig_problem"]
 
 # Smaller noise, as a share of the other camera's and in normalised pixels, is rounding in data without noise;
 # test_without_noise_the_truth_comes_back checks such data.
@@ -42,8 +42,8 @@ class RigProblem:
     observations : two of Observations
     cameras : two of CameraState
         As calibrated alone, with the poses of the views.
-    own_cost : two (V_c,) arrays
-        Whitened squared residuals of each view in its camera alone.
+    own_normal : two (V_c, 12 + K, 12 + K) arrays
+        Whitened normal matrices of each view in its camera alone, from `normal_blocks`.
     paired : (P,) int array
         Frames of both cameras.
     paired_right : (P,) int array
@@ -60,12 +60,18 @@ class RigProblem:
     frames: Frames
     observations: tuple[Observations, Observations]
     cameras: tuple[CameraState, CameraState]
-    own_cost: tuple[Array, Array]
+    own_normal: tuple[Array, Array]
     paired: NDArray[np.intp]
     paired_right: NDArray[np.intp]
     spread: Array
     axes: Array
     flat: NDArray[np.bool_]
+
+    @property
+    def own_cost(self) -> tuple[Array, Array]:
+        """Whitened squared residuals of each view in its camera alone, two (V_c,) arrays."""
+        left, right = self.own_normal
+        return left[:, -1, -1], right[:, -1, -1]
 
     @property
     def pairs(self) -> list[tuple[str, str]]:
@@ -95,6 +101,16 @@ def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
     return np.array([not held and name not in calibration.fixed for name in names])
 
 
+def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:
+    """(5 + K,) which of A's entries and the distortion coefficients the views' points determined."""
+    from_lines = calibration.straight_lines is not None
+    coefficients = coefficient_names(calibration.distortion_model)
+    names = (*_ENTRY_NAMES, *coefficients)
+    return np.array(
+        [name not in calibration.fixed and not (from_lines and name in coefficients) for name in names]
+    )
+
+
 def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigProblem:
     """Combine two calibrations with one world unit."""
     # Covariances of the points count as far as the residuals confirm them.
@@ -121,24 +137,24 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
     ]
     noise = [max(side[3], _LEAST_NOISE) for side in sides]
     real = [observed.pixel_scale * s for (observed, *_), s in zip(sides, noise, strict=True)]
-    observations, costs = [], []
-    for (observed, _, cost, _), s, own in zip(sides, noise, real, strict=True):
+    observations, normals = [], []
+    for (observed, _, normal, _), s, own in zip(sides, noise, real, strict=True):
         weight = 1.0 / (s * max(1.0, _LEAST_SHARE * max(real) / own)) ** 2
         observations.append(replace(observed, weight=weight))
-        costs.append(weight * cost)
+        normals.append(weight * normal)
     paired_right = np.flatnonzero(through[frame] & (frame < n_left))
     paired = frame[paired_right]
     return RigProblem(
-        names, frames, (observations[0], observations[1]), (sides[0][1], sides[1][1]), (costs[0], costs[1]),
-        paired, paired_right, _spread(arranged[0], paired), arranged[0].basis[paired],
-        arranged[0].nearly_flat[paired],
+        names, frames, (observations[0], observations[1]), (sides[0][1], sides[1][1]),
+        (normals[0], normals[1]), paired, paired_right, _spread(arranged[0], paired),
+        arranged[0].basis[paired], arranged[0].nearly_flat[paired],
     )  # fmt: skip
 
 
 def _side(
     calibration: Calibration, views: Views, frames: Frames, frame: NDArray[np.intp]
 ) -> tuple[Observations, CameraState, Array, float]:
-    """Normalised observations of one camera (without weight), its state, cost by view and noise."""
+    """Normalised observations of one camera (without weight), its state, normal matrices and noise."""
     centre, scale = frames.centre[frame], frames.scale[frame]
     local = views.local * np.repeat(views.scale / scale, views.counts)[:, None]
     local += np.repeat((views.centre - centre) / scale[:, None], views.counts, axis=0)
@@ -154,13 +170,14 @@ def _side(
         calibration.distortion_model,
         np.array(calibration.distortion, dtype=float),
     )
-    cost = normal_blocks(batches, state)[0][:, -1, -1]
+    normal = normal_blocks(batches, state)[0]
+    cost = normal[:, -1, -1]
     spare = views.n_equations - int(free_parameters(calibration).sum()) - 6 * views.n_views
     noise = float(np.sqrt(cost.sum() / max(spare, 1)))
     observed = Observations(
         batches, frame, views.pixel_centre, views.pixel_scale, 1.0, len(views.index), views.n_equations
     )
-    return observed, state, cost, noise
+    return observed, state, normal, noise
 
 
 def _spread(views: Views, which: NDArray[np.intp]) -> Array:

@@ -12,6 +12,7 @@ from neurocal_cli.report import align, number_or_none, plural, printable, rounde
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError
+from neurocal_cli.verdict.report import verdict_json, verdict_lines
 
 __all__ = [
     "rig_report",
@@ -28,7 +29,10 @@ _ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "
 
 def stereo_evaluation_report(evaluation: StereoEvaluation) -> str:
     """Summary of an evaluation as aligned text."""
-    return "\n\n".join("\n".join(align(table)) for table in stereo_evaluation_tables(evaluation))
+    blocks = [align(table) for table in stereo_evaluation_tables(evaluation)]
+    if evaluation.verdict is not None:
+        blocks.append(verdict_lines(evaluation.verdict))
+    return "\n\n".join("\n".join(block) for block in blocks)
 
 
 def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[str]], ...]:
@@ -78,6 +82,7 @@ def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
         "pairs": [list(pair) for pair in evaluation.pairs],
         "fitted_views": list(evaluation.fitted),
         "rig": None if evaluation.rig is None else _error_json(evaluation.rig),
+        **({} if evaluation.verdict is None else {"verdict": verdict_json(evaluation.verdict)}),
     }
 
 
@@ -114,9 +119,11 @@ def _share(value: float) -> str:
 
 
 def rig_report(rig: Rig) -> str:
-    """Summary of a calibrated rig: both cameras, the rig and the fit, without the warnings."""
+    """Summary of a calibrated rig: both cameras, the rig, the fit and the verdict, without the warnings."""
     blocks = [[_headline(rig)], align(_camera_rows(rig)), align(_rig_rows(rig)), _view_lines(rig)]
     blocks.append(_fit_lines(rig))
+    if rig.verdict is not None:
+        blocks.append(verdict_lines(rig.verdict))
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
@@ -140,6 +147,7 @@ def _headline(rig: Rig) -> str:
 def _camera_rows(rig: Rig) -> list[list[str]]:
     """Both cameras' parameters side by side."""
     rows = [["parameter", "left", "std", "right", "std"]]
+    rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
     models = [coefficient_names(camera.distortion_model) for camera in (rig.left, rig.right)]
     longest = max(models, key=len)
     for name in (

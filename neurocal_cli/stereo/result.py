@@ -23,8 +23,10 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, euler_jacobian
-from neurocal_cli.least_squares.schur_complement import schur_covariance
+from neurocal_cli.least_squares.normal_equations import solve_scaled
+from neurocal_cli.least_squares.schur_complement import SchurCovariance, schur_covariance
 from neurocal_cli.stereo.adjust import AdjustedRig
+from neurocal_cli.stereo.pair_covariance import not_smaller
 from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import Columns, Observations, rig_jacobian
 from neurocal_cli.stereo.rig import Rig
@@ -40,15 +42,24 @@ def assemble_rig(
     adjusted: AdjustedRig,
     free: NDArray[np.bool_],
     left_out: Mapping[tuple[str, str], str],
+    least: Array | None = None,
 ) -> Rig:
     """Convert an adjusted rig to the user's units.
+
+    Parameters
+    ----------
+    problem, calibrations, adjusted, free
+        As they were adjusted.
+    left_out : dict of str by (left name, right name)
+    least : (f, f) array, optional
+        Covariance of the free shared parameters, normalised, below which the result's must not be.
 
     Raises
     ------
     DegenerateGeometryError
         The points do not determine the parameters.
     """
-    return _RigAssembly(problem, calibrations, adjusted, free).rig(left_out)
+    return _RigAssembly(problem, calibrations, adjusted, free, least).rig(left_out)
 
 
 def non_monotonic_sides(
@@ -78,6 +89,7 @@ class _RigAssembly:
         calibrations: tuple[Calibration, Calibration],
         adjusted: AdjustedRig,
         free: NDArray[np.bool_],
+        least: Array | None,
     ) -> None:
         self.problem, self.calibrations, self.adjusted = problem, calibrations, adjusted
         self.columns = Columns.of(adjusted.state)
@@ -98,6 +110,8 @@ class _RigAssembly:
             own=variance * inverse.own,
             cross=variance * inverse.cross,
         )
+        if least is not None:
+            self.covariance = _widened(self.covariance, not_smaller(self.covariance.shared, least))
 
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
         state, frames = self.adjusted.state, self.problem.frames
@@ -116,13 +130,14 @@ class _RigAssembly:
         pose = Pose(state.R, state.t * frames.unit)
         block, std = self._rig_covariance(pose)
         n_points = sum(observed.n_points for observed in self.problem.observations)
+        pairs = self.problem.pairs
         return Rig(
             left,
             right,
             pose,
             std,
             block,
-            tuple(self.problem.pairs[k] for k in np.argsort(self.problem.paired)),
+            tuple(pairs[k] for k in np.argsort(self.problem.paired)),
             dict(left_out),
             rmse_px=float(np.sqrt(sum(s.sum() for s in sums) / n_points)),
             max_px=float(np.sqrt(max(e.max() for e in errors))),
@@ -242,6 +257,15 @@ class _RigAssembly:
         covariance += by_rig @ self._shared_block(columns.rig) @ np.swapaxes(by_rig, 1, 2)
         centre = (R @ frames.centre[observed.view][..., None])[..., 0]
         return pose_std(R, centre, frames.scale[observed.view], covariance)
+
+
+def _widened(covariance: SchurCovariance, shared: Array) -> SchurCovariance:
+    """The same with another covariance of the shared unknowns; the own ones follow them as before."""
+    follow = solve_scaled(
+        np.broadcast_to(covariance.shared, (len(covariance.cross), *shared.shape)), covariance.cross
+    )
+    more = np.swapaxes(follow, 1, 2) @ (shared - covariance.shared) @ follow
+    return replace(covariance, shared=shared, own=covariance.own + more, cross=shared @ follow)
 
 
 def _intrinsics(

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array, cross_matrix
 
@@ -41,6 +42,8 @@ class Rig:
     iterations : int
         Iterations of the common bundle adjustment.
     warnings : tuple of str
+    judgement : Verdict or callable, optional
+        The verdict as a file has it, or what reaches it from this rig; see `verdict`.
     """
 
     left: Calibration
@@ -56,6 +59,15 @@ class Rig:
     stop_reason: str = ""
     iterations: int = 0
     warnings: tuple[str, ...] = ()
+    judgement: Verdict | Callable[[Rig], Verdict | None] | None = None
+
+    @cached_property
+    def verdict(self) -> Verdict | None:
+        """What the data say of this rig beyond its error, reached when it is first read.
+
+        None where it has no points of its own to be judged by.
+        """
+        return self.judgement(self) if callable(self.judgement) else self.judgement
 
     @property
     def R(self) -> Array:

@@ -22,15 +22,18 @@ from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.cross_validation import disagreement, held_out
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
+from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.bundle_adjustment.view_covariance import counting_views, scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
+from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.given_parameters import asked_for
@@ -43,6 +46,7 @@ from neurocal_cli.verdict.projection_uncertainty import (
 from neurocal_cli.verdict.repeated_views import repeated_views
 from neurocal_cli.verdict.rules import Verdict, reach_verdict
 from neurocal_cli.verdict.stated_noise import stated_noise
+from neurocal_cli.verdict.view_change import ViewChange, view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
 __all__ = ["assess", "gather_evidence"]
@@ -93,6 +97,13 @@ class _AtMinimum:
         self.cost = float(self.normal[:, -1, -1].sum())
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
         self.spare = max(self.views.n_equations - self.unknowns, 1)
+        self.errors = point_residuals(self.views, self.state)
+        self.repeated = repeated_poses(self.views, self.state, self.errors)
+        cov = covariance(self.normal, self.free, self.free_poses, self.views.n_equations)
+        self.condition = 1.0 / cov.smallest if cov.smallest > 0 else np.inf
+        self.covariance = counting_views(
+            cov, self.normal, self.free, self.free_poses, self.views.n_equations, self.repeated
+        ).entries
 
     def _arranged(self) -> Views:
         if self.points.covariance is None:
@@ -100,11 +111,9 @@ class _AtMinimum:
         return weighed(self.points, -self._residuals())
 
     def evidence(self) -> Evidence:
-        views, free, poses = self.views, self.free, self.free_poses
-        errors = point_residuals(views, self.state)
-        cov = covariance(self.normal, free, poses, views.n_equations)
+        views = self.views
         precision, contradiction = self._precision()
-        alike, residuals = correlation(views, errors), self._residuals()
+        alike, residuals = correlation(views, self.errors), self._residuals()
         stated = tuple(stated_noise(self.points, residuals))
         return Evidence(
             rmse_px=self.calibration.rmse_px,
@@ -113,12 +122,15 @@ class _AtMinimum:
             contradiction=contradiction,
             disagreement=self._disagreement(),
             correlation=alike,
-            condition=1.0 / cov.smallest if cov.smallest > 0 else np.inf,
+            condition=self.condition,
             coverage=cover(self.points, views, self.state),
             projection=self._projection(),
             repeated=repeated_views(self.points),
+            poses=self.repeated.n_poses,
+            change=self._change(),
+            board=self._board(),
             mirrored=tuple(seen_from_behind(views, self.state)),
-            asked_for=asked_for(views, self.state, self.calibration.fixed, poses),
+            asked_for=asked_for(views, self.state, self.calibration.fixed, self.free_poses),
             noise=(*stated, *noise_shape(self.points, residuals, alike)),
             groups=None if stated else self._groups(),
         )
@@ -134,7 +146,7 @@ class _AtMinimum:
         return view_groups(self.views, self.state, self.normal, self.free)
 
     def _held_out(self) -> float:
-        lost = held_out(self.views, self.state, self.normal, self.free, self.free_poses)
+        lost = held_out(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
 
     def _precision(self) -> tuple[float, float]:
@@ -149,10 +161,27 @@ class _AtMinimum:
         of_point = self.views.n_equations / len(self.points)
         return float(np.sqrt(of_point * own)) * px, float(ratio)
 
+    def _change(self) -> ViewChange | None:
+        if not self.free.any() or self.repeated.n_poses < 2:
+            return None
+        scores = scores_of_poses(self.normal, self.free, self.free_poses, self.repeated)
+        return view_change(
+            self.views, self.state, self.free, scores, self.repeated.group, self.cost / self.spare, self.spare
+        )
+
+    def _board(self) -> BoardShape | None:
+        if not self.free[0] or not self.free_poses:
+            return None
+        std = float(np.sqrt(self.covariance[0, 0]))
+        times = float(self.repeated.variance.mean())
+        return board_shape(self.views, self.state, self.free, self.cost / self.spare, self.spare, times, std)
+
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:
             return np.nan
-        difference, cov = disagreement(self.views, self.state, self.normal, self.free, self.free_poses)
+        difference, cov = disagreement(
+            self.views, self.state, self.normal, self.free, self.free_poses, self.repeated
+        )
         if not np.isfinite(cov).all():
             return np.nan
         scale = np.sqrt(np.diagonal(cov))
@@ -168,7 +197,7 @@ class _AtMinimum:
         depths = np.array([depth.min(), median(depth), depth.max(), _DISTANT * depth.max()])
         return projection_uncertainty(
             self.views, self.state, self.camera, self.normal, self.free, self.free_poses,
-            self.cost / self.spare, image_grid(self.points.image_size), depths,
+            self.cost / self.spare, image_grid(self.points.image_size), depths, self.covariance,
         )  # fmt: skip
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.coverage import Coverage
 from neurocal_cli.verdict.findings import Finding
 from neurocal_cli.verdict.given_parameters import AskedFor
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
+from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
 
 __all__ = ["Evidence"]
@@ -47,6 +49,12 @@ class Evidence:
         Residuals that are not those of measuring, or not as the points state.
     groups : ViewGroups or None
         Two cameras among the views, or a focal length that changes; None where nothing says so.
+    poses : int
+        Different poses among the views (`repeated_poses`).
+    change : ViewChange or None
+        How the camera differs between views; None where it does not.
+    board : BoardShape or None
+        How a target that is said to be flat seems to be bent; None where it does not.
     """
 
     rmse_px: float
@@ -63,3 +71,6 @@ class Evidence:
     asked_for: tuple[AskedFor, ...]
     noise: tuple[Finding, ...]
     groups: ViewGroups | None
+    poses: int
+    change: ViewChange | None
+    board: BoardShape | None

@@ -66,6 +66,7 @@ def projection_uncertainty(
     variance: float,
     pixels: Array,
     depths: Array,
+    shared: Array,
 ) -> ProjectionUncertainty:
     """Propagate the covariance of a calibration.
 
@@ -81,9 +82,11 @@ def projection_uncertainty(
         Of the residuals, normalised.
     pixels : (G, 2) array [px]
     depths : (D,) array
+    shared : (f, f) array
+        Covariance of the free entries and coefficients (`view_covariance`).
     """
-    shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
-    gain, motion, own = _covariances(views, state, normal, shared, free_poses)
+    columns = camera_columns(len(free) - 5)[np.flatnonzero(free)]
+    gain, motion = _motions(views, state, normal, columns, free_poses)
     by_camera, by_point, rays = _derivatives(camera, pixels, views.pixel_scale)
     by_camera = by_camera[:, :, np.flatnonzero(free)]
     std = np.empty((len(depths), len(pixels)))
@@ -92,29 +95,27 @@ def projection_uncertainty(
         moved = np.concatenate([-cross_matrix(p), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2)
         by_motion = by_point / depth @ moved  # (G, 2, 6)
         J = by_camera + by_motion @ gain
-        covariance = J @ own @ np.swapaxes(J, 1, 2) + by_motion @ motion @ np.swapaxes(by_motion, 1, 2)
-        std[k] = np.sqrt(variance * np.trace(covariance, axis1=1, axis2=2))
+        of_motion = variance * by_motion @ motion @ np.swapaxes(by_motion, 1, 2)
+        std[k] = np.sqrt(np.trace(J @ shared @ np.swapaxes(J, 1, 2) + of_motion, axis1=1, axis2=2))
     return ProjectionUncertainty(pixels, depths, std)
 
 
-def _covariances(
+def _motions(
     views: Views, state: CameraState, normal: Array, shared: NDArray[np.intp], free_poses: bool
-) -> tuple[Array, Array, Array]:
-    """Gain G (6, f), cov(e) (6, 6), S^-1 (f, f); world units, residuals of unit variance."""
-    S = normal[:, shared[:, None], shared].sum(axis=0)
+) -> tuple[Array, Array]:
+    """Gain G (6, f), cov(e) (6, 6); world units, residuals of unit variance."""
     if not free_poses:
-        return np.zeros((6, len(shared))), np.zeros((6, 6)), inverse_or_nan(S)
+        return np.zeros((6, len(shared))), np.zeros((6, 6))
     V = views.n_views
     B_inverse = inverse_or_nan(normal[:, POSE, POSE])
     C = normal[:, shared, POSE]
-    S = S - (C @ B_inverse @ np.swapaxes(C, 1, 2)).sum(axis=0)
     M = np.zeros((V, 6, 6))
     M[:, :3, :3] = np.eye(3)
     M[:, 3:, :3] = views.scale[:, None, None] * cross_matrix(state.t)
     M[:, 3:, 3:] = views.scale[:, None, None] * np.eye(3)
     gain = -(M @ B_inverse @ np.swapaxes(C, 1, 2)).mean(axis=0)
     motion = (M @ B_inverse @ np.swapaxes(M, 1, 2)).sum(axis=0) / V**2
-    return gain, motion, inverse_or_nan(S)
+    return gain, motion
 
 
 def _derivatives(camera: Camera, pixels: Array, scale: float) -> tuple[Array, Array, Array]:

@@ -40,6 +40,9 @@ def _facts(verdict: Verdict) -> list[str]:
         ("projection_px", "std of predicted pixels {:.2g} px at most"),
     )
     facts = [text.format(m[name]) for name, text in texts if math.isfinite(m.get(name, math.nan))]
+    depth = m.get("depth_share", math.nan)
+    if math.isfinite(depth):
+        facts.append(f"std of triangulated depth {100 * depth:.2g} % of the depth")
     coverage = m.get("coverage", math.nan)
     if math.isfinite(coverage):
         facts.append(f"{100 * coverage:.0f} % of the image covered")

@@ -9,6 +9,7 @@ import numpy as np
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.geometry import Array
+from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import WORDS, Finding, image_diagonal, name_some, pixel_spread
 from neurocal_cli.verdict.given_parameters import AskedFor
@@ -31,10 +32,11 @@ _UNCOVERED = Limit(0.6, 0.9)  # share of the image
 _FLAT = Limit(-20.0, -5.0)  # degrees of tilt, negative
 _ALPHA = Limit(0.01, 0.05)  # std over the value
 _CENTRE = Limit(0.01, 0.05)  # std over alpha
-_PROJECTION = Limit(0.0025, 0.02)  # worst std in the image over its diagonal
+_PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
 _GIVEN = Limit(0.01, 0.05)  # difference over alpha; 100 cameras given truly stay below 5 std
 _TOLD_APART = 5.0  # standard deviations
 _SHALLOW = 0.1  # depth over distance: the focal length of 200 points is known to about 1 %
+_FEW_POSES = 10  # where views repeat them
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
 _NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
 _TOLD = 3.0  # standard deviations
@@ -70,6 +72,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
+    yield from common_errors(evidence, calibration.unit)
     yield from _errors(calibration, evidence)
     yield from given_parameters(evidence.asked_for, calibration.intrinsics, calibration.std)
     yield from _data(calibration, evidence)
@@ -178,6 +181,13 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     yield from e.noise
     if e.repeated:
         yield 1, f"{name_some(e.repeated)}: the rows are those of another view", "give each view once"
+    views = len(calibration.views)
+    if e.poses < min(views, _FEW_POSES):
+        yield (
+            1,
+            f"{views} views show only {e.poses} different poses; views that repeat a pose count as one",
+            "add views of other poses instead of more frames of the same ones",
+        )
     if e.mirrored:
         yield (
             1,

@@ -416,7 +416,7 @@ CAUSES: dict[str, str] = {
     "half of the images at half size": "of two sizes",
     "one image of another zoom": "view09 (it asks for another zoom",
     "all views alike": "parallel",
-    "one view copied ten times": "rows are those of another view",
+    "one view copied ten times": "those of another view",
     "every view given twice": "rows are those of another view",
     "every row given twice": "rows are those of another view",
     "boards all parallel": "parallel",

@@ -1,0 +1,153 @@
+"""Views that repeat a pose: frames of a video that stands still, or photographs from a tripod.
+
+Such views are one view to everything that counts views. Whether their errors are news is measured: where the
+same point has the same residual in all of them, n views say no more than one; where the residuals are
+independent, they average. With the correlation rho of residuals between copies, n of them are worth
+n / (1 + (n - 1) rho) views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.leave_out import folds_of
+
+__all__ = ["RepeatedPoses", "repeated_poses"]
+
+# Repeated by tests/test_repeated_poses.py: copies with 0.01 to 0.1 px of motion are found, and no two of a
+# thousand random views are called the same.
+_STILL = 1.0  # px that the target's points may move, or
+_NOISE = 3.0  # standard deviations of their noise
+_ROWS = 1000  # of a table of distances that is held at a time
+
+
+@dataclass(frozen=True, eq=False)
+class RepeatedPoses:
+    """Which views repeat which.
+
+    Attributes
+    ----------
+    group : (V,) int array
+        Pose that each view shows, numbered from 0 in the order of the views.
+    correlation : float
+        Of the same point's residuals in views of one pose, 0 to 1.
+    """
+
+    group: NDArray[np.intp]
+    correlation: float
+
+    @property
+    def n_poses(self) -> int:
+        """Number of different poses."""
+        return int(self.group.max(initial=-1)) + 1
+
+    @property
+    def none(self) -> bool:
+        """Whether every view has a pose of its own."""
+        return self.n_poses == len(self.group)
+
+    @property
+    def size(self) -> NDArray[np.intp]:
+        """(P,) views of each pose."""
+        return np.bincount(self.group, minlength=self.n_poses)
+
+    @property
+    def variance(self) -> Array:
+        """(P,) how many times the variance of the sum over a pose's views is that of independent views."""
+        return np.asarray(1.0 + (self.size - 1) * self.correlation)
+
+    @property
+    def worth(self) -> float:
+        """Share of the views' number that they are worth."""
+        return float((self.size / self.variance).sum() / len(self.group))
+
+    def folds(self, n_folds: int) -> NDArray[np.intp]:
+        """(V,) fold of each view; views of one pose are in the same."""
+        return folds_of(self.n_poses, n_folds)[self.group]
+
+    def summed(self, of_views: Array) -> Array:
+        """Sums (P, ...) over the views of each pose of something that each view (V, ...) has."""
+        out = np.zeros((self.n_poses, *of_views.shape[1:]))
+        np.add.at(out, self.group, of_views)
+        return out
+
+
+def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedPoses:
+    """Find views that repeat a pose.
+
+    Parameters
+    ----------
+    views : Views
+    state : CameraState
+        Normalised, of a fit.
+    errors : (N, 2) array
+        Its residuals, normalised, in the order of the points.
+    """
+    noise = float(np.sqrt((errors**2).mean())) if len(errors) else 0.0
+    group = _by_distance(_seen(views, state), max(_STILL / views.pixel_scale, _NOISE * noise))
+    if int(group.max()) + 1 == len(group):
+        return RepeatedPoses(group, 0.0)
+    return RepeatedPoses(group, _correlation(views, errors, group))
+
+
+def _seen(views: Views, state: CameraState) -> Array:
+    """Where each view's pose puts five places of the target, distortion aside; (V, 10)."""
+    centre = np.average(views.centre, axis=0, weights=views.counts)
+    reach = views.scale[0] * views.extent[0, :2] * views.basis[0][:, :2]  # columns
+    places = centre + np.concatenate([np.zeros((1, 3)), reach.T, -reach.T])
+    local = (places - views.centre[:, None]) / views.scale[:, None, None]
+    X, Y, Z = np.moveaxis(local @ np.swapaxes(state.R, 1, 2) + state.t[:, None], 2, 0)
+    a11, a12, a22, a13, a23 = state.entries.T[..., None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = X / Z, Y / Z
+        seen = np.concatenate([a11 * x + a12 * y + a13, a22 * y + a23], axis=1)
+    behind = np.asarray((Z <= 0).any(axis=1) | ~np.isfinite(seen).all(axis=1))
+    return np.where(behind[:, None], np.inf, seen)
+
+
+def _by_distance(seen: Array, near: float) -> NDArray[np.intp]:
+    """Number of the pose of each view: the first view of a pose and all that are near it.
+
+    Not the ones near those: a slow video would be a single pose.
+    """
+    V = len(seen)
+    leader = np.arange(V)
+    fit = np.asarray(np.isfinite(seen).all(axis=1))
+    seen = np.where(fit[:, None], seen, 0.0)
+    square = (seen**2).sum(axis=1)
+    limit = near**2 * (seen.shape[1] / 2)  # rms over the places
+    for first in range(0, V, _ROWS):
+        rows = slice(first, first + _ROWS)
+        close = square[rows, None] + square - 2.0 * seen[rows] @ seen.T < limit
+        close &= fit[rows, None] & fit
+        for k in np.flatnonzero(close.sum(axis=1) > 1):
+            if leader[first + k] == first + k:
+                mine = close[k] & (leader == np.arange(V)) & (np.arange(V) > first + k)
+                leader[mine] = first + k
+    _, group = np.unique(leader, return_inverse=True)
+    return group.reshape(-1)
+
+
+def _correlation(views: Views, errors: Array, group: NDArray[np.intp]) -> float:
+    """Of the same point's residuals in views of one pose; what chance may leave is none."""
+    size = np.bincount(group)
+    rows = np.flatnonzero((size > 1)[group][views.index])
+    view = views.index[rows]
+    world = views.local[rows] * views.scale[view, None] + views.centre[view]
+    place = np.round(world / (1e-6 * views.scale[0]))
+    key = np.column_stack([group[view], place])
+    _, same, n = np.unique(key, axis=0, return_inverse=True, return_counts=True)
+    same = same.reshape(-1)
+    errors = errors[rows]
+    together = np.stack([np.bincount(same, errors[:, k], len(n)) for k in (0, 1)], axis=1)
+    power = np.bincount(same, (errors**2).sum(axis=1), len(n))
+    whole = float(((n - 1) * power).sum())
+    if not whole > 0:
+        return 1.0
+    return float(np.clip(((together**2).sum(axis=1) - power).sum() / whole, 0.0, 1.0))

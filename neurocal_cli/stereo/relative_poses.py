@@ -1,0 +1,255 @@
+"""The relative pose of the two cameras as each pair of views measures it by itself.
+
+Each camera alone gives the poses of its views. So every pair of views gives a relative pose of its own, with
+a covariance. All of them are one if the cameras are fixed to each other and each pair shows one moment.
+
+The model is linear around each camera's own result. With d the errors of both cameras' parameters, x the step
+of the rig from a reference, and z_i the step of the relative pose of pair i from the same reference:
+
+    z_i = x - D_i d + e_i,   cov(e_i) = C_i,
+
+where D_i says how the poses of the views follow the cameras' parameters and C_i is the covariance of the
+relative pose for given cameras. What the views of each camera say of d itself is a second sum of squares.
+The sum of squares of both is the cost of the common bundle adjustment over that of both cameras alone.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.geometry import Array, cross_matrix, rotation_vector
+from neurocal_cli.least_squares.leave_out import Quadratics
+from neurocal_cli.least_squares.normal_equations import solve_scaled
+from neurocal_cli.least_squares.schur_complement import eliminate
+from neurocal_cli.stereo.problem import RigProblem
+
+__all__ = ["RelativePoses", "in_order", "relative_poses"]
+
+_POSE = np.arange(POSE.start, POSE.stop)
+# Smaller noise, in normalised pixels, is rounding; a pixel has about 0.004 of them.
+_LEAST_NOISE = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class RelativePoses:
+    """Relative poses of P pairs of views, in order of their names, and what they depend on.
+
+    The F unknowns are the free parameters of the left camera, those of the right one, and the step of the
+    rig: rotation [rad] and translation [`unit`].
+
+    Attributes
+    ----------
+    names : tuple of (left name, right name)
+    cameras : Quadratics
+        What each frame's views say of the cameras alone, V groups.
+    pairs : Quadratics
+        What each pair adds, the cost of the common fit over that of the cameras alone, P groups.
+    frame : (P,) int array
+        Frame of each pair.
+    left, right, rig : (f,) int arrays
+        Columns of the unknowns.
+    estimated : two of (f,) int arrays
+        Places of the left and the right unknowns among A's entries and the distortion coefficients.
+    focal : two of (0, 1 or 2) int arrays
+        Columns of alpha_u and alpha_v of each camera, where they are free.
+    entries : two of (5,) arrays
+        Entries of A of each camera, normalised.
+    offset : (P, 6) array
+        z.
+    design : (P, 6, F) array
+        Of z by the unknowns.
+    covariance : (P, 6, 6) array
+        C.
+    size : (P,) array
+        Of each target [world unit].
+    centre : (P, 3) array
+        Of each target, in the left camera's directions turned by the rig.
+    motion : (P, 2, 6) array
+        Steps of the relative pose if the right image showed the next, or the previous, pair's pose; nan at
+        the ends.
+    n_equations : (P,) array
+        Equations of both views of each pair.
+    spare : float
+        Equations of both cameras alone less their unknowns.
+    unit : float
+        Of the rig's translation [world unit].
+    """
+
+    names: tuple[tuple[str, str], ...]
+    cameras: Quadratics
+    pairs: Quadratics
+    frame: NDArray[np.intp]
+    left: NDArray[np.intp]
+    right: NDArray[np.intp]
+    rig: NDArray[np.intp]
+    estimated: tuple[NDArray[np.intp], NDArray[np.intp]]
+    focal: tuple[NDArray[np.intp], NDArray[np.intp]]
+    entries: tuple[Array, Array]
+    offset: Array
+    design: Array
+    covariance: Array
+    size: Array
+    centre: Array
+    motion: Array
+    n_equations: Array
+    spare: float
+    unit: float
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def normal(self, used: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """Normal matrix (F, F) and right side (F,) of the common fit of some pairs, (P,) bool."""
+        S = self.cameras.S.sum(axis=0) + self.pairs.S[used].sum(axis=0)
+        return S, self.cameras.g.sum(axis=0) + self.pairs.g[used].sum(axis=0)
+
+    def solution(self, used: NDArray[np.bool_]) -> Array:
+        """(F,) unknowns of the common fit of some pairs."""
+        S, g = self.normal(used)
+        return np.asarray(solve_scaled(S, g[:, None])[:, 0])
+
+    def excess(self, unknowns: Array) -> Array:
+        """(P,) squared distance of each pair's relative pose from the rig, over its covariance."""
+        return self.pairs.at(unknowns)
+
+
+def relative_poses(
+    problem: RigProblem, free: tuple[NDArray[np.bool_], NDArray[np.bool_]], reference: Pose
+) -> RelativePoses | None:
+    """Relative poses of all pairs of a problem.
+
+    Parameters
+    ----------
+    problem : RigProblem
+        The cameras need not be at their own minimum; one step leads there.
+    free : two of (5 + K,) bool array
+        Which of A's entries and the distortion coefficients were estimated from the points.
+    reference : Pose
+        A rig near those of most pairs.
+
+    Returns
+    -------
+    RelativePoses or None
+        None where a view does not determine its pose.
+    """
+    sides = [_Alone(problem, side, free[side]) for side in (0, 1)]
+    if not all(side.determined for side in sides):
+        return None
+    names = in_order(problem.pairs)
+    place = {pair: k for k, pair in enumerate(problem.pairs)}
+    order = np.array([place[pair] for pair in names], dtype=np.intp)
+    first, second = problem.paired[order], problem.paired_right[order]
+    frames, (left, right) = problem.frames, problem.cameras
+    scale = frames.scale[first] / frames.unit
+    R = right.R[second] @ np.swapaxes(left.R[first], 1, 2)
+    centre = (R @ left.t[first][..., None])[..., 0]
+    t = scale[:, None] * (right.t[second] - centre)
+    offset = np.concatenate([rotation_vector(R @ reference.R.T), t - reference.t / frames.unit], axis=1)
+    # A step of the right view's pose is by_rig times one of the rig plus by_pose times one of the left view.
+    by_rig, by_pose = np.zeros((len(order), 6, 6)), np.zeros((len(order), 6, 6))
+    by_rig[:, :3, :3] = np.eye(3)
+    by_rig[:, 3:, :3] = -cross_matrix(centre)
+    by_rig[:, 3:, 3:] = np.eye(3) / scale[:, None, None]
+    by_pose[:, :3, :3] = by_pose[:, 3:, 3:] = R
+    of_right = np.asarray(np.linalg.inv(by_rig), dtype=float)
+    of_left = -of_right @ by_pose
+    covariance = _transformed(of_right, sides[1].covariance[second])
+    covariance += _transformed(of_left, sides[0].covariance[first])
+    offset += (of_right @ sides[1].step[second][..., None] + of_left @ sides[0].step[first][..., None])[
+        ..., 0
+    ]
+    n_left, n_right = (int(side.sum()) for side in free)
+    columns = np.arange(n_left + n_right + 6)
+    places = columns[:n_left], columns[n_left : n_left + n_right], columns[-6:]
+    design = np.zeros((len(order), 6, len(columns)))
+    design[:, :, places[0]] = of_left @ sides[0].follow[first]
+    design[:, :, places[1]] = of_right @ sides[1].follow[second]
+    design[:, :, places[2]] = np.eye(6)
+    weight = np.linalg.inv(covariance)
+    weighted = np.swapaxes(design, 1, 2) @ weight
+    cost = np.einsum("pi,pij,pj->p", offset, weight, offset)
+    pairs = Quadratics(weighted @ design, (weighted @ offset[..., None])[..., 0], cost)
+    counts = [_equations(problem, side) for side in (0, 1)]
+    return RelativePoses(
+        tuple(names),
+        _both(problem, sides, places[:2], len(columns)),
+        pairs, first, *places, (np.flatnonzero(free[0]), np.flatnonzero(free[1])),
+        (places[0][sides[0].focal], places[1][sides[1].focal]),
+        (left.entries[0], right.entries[0]), offset, design, covariance,
+        frames.scale[first], centre * scale[:, None],
+        _motion(right.R[second], right.t[second] * scale[:, None], scale, of_right),
+        counts[0][first] + counts[1][second],
+        sum(side.spare for side in sides),
+        frames.unit,
+    )  # fmt: skip
+
+
+class _Alone:
+    """One camera alone: the poses of its views at its minimum, and how they follow its parameters."""
+
+    def __init__(self, problem: RigProblem, side: int, free: NDArray[np.bool_]) -> None:
+        observed, normal = problem.observations[side], problem.own_normal[side]
+        shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
+        left, solved = eliminate(normal, np.append(shared, normal.shape[-1] - 1), _POSE)
+        S, g, cost = left[:, :-1, :-1], left[:, :-1, -1], left[:, -1, -1]
+        camera = solve_scaled(S.sum(axis=0), g.sum(axis=0)[:, None])[:, 0]
+        self.spare = max(observed.n_equations - len(shared) - 6 * len(normal), 1.0)
+        least = max(cost.sum() - g.sum(axis=0) @ camera, self.spare * observed.weight * _LEAST_NOISE**2)
+        variance = least / self.spare
+        self.follow, self.step = solved[..., :-1], solved[..., -1]
+        own = np.linalg.pinv(normal[:, _POSE[:, None], _POSE], hermitian=True)
+        self.covariance = np.asarray(variance * own, dtype=float)
+        self.quadratics = Quadratics(S / variance, g / variance, cost / variance)
+        self.focal = np.flatnonzero(np.isin(np.flatnonzero(free), (0, 2)))
+        self.determined = bool(np.isfinite(solved).all() and np.isfinite(camera).all())
+
+
+def _both(
+    problem: RigProblem, sides: Sequence[_Alone], places: Sequence[NDArray[np.intp]], width: int
+) -> Quadratics:
+    """What the views of both cameras say of the cameras, by frames."""
+    n = len(problem.frames.scale)
+    S, g, cost = np.zeros((n, width, width)), np.zeros((n, width)), np.zeros(n)
+    for side, place in enumerate(places):
+        view, own = problem.observations[side].view, sides[side].quadratics
+        S[view[:, None, None], place[:, None], place] += own.S
+        g[view[:, None], place] += own.g
+        cost[view] += own.cost
+    return Quadratics(S, g, cost)
+
+
+def _transformed(J: Array, covariance: Array) -> Array:
+    return np.asarray(J @ covariance @ np.swapaxes(J, 1, 2))
+
+
+def _equations(problem: RigProblem, side: int) -> Array:
+    """Equations of each view of one camera."""
+    observed = problem.observations[side]
+    counts = observed.batches.counts
+    return np.asarray(counts * (observed.n_equations / counts.sum()))
+
+
+def _motion(R: Array, t: Array, scale: Array, of_right: Array) -> Array:
+    """Steps of the relative pose from each pair's pose in the right camera to its neighbours' poses."""
+    motion = np.full((len(R), 2, 6), np.nan)
+    for k, neighbour in enumerate((1, -1)):
+        here = np.arange(len(R) - 1) + (neighbour < 0)
+        there = here + neighbour
+        turn = rotation_vector(R[there] @ np.swapaxes(R[here], 1, 2))
+        step = np.concatenate([turn, (t[there] - t[here]) / scale[here, None]], axis=1)
+        motion[here, k] = (of_right[here] @ step[..., None])[..., 0]
+    return motion
+
+
+def in_order(pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Pairs in order of their left names, in which numbers count as numbers."""
+    return sorted(pairs, key=lambda pair: [
+        (int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", pair[0])
+    ])  # fmt: skip

@@ -1,0 +1,159 @@
+"""One word on a rig, good, usable or poor, with the reasons and what to do next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from neurocal_cli.calibration import Verdict
+from neurocal_cli.stereo.contradiction import Contradiction
+from neurocal_cli.stereo.evidence import RigEvidence
+from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.stereo.sound_pairs import MOVED, pair_name, told_of_faults, told_of_move
+from neurocal_cli.verdict.limits import Limit
+
+__all__ = ["reach_rig_verdict"]
+
+# Repeated by tests/test_wrong_rigs.py, in which no wrong rig may be good, and tests/test_rig_verdict.py, in
+# which real and simulated good ones are. Real boards make the relative poses scatter 2 to 3 times as much as
+# noise does.
+_SCATTER = Limit(3.5, 10.0)
+_GROWTH = Limit(1.6, 2.3)
+_CHANGE = Limit(0.0, 10.0)  # standard deviations for each unknown of the explanation
+_HELD_OUT = Limit(1.3, 2.0)  # over the rms error
+_DEPTH = Limit(0.01, 0.05)  # std over the depth
+_BASELINE = Limit(0.01, 0.05)  # std over the baseline
+_LEFT_OUT = Limit(0.0, 0.34)  # share of the pairs
+
+_Finding = tuple[int, str, str]  # grade, reason, advice
+_WORDS = ("good", "usable", "poor")
+_MOMENT = (
+    "trigger both cameras at the same moment, or hold the target still; check that the cameras are fixed"
+)
+
+
+def reach_rig_verdict(rig: Rig, evidence: RigEvidence) -> Verdict:
+    """Weigh the evidence.
+
+    Returns
+    -------
+    Verdict
+    """
+    findings = [finding for finding in _findings(rig, evidence) if finding[0] > 0]
+    findings.sort(key=lambda finding: -finding[0])
+    word = _WORDS[max((finding[0] for finding in findings), default=0)]
+    nan = float("nan")
+    found = evidence.contradiction
+    measures = {
+        "held_out_px": evidence.held_out_px,
+        "alone_px": nan if found is None else rig.rmse_px / found.growth,
+        "growth": nan if found is None else found.growth,
+        "scatter": nan if found is None else found.scatter,
+        "depth": evidence.depth,
+        "depth_share": evidence.depth_share,
+    }
+    return Verdict(
+        word,
+        tuple(dict.fromkeys(finding[1] for finding in findings if finding[1])),
+        tuple(dict.fromkeys(finding[2] for finding in findings if finding[2])),
+        measures,
+    )
+
+
+def _findings(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
+    if not rig.converged:
+        yield 2, f"training did not converge: {rig.stop_reason}", "increase --starts"
+    yield from _pairs(rig, e)
+    yield from _precision(rig, e)
+    for side, verdict in zip(("left", "right"), e.cameras, strict=True):
+        if verdict is not None:
+            # The reasons come the worst first.
+            grades = [_WORDS.index(verdict.word), *[1] * len(verdict.reasons)]
+            for grade, reason in zip(grades, verdict.reasons, strict=False):
+                yield grade, f"{side} camera: {reason}", ""
+            yield from ((1, "", advice) for advice in verdict.advice)
+
+
+def _pairs(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
+    """Whether the pairs agree on one rig."""
+    if len(rig.pairs) == 1:
+        yield 1, "the rig rests on one pair of views, and nothing checks it", "add pairs of views"
+    if e.moved is not None:
+        yield _rig_moved(rig, e, e.moved)
+    odd = {
+        pair: why for pair, why in rig.left_out.items() if not (e.moved is not None and why.startswith(MOVED))
+    }
+    if odd:
+        yield (
+            _LEFT_OUT.grade(len(odd) / len(e.names)),
+            f"{told_of_faults(odd, len(e.names))} and were left out",
+            "look at the views of these pairs, and take them again",
+        )
+    found = e.contradiction
+    if found is None:
+        return
+    if found.odd.any() and found.kind != "moved":
+        names = [pair_name(pair) for pair, is_odd in zip(e.names, found.odd, strict=True) if is_odd]
+        yield 1, f"{', '.join(names[:3])}: the relative pose contradicts that of the other pairs", _MOMENT
+    if found.kind in ("left focal", "right focal", "late", "early"):
+        yield _changed(e, found)
+        return
+    if found.kind == "moved":
+        return
+    poor = "the relative pose of the cameras differs from pair to pair"
+    yield (
+        max(_SCATTER.grade(found.rest), _GROWTH.grade(found.growth)),
+        f"{poor}, by {found.rest:.2g} times what noise explains (rms {rig.rmse_px:.3g} px together, "
+        f"{rig.rmse_px / found.growth:.3g} px each camera alone): the target moved by about "
+        f"{e.displacement:.2g} {rig.unit} between the left and the right image, as they were not taken at "
+        "the same moment, or the cameras are not fixed to each other",
+        _MOMENT,
+    )
+
+
+def _rig_moved(rig: Rig, e: RigEvidence, found: Contradiction) -> _Finding:
+    used = set(rig.pairs)
+    kept = [part for part in (e.names[: found.at], e.names[found.at :]) if used & set(part)]
+    text, advice = told_of_move(e.names, e.size, found.at, kept[0] if len(kept) == 1 else ())
+    return _CHANGE.grade(found.gain), text, advice
+
+
+def _changed(e: RigEvidence, found: Contradiction) -> _Finding:
+    """A focal length that changed, or images that were taken at different moments."""
+    grade = _CHANGE.grade(found.gain)
+    if found.kind in ("late", "early"):
+        sense, way = {"late": ("later", "to the next"), "early": ("earlier", "back to the previous")}[
+            found.kind
+        ]
+        return (
+            grade,
+            f"the two cameras were not triggered at the same moment: the right images were taken {sense}, as "
+            f"they show the target {100 * found.amount:.2g} % of the way {way} pair's place",
+            _MOMENT,
+        )
+    side = found.kind.partition(" ")[0]
+    return (
+        grade,
+        f"the focal length of the {side} camera changed by {100 * found.amount:+.2g} % between "
+        f"{pair_name(e.names[found.at - 1])} and {pair_name(e.names[found.at])}",
+        "calibrate each part by itself, and lock zoom and focus",
+    )
+
+
+def _precision(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
+    more = "add pairs of views in which the target is near, tilted and fills both images"
+    yield (
+        _DEPTH.grade(e.depth_share),
+        f"the std of triangulated depth is {100 * e.depth_share:.2g} % of the depth",
+        more,
+    )
+    share = rig.std["baseline"] / rig.baseline if rig.baseline > 0 else np.inf
+    yield _BASELINE.grade(share), f"the std of the baseline is {100 * share:.2g} % of its length", more
+    if e.contradiction is not None and rig.rmse_px > 0:
+        yield (
+            _HELD_OUT.grade(e.held_out_px / rig.rmse_px),
+            f"the cross-validation error is {e.held_out_px:.3g} px, but the error on all data "
+            f"{rig.rmse_px:.3g} px",
+            "add pairs of views",
+        )

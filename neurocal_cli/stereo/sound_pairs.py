@@ -1,0 +1,189 @@
+"""Which pairs of views determine the rig, and what is wrong with the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array, rotation_step
+from neurocal_cli.median import median
+from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
+from neurocal_cli.stereo.contradiction import contradiction, is_significant
+from neurocal_cli.stereo.pairing import ViewPairs
+from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, rig_problem
+from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
+
+__all__ = ["MOVED", "SoundPairs", "pair_name", "sound_pairs", "span", "told_of_faults", "told_of_move"]
+
+MOVED = "taken"  # the reason of a pair that shows the rig before or after it moved begins so
+_OTHER_SIZE = 1.2  # times; targets of one series are alike, and units differ by far more
+_SHOWN = 5  # names in a message
+_AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and pairs, that agree by more than chance once shifted
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True, eq=False)
+class SoundPairs:
+    """What the relative poses of the pairs say.
+
+    Attributes
+    ----------
+    problem : RigProblem
+        Of all pairs.
+    rig : Pose
+        The rig of most pairs, where an adjustment starts.
+    left_out : dict of str by (left name, right name)
+        Pairs that do not determine the rig, with the reason.
+    moved : str
+        What to say of a rig that moved between two pairs; empty if it did not.
+    luck : bool
+        Whether the pairs differ by no more than luck.
+    """
+
+    problem: RigProblem
+    rig: Pose
+    left_out: Mapping[Pair, str] = field(default_factory=dict)
+    moved: str = ""
+    luck: bool = False
+
+    def contradiction(self, n_pairs: int, outliers: str = "reject") -> str:
+        """Message with the pairs that are left out and their faults."""
+        if self.moved:
+            return self.moved
+        found = told_of_faults(self.left_out, n_pairs)
+        if outliers == "keep" and 2 * len(self.left_out) < n_pairs:
+            return f"{found}; remove them, or use --outliers reject"
+        return f"{found}; check that the views of a pair show one target at one moment, in the same order"
+
+
+def told_of_faults(left_out: Mapping[Pair, str], n_pairs: int) -> str:
+    """What to say of pairs that are left out: how many they are, and the faults with the pairs of each."""
+    by_reason: dict[str, list[str]] = {}
+    for pair, reason in left_out.items():
+        by_reason.setdefault(reason, []).append(pair_name(pair))
+    parts = []
+    for reason, names in by_reason.items():
+        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+        parts.append(f"{', '.join(names[:_SHOWN])}{more}: {reason}")
+    return f"{len(left_out)} of {n_pairs} pairs of views contradict the rig ({'; '.join(parts)})"
+
+
+def pair_name(pair: Pair) -> str:
+    """The name of a pair of views for messages."""
+    return pair[0] if pair[0] == pair[1] else f"{pair[0]}/{pair[1]}"
+
+
+def span(pairs: Sequence[Pair]) -> str:
+    """The names of pairs in a row, by the first and the last left view."""
+    first, last = pairs[0][0], pairs[-1][0]
+    return first if len(pairs) == 1 else f"{first} to {last}"
+
+
+def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> SoundPairs:
+    """Find the pairs that determine the rig.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        Half of the pairs, or more, contradict each other.
+    """
+    problem = rig_problem(left, right, views)
+    consensus = find_consensus(problem)
+    reasons = dict(zip(problem.pairs, consensus.reasons, strict=True))
+    # A fault that has a name is certain. The others may belong to a rig that moved.
+    named = {pair: reason for pair, reason in reasons.items() if reason not in ("", UNSYNCHRONISED)}
+    found = SoundPairs(problem, consensus.rig, {pair: reason for pair, reason in reasons.items() if reason})
+    free = estimated_parameters(left), estimated_parameters(right)
+    poses = relative_poses(problem, free, consensus.rig)
+    if poses is not None:
+        used = np.array([pair not in named for pair in poses.names])
+        found = _explained(poses, used, found)
+    if not found.moved and 2 * len(found.left_out) >= len(views.both):
+        shifted = _shifted(left, right, views)
+        raise DegenerateGeometryError(shifted or found.contradiction(len(views.both)))
+    return found
+
+
+def _explained(poses: RelativePoses, used: NDArray[np.bool_], found: SoundPairs) -> SoundPairs:
+    """The pairs that contradict most others, or those of the smaller part where the rig moved."""
+    why = contradiction(poses, used)
+    odd = {pair: UNSYNCHRONISED for pair, is_odd in zip(poses.names, why.odd, strict=True) if is_odd}
+    if why.kind == "moved":
+        found = replace(found, left_out={**found.left_out, **odd})
+        return _larger_part(poses, used & ~why.odd, why.at, found)
+    luck = not is_significant(why.scatter**2 * why.degrees, why.degrees)
+    return replace(found, left_out={**odd, **found.left_out}, luck=luck)
+
+
+def _larger_part(poses: RelativePoses, used: NDArray[np.bool_], at: int, found: SoundPairs) -> SoundPairs:
+    """The pairs before or after the rig moved; those after it, as the rig is now, if both are as many."""
+    later = np.arange(len(poses)) >= at
+    sides = used & ~later, used & later
+    kept = int(sides[1].sum() >= sides[0].sum())
+    members = {pair for pair, is_in in zip(poses.names, sides[kept], strict=True) if is_in}
+    others = [pair for pair, is_in in zip(poses.names, sides[1 - kept], strict=True) if is_in]
+    between = f"between {pair_name(poses.names[at - 1])} and {pair_name(poses.names[at])}"
+    reason = f"{MOVED} {('after', 'before')[kept]} the rig moved {between}"
+    left_out = {pair: why for pair, why in found.left_out.items() if pair not in members}
+    left_out |= dict.fromkeys(others, reason)
+    start = poses.solution(sides[kept])[-6:]
+    rig = Pose(rotation_step(start[:3]) @ found.rig.R, found.rig.t + start[3:] * poses.unit)
+    text, advice = told_of_move(poses.names, poses.size, at, poses.names[at:] if kept else poses.names[:at])
+    return SoundPairs(found.problem, rig, left_out, f"{text}; {advice}")
+
+
+def told_of_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pair] = ()) -> tuple[str, str]:
+    """What to say of a rig that has two geometries, and what to do.
+
+    Parameters
+    ----------
+    names : sequence of (left name, right name)
+        All pairs in order.
+    size : (P,) array
+        Of each target.
+    at : int
+        First pair of the second geometry.
+    kept : sequence of (left name, right name)
+        The part that determines the rig; none where both do.
+    """
+    this = f"; this is that of {span(kept)}" if kept else ""
+    (large, larger), (small, smaller) = sorted(
+        ((float(median(size[part])), span(names[part])) for part in (slice(at), slice(at, None))),
+        reverse=True,
+    )
+    if large > _OTHER_SIZE * small:
+        return (
+            f"the targets in {larger} are {large / small:.3g} times as large as in {smaller}, so the rig has "
+            f"two sizes{this}",
+            "check the unit of X,Y,Z and the size of the squares",
+        )
+    return (
+        f"the rig moved between {pair_name(names[at - 1])} and {pair_name(names[at])}: it has two "
+        f"geometries, {span(names[:at])} and {span(names[at:])}{this}",
+        "calibrate each part by itself, and fix the cameras to each other",
+    )
+
+
+def _shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str:
+    """What to say where the pairs agree on a rig once the right views are moved up or down by one."""
+    if len(views.both) < 2 * _LEAST_AGREED:
+        return ""
+    for word, by in (("next", 1), ("previous", -1)):
+        pairs = in_order(views.both)
+        first, second = (pairs[:-1], pairs[1:]) if by > 0 else (pairs[1:], pairs[:-1])
+        moved = tuple((a, b) for (a, _), (_, b) in zip(first, second, strict=True))
+        agree = find_consensus(rig_problem(left, right, ViewPairs(moved, (), ()))).agree
+        if agree.mean() > _AGREED:
+            return (
+                f"each left view fits the right view of the {word} pair, such as {pair_name(moved[0])}, but "
+                "not that of its own; one image of one camera is missing or was taken twice; name the views "
+                "that were taken at the same moment alike"
+            )
+    return ""

@@ -1,0 +1,93 @@
+"""What views say together that none says alone: a camera that changes, and a board that is bent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from neurocal_cli.verdict.board_shape import BoardShape
+from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.view_change import ViewChange
+
+__all__ = ["common_errors"]
+
+# Repeated by tests/test_view_change.py and tests/test_board_shape.py, with changes from 0.2 % and boards
+# bent by 0.2 mm and more. A result is off by half of a change; careful calibrations state 0.05 %.
+_CHANGED, _MUCH_CHANGED = 0.001, 0.05  # of the focal length
+# Real boards of good calibrations are bent, too; they cost up to 0.4 % and 1.3 sigmas.
+_OFF, _MUCH_OFF = 0.005, 0.05  # of the focal length
+_SIGMAS = 2.0
+# Times the noise floor that may be left when a cause is taken away: what leaves more is not the cause, or not
+# the only one. Of the wrong inputs, true causes leave up to 1.04 and others 1.38 and more.
+_LEFT = 1.25
+_SHOWN = 3  # names
+
+Finding = tuple[int, str, str]  # grade, reason, advice
+
+
+def common_errors(evidence: Evidence, unit: str) -> Iterator[Finding]:
+    """Reasons against a camera that is not the same in all views, or a board that is not flat.
+
+    Parameters
+    ----------
+    evidence : Evidence
+    unit : str
+        Of the world.
+    """
+    change, board = evidence.change, evidence.board
+    if change is not None and not _explains(change.explained, evidence):
+        change = None
+    if board is not None and not _explains(board.explained, evidence):
+        board = None
+    if board is not None:
+        yield _bent(board, unit)
+    # Views of a bent board differ, and not by chance; rows given twice know less than they seem to.
+    if change is not None and not evidence.repeated and (board is None or change.explained > board.explained):
+        yield _changed(change)
+
+
+def _explains(share: float, evidence: Evidence) -> bool:
+    """Whether hardly more than noise is left of the error without a share of its square."""
+    return not evidence.contradiction * np.sqrt(max(1.0 - share, 0.0)) > _LEFT
+
+
+def _changed(change: ViewChange) -> Finding:
+    size = abs(change.amount)
+    percent, grows = f"{100 * size:.2g} %", "grows" if change.amount > 0 else "shrinks"
+    what = "the focal length" if change.what == "focal length" else "the size of the image"
+    if change.pattern == "line":
+        reason = f"{what} {grows} by {percent} along the sequence of the views, so zoom or focus moves"
+    elif change.pattern == "step":
+        reason = f"{what} {grows} by {percent} from view {change.views[0]} on, so zoom or focus has moved"
+    else:
+        shown = ", ".join(change.views[:_SHOWN])
+        more = f" and {len(change.views) - _SHOWN} more" if len(change.views) > _SHOWN else ""
+        reason = (
+            f"{shown}{more}: these views are scaled by {1 + change.amount:.4g} against the others, so the "
+            "images are of two sizes, or of two settings of zoom or focus"
+        )
+    return (
+        int(size > _CHANGED) + int(size > _MUCH_CHANGED),
+        reason,
+        "keep zoom and focus fixed, autofocus off, and all images at one size",
+    )
+
+
+def _bent(board: BoardShape, unit: str) -> Finding:
+    off = abs(board.focal_length)
+    return (
+        max(int(board.sigmas > _SIGMAS), int(off > _OFF) + int(off > _MUCH_OFF)),
+        f"the residuals repeat on the board in all views: it seems {_shape(board, unit)}, which "
+        f"makes the focal length {100 * off:.2g} % too {'short' if board.focal_length > 0 else 'long'}",
+        "use a board that is flat, or measure its shape and give X,Y,Z as measured",
+    )
+
+
+def _shape(board: BoardShape, unit: str) -> str:
+    if board.bend:
+        return f"bent by {board.bend:.2g} {unit}"
+    if abs(board.shear) > abs(board.stretch):
+        return f"printed with sides that are {abs(board.shear):.2g} rad off a right angle"
+    more = "stretched" if board.stretch > 0 else "shrunk"
+    return f"{more} by {100 * abs(board.stretch):.2g} % along {board.side}"

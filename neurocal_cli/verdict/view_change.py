@@ -1,0 +1,226 @@
+"""Whether the camera is the same in all views: score tests, which need no other calibration.
+
+Let one parameter of the camera, the logarithm of its focal length or of the image's size, differ by delta_v
+from view to view. With each view's S_v and g_v (`cross_validation.reduced`), and a the step of the shared
+parameters that delta = 1 makes, its score is s_v = a.g_v, and the covariance of the scores is
+
+    M = diag(a.S_v a) - B S^-1 B^T,   B_v = S_v a,
+
+in units of the noise's variance. A pattern c of views, delta_v = b c_v, has b = c.s / c.M c, known to
+1 / sqrt(c.M c). The patterns are a line along the sequence of the views, a step at each place of it, every
+other view, and the two groups that differ most.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
+from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
+
+__all__ = ["ViewChange", "in_sequence", "view_change"]
+
+# Repeated by tests/test_view_change.py: on clean scenes less than one in a hundred is told, and on real
+# boards, whose views differ by more than noise, none is.
+_LINE = 3.5  # sigmas: one in 2000 for each of four
+_STEP = 4.5  # sigmas, of the largest of all steps
+_SCATTER = 1.645  # sigmas: the other views differ by more than noise in one case of 20
+_FEWEST = 5  # views
+# The largest chi-squared of two groups among V normal values, and its share of theirs, is exceeded in one
+# case of 1000 by 2/pi V + 6.5 + 2.75 sqrt(V), and by 2/pi + 1.06 / sqrt(V): 40,000 draws at V = 4 to 1000.
+_MEAN, _TWO, _TWO_ROOT, _SHARE = 2.0 / np.pi, 6.5, 2.75, 1.06
+
+
+@dataclass(frozen=True)
+class ViewChange:
+    """How the camera differs between views.
+
+    Attributes
+    ----------
+    what : str
+        "focal length" or "image size".
+    pattern : str
+        "line", "step" or "groups".
+    amount : float
+        From the first view to the last, or of the second group against the first, as a share of it.
+    sigmas : float
+        In its standard deviations.
+    explained : float
+        Share of the squared error that it explains.
+    views : tuple of str
+        The second group; for a line all views, in their sequence.
+    """
+
+    what: str
+    pattern: str
+    amount: float
+    sigmas: float
+    explained: float
+    views: tuple[str, ...]
+
+
+def in_sequence(names: tuple[str, ...]) -> list[int]:
+    """Places of names in their natural order, in which img2 is before img10."""
+
+    def key(place: int) -> list[tuple[bool, int, str]]:
+        parts = re.findall(r"\d+|\D+", names[place])
+        return [(not part[0].isdecimal(), int(part) if part[0].isdecimal() else 0, part) for part in parts]
+
+    return sorted(range(len(names)), key=key)
+
+
+def view_change(
+    views: Views,
+    state: CameraState,
+    free: NDArray[np.bool_],
+    scores: Quadratics,
+    group: NDArray[np.intp],
+    variance: float,
+    spare: float,
+) -> ViewChange | None:
+    """Find how the camera differs between views: the most significant way, or None.
+
+    Parameters
+    ----------
+    views : Views
+    state : CameraState
+        Normalised, at the minimum.
+    free : (5 + K,) bool array
+    scores : Quadratics
+        Of the poses (`view_covariance.scores_of_poses`).
+    group : (V,) int array
+        Pose of each view (`repeated_poses`).
+    variance : float
+        Of the residuals, normalised.
+    spare : float
+        Equations beyond the unknowns.
+    """
+    order = in_sequence(views.names)
+    place = np.empty(len(order))
+    place[order] = np.arange(len(order))
+    place = np.bincount(group, place) / np.bincount(group)  # of each pose
+    if len(place) < _FEWEST or not variance > 0:
+        return None
+    found: list[ViewChange] = []
+    for what, step in _directions(views, state, free):
+        test = _ScoreTest.of(scores, step[free], variance)
+        for pattern, members, amount, sigmas in _patterns(test, place):
+            names = tuple(views.names[k] for k in order if members[group[k]])
+            found.append(ViewChange(what, pattern, amount, sigmas, sigmas**2 / spare, names))
+    return max(found, key=lambda change: abs(change.sigmas), default=None)
+
+
+def _directions(views: Views, state: CameraState, free: NDArray[np.bool_]) -> Iterator[tuple[str, Array]]:
+    """Steps of A's entries and the coefficients, by what changes."""
+    focal, size = np.zeros((2, len(free)))
+    focal[:3] = size[:3] = state.entries[0, :3]
+    size[3:5] = state.entries[0, 3:5] + views.pixel_centre / views.pixel_scale
+    if free[0] and free[2]:
+        yield "focal length", focal
+    if free[[0, 2, 3, 4]].all():
+        yield "image size", size
+
+
+@dataclass(frozen=True, eq=False)
+class _ScoreTest:
+    """Scores of one parameter.
+
+    Attributes
+    ----------
+    s : (P,) array
+    information : (P,) array
+        a.S_v a.
+    B : (P, f) array
+    S_inverse : (f, f) array
+    variance : float
+    """
+
+    s: Array
+    information: Array
+    B: Array
+    S_inverse: Array
+    variance: float
+
+    @classmethod
+    def of(cls, scores: Quadratics, step: Array, variance: float) -> _ScoreTest:
+        B = scores.S @ step
+        return cls(scores.g @ step, B @ step, B, inverse_or_nan(scores.S.sum(axis=0)), variance)
+
+    def cumulative(self, order: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Amounts and sigmas of the patterns that are 0 for the first k views of an order and 1 after."""
+        num = -np.cumsum(self.s[order])[:-1]  # the scores add up to 0
+        B = np.cumsum(self.B[order], axis=0)[:-1]
+        return self._tested(num, np.cumsum(self.information[order])[:-1], B)
+
+    def pattern(self, c: Array) -> tuple[float, float]:
+        """Amount and sigmas of one pattern."""
+        amount, sigmas = self._tested(
+            np.array([c @ self.s]), np.array([c**2 @ self.information]), (c @ self.B)[None]
+        )
+        return float(amount[0]), float(sigmas[0])
+
+    def _tested(self, num: Array, diagonal: Array, B: Array) -> tuple[Array, Array]:
+        known = diagonal - ((B @ self.S_inverse) * B).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            amount, sigmas = num / known, num / np.sqrt(known * self.variance)
+        usable = (known > 1e-9 * diagonal) & np.isfinite(sigmas)
+        return np.where(usable, amount, 0.0), np.where(usable, sigmas, 0.0)
+
+    def scatter(self) -> tuple[float, float]:
+        """Chi-squared of all views' differences, and its degrees of freedom."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            chi = self.s**2 / self.information / self.variance
+            shared = ((self.B @ self.S_inverse) * self.B).sum(axis=1) / self.information
+        usable = np.isfinite(chi) & np.isfinite(shared)
+        return float(chi[usable].sum()), float((1.0 - shared[usable]).sum())
+
+
+def _patterns(test: _ScoreTest, place: Array) -> Iterator[tuple[str, NDArray[np.bool_], float, float]]:
+    """Patterns that chance does not make: what, its second group, its amount and sigmas."""
+    P = len(place)
+    order = np.argsort(place, kind="stable")
+    everywhere = np.ones(P, dtype=bool)
+    chi, freedom = test.scatter()
+
+    def beyond_scatter(sigmas: float) -> float:
+        # Views that differ anyhow, as those of real boards do, make patterns by chance.
+        rest = (chi - sigmas**2) / max(freedom - 1, 1.0)
+        usual = float(exceeded_by_chance(max(freedom - 1, 1.0), _SCATTER))
+        return sigmas / float(np.sqrt(max(rest / usual, 1.0)))
+
+    line = (place - place.mean()) / max(float(np.ptp(place)), 1e-300)
+    amount, sigmas = test.pattern(line)
+    if abs(sigmas := beyond_scatter(sigmas)) > _LINE:
+        yield "line", everywhere, amount, sigmas
+    amounts, all_sigmas = test.cumulative(order)
+    k = int(np.argmax(np.abs(all_sigmas[1:-1]))) + 1
+    sigmas = beyond_scatter(float(all_sigmas[k]))
+    if abs(sigmas) > _STEP:
+        after = ~everywhere
+        after[order[k + 1 :]] = True
+        yield "step", after, float(amounts[k]), sigmas
+    odd = ~everywhere
+    odd[order[1::2]] = True
+    amount, sigmas = test.pattern(odd.astype(float))
+    if abs(sigmas := beyond_scatter(sigmas)) > _LINE:
+        yield "groups", odd, amount, sigmas
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = np.nan_to_num(test.s / test.information, posinf=0.0, neginf=0.0)
+    order = np.argsort(own, kind="stable")
+    amounts, all_sigmas = test.cumulative(order)
+    k = int(np.argmax(np.abs(all_sigmas)))
+    two = float(all_sigmas[k] ** 2)
+    by_chance = _MEAN * freedom + _TWO + _TWO_ROOT * np.sqrt(freedom)
+    if two > by_chance and two > (_MEAN + _SHARE / np.sqrt(freedom)) * max(chi, two):
+        larger = ~everywhere
+        larger[order[k + 1 :]] = True
+        # As many sigmas as a pattern known beforehand would have with what is beyond chance.
+        yield "groups", larger, float(amounts[k]), float(np.sqrt(two - by_chance + _LINE**2))

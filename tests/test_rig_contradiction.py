@@ -1,0 +1,159 @@
+"""Relative poses of pairs of views: how they contradict one rig, and what that does to its covariance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.rigs import RigScene, random_rig
+from support.wrong_rigs import in_parts, jolted, loose, scene, seen, turned, zoomed
+
+from neurocal_cli import Correspondences, calibrate, fit_rig
+from neurocal_cli.geometry import rotation_step, rotation_vector
+from neurocal_cli.stereo.adjust import adjust_rig
+from neurocal_cli.stereo.consensus import find_consensus
+from neurocal_cli.stereo.contradiction import Contradiction, contradiction
+from neurocal_cli.stereo.pair_covariance import not_smaller
+from neurocal_cli.stereo.pairing import pair_views
+from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, rig_problem
+from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
+from neurocal_cli.stereo.rig import Rig
+
+Points = tuple[Correspondences, Correspondences]
+
+
+def made(points: Points) -> tuple[RigProblem, RelativePoses]:
+    cameras = [calibrate(side, distortion="none", skew=False) for side in points]
+    problem = rig_problem(*cameras, pair_views(points[0].view_names, points[1].view_names))
+    free = estimated_parameters(cameras[0]), estimated_parameters(cameras[1])
+    poses = relative_poses(problem, free, find_consensus(problem).rig)
+    assert poses is not None
+    return problem, poses
+
+
+def found(points: Points) -> Contradiction:
+    return contradiction(made(points)[1])
+
+
+def fitted(points: Points) -> Rig:
+    left, right = (calibrate(side, distortion="none", skew=False) for side in points)
+    return fit_rig(left, right, refine_cameras=True)
+
+
+def test_the_vector_of_a_rotation_leads_back_to_it() -> None:
+    small = np.random.default_rng(1).normal(size=(5, 3)) * [[0.0], [1e-9], [1e-4], [0.01], [1e-3]]
+    assert rotation_vector(rotation_step(small)) == pytest.approx(small, abs=1e-7, rel=1e-4)
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert rotation_vector(quarter) == pytest.approx([0.0, 0.0, np.pi / 2])
+
+
+def test_names_count_numbers_as_numbers() -> None:
+    names = ["v10", "v9", "v²", "v1b2", "v1b11", "7"]
+    ordered = [a for a, _ in in_order([(name, name) for name in names])]
+    assert ordered == ["7", "v1b2", "v1b11", "v9", "v10", "v²"]
+
+
+@pytest.mark.parametrize("degrees", [0.0, 0.02])
+def test_the_sum_of_squares_is_that_of_the_common_adjustment(degrees: float) -> None:
+    problem, poses = made(in_parts(scene(), turned(scene(), degrees), 6))
+    told = contradiction(poses)
+    start = problem.start(find_consensus(problem).rig)
+    free = np.concatenate([[True, False, True, True, True] * 2, [True] * 6])
+    adjusted = adjust_rig(problem.frames, problem.observations, start, free.astype(bool))
+    alone = sum(float(cost.sum()) for cost in problem.own_cost)
+    assert told.scatter**2 * told.degrees == pytest.approx(adjusted.cost - alone, rel=0.02)
+
+
+def test_a_rig_that_moved_is_found_at_its_pair() -> None:
+    for at in (3, 6, 9):
+        told = found(in_parts(scene(), turned(scene(), 0.1), at))
+        assert (told.kind, told.at) == ("moved", at)
+        assert told.rest < 1.5 < told.scatter
+
+
+def test_a_focal_length_that_changed_is_told_from_a_rig_that_moved() -> None:
+    told = found(in_parts(scene(), zoomed(scene(), 1, 1.007), 5))
+    assert (told.kind, told.at) == ("right focal", 5)
+    assert told.amount == pytest.approx(0.007, rel=0.1)
+
+
+def test_scatter_is_not_taken_for_a_change() -> None:
+    for seed in range(8):
+        assert found(jolted(scene(8, seed), 2.0, seed)).kind in ("", "odd")
+
+
+def test_the_majority_wins() -> None:
+    few = in_parts(scene(), turned(scene(), 0.3), 9)
+    rig = fitted(few)
+    assert list(rig.left_out) == [(f"left{k}", f"right{k}") for k in (10, 11, 12)]
+    assert all(reason.startswith("taken after the rig moved") for reason in rig.left_out.values())
+    turn = rotation_vector(rig.R @ scene().rig.R.T)
+    assert (np.abs(turn) < 5 * np.array([rig.std[name] for name in ("R_x", "R_y", "R_z")])).all()
+
+
+def test_two_equal_parts_are_named_and_the_cameras_are_right() -> None:
+    rig = fitted(in_parts(scene(), turned(scene(), 0.5, 1.0), 6))
+    assert "two geometries, left01 to left06 and left07 to left12" in rig.warnings[0]
+    truth = scene().cameras
+    for camera, true in zip((rig.left, rig.right), truth, strict=True):
+        assert abs(camera.intrinsics.alpha_u - true.alpha_u) < 4 * camera.std["alpha_u"]
+
+
+def test_pairs_that_scatter_do_not_spoil_the_cameras() -> None:
+    points = jolted(scene(), 3.0)
+    rig = fitted(points)
+    alone = calibrate(points[0], distortion="none", skew=False)
+    assert rig.left.intrinsics.alpha_u == alone.intrinsics.alpha_u
+    assert any("keep the result of their own views" in text for text in rig.warnings)
+
+
+def deviations(some: RigScene, points: Points) -> np.ndarray:
+    """Errors of the rig over its standard deviations."""
+    rig = fitted(points)
+    off = np.concatenate([rig.pose.euler - some.rig.euler, rig.t - some.rig.t])
+    return off / np.array([rig.std[name] for name in ("R_x", "R_y", "R_z", "t_x", "t_y", "t_z")])
+
+
+def test_std_count_pairs_where_pairs_scatter() -> None:
+    z = np.array([deviations(scene(12, seed), jolted(scene(12, seed), 2.0, seed)) for seed in (6, 9, 11)])
+    assert np.sqrt((z**2).mean()) < 2.0  # 20 where points are taken for independent
+    assert np.abs(z).max() < 4.0
+
+
+@pytest.mark.slow
+def test_std_hold_over_many_rigs_that_scatter() -> None:
+    z = []
+    for seed in range(60):
+        some = scene(14, seed)
+        points = jolted(some, 1.0, seed) if seed % 2 else loose(some, 0.05)
+        z.append(deviations(some, points))
+    assert 0.7 < np.sqrt(np.mean(np.square(z))) < 1.4
+    assert np.mean(np.abs(z) > 3) < 0.02
+
+
+def test_a_widened_covariance_is_nowhere_smaller() -> None:
+    rng = np.random.default_rng(3)
+    roots = rng.normal(size=(2, 5, 5)) * 10.0 ** rng.uniform(-3, 3, (2, 5, 1))
+    a, b = (root @ root.T for root in roots)
+    larger = not_smaller(a, b)
+    scale = np.sqrt(np.diagonal(larger))
+    for one in (a, b):
+        assert np.linalg.eigvalsh((larger - one) / np.outer(scale, scale)).min() > -1e-6
+    assert not_smaller(a, 0.1 * a) == pytest.approx(a)
+
+
+@pytest.mark.slow
+def test_the_criterion_is_still_where_there_is_nothing_but_noise() -> None:
+    """No explanation, and the scatter of chi-squared variables, over 150 rigs of all kinds."""
+    rng = np.random.default_rng(17)
+    scatter, alarms = [], 0
+    for seed in range(150):
+        n, kind = int(rng.choice([3, 4, 6, 10, 20, 40])), ("parallel", "verging", "wide", "narrow", "unequal")
+        some = replace(random_rig(rng, kind[seed % 5], n), names=("left{}", "right{}"))
+        told = found(seen(some, float(np.exp(rng.uniform(np.log(0.05), 0.0))), seed))
+        alarms += told.kind != ""
+        scatter.append((told.scatter**2 - 1) * np.sqrt(told.degrees / 2))
+    assert alarms == 0
+    assert abs(np.mean(scatter)) < 0.35
+    assert np.std(scatter) < 1.5

@@ -1,0 +1,130 @@
+"""Standard deviations that count views: larger where views contradict each other, and only there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.distorted import bent_set
+from support.grouped_views import ALPHA, photographed, poses
+from support.scenes import random_flat_set
+
+from neurocal_cli import Calibration, calibrate
+from neurocal_cli.bundle_adjustment import view_covariance
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
+from neurocal_cli.bundle_adjustment.view_covariance import counting_views
+from neurocal_cli.bundle_adjustment.views import Views, arrange
+from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
+from neurocal_cli.verdict.assessment import _AtMinimum
+
+NO_SKEW = np.array([1, 0, 1, 1, 1], dtype=bool)
+
+
+def own_poses(n: int) -> RepeatedPoses:
+    return RepeatedPoses(np.arange(n), 0.0)
+
+
+def test_levels_of_chi_squared() -> None:
+    from scipy.stats import chi2, norm
+
+    freedom = np.array([3.0, 5.0, 12.5, 100.0])
+    for sigmas in (1.645, 2.326, 3.719):
+        expected = chi2.ppf(norm.cdf(sigmas), freedom) / freedom
+        np.testing.assert_allclose(exceeded_by_chance(freedom, sigmas), expected, rtol=0.04)
+
+
+def scores(n_views: int, seeds: range) -> list[bool]:
+    """Whether clean views were taken to contradict each other."""
+    taken = []
+    for seed in seeds:
+        rng = np.random.default_rng([seed, n_views])
+        scene = random_flat_set(rng, n_views, False, cols=8, rows=6, f=900.0, width=1280)
+        views = arrange(scene.points(0.2, rng))
+        found = adjust(views.batches, scene.true_state(views), NO_SKEW, True)
+        given = found.normal, NO_SKEW, True, views.n_equations
+        cov = covariance(*given)
+        taken.append(counting_views(cov, *given, own_poses(n_views)) is not cov)
+    return taken
+
+
+@pytest.mark.parametrize("n_views", [3, 5, 20])
+def test_clean_views_contradict_each_other_in_one_set_of_twenty(n_views: int) -> None:
+    # Of 100 sets, 15 and more have a probability of 0.0001.
+    assert sum(scores(n_views, range(100))) < 15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_views", [3, 4, 5, 6, 10, 30])
+def test_the_share_of_clean_sets_is_one_in_twenty(n_views: int) -> None:
+    assert 0.025 < np.mean(scores(n_views, range(1000))) < 0.075
+
+
+def test_the_std_of_clean_views_is_the_normal_matrix_s() -> None:
+    scene, _ = bent_set("k1k2", 12)
+    points = scene.points(0.2, np.random.default_rng(3))
+    found = calibrate(points, distortion="k1k2", outliers="keep", skew=False)
+    views = arrange(points)
+    A = scene.intrinsics
+    ratio = found.std["alpha_u"] / noise_std(views, found)
+    assert A.alpha_u == pytest.approx(found.intrinsics.alpha_u, abs=4 * found.std["alpha_u"])
+    assert ratio == pytest.approx(1.0, rel=1e-6)
+
+
+def noise_std(views: Views, found: Calibration) -> float:
+    """Std of alpha_u from the normal matrix alone."""
+    m = _AtMinimum(found)
+    entries = covariance(m.normal, m.free, m.free_poses, views.n_equations).entries
+    return float(np.sqrt(entries[0, 0])) * views.pixel_scale
+
+
+@pytest.mark.parametrize("n_views", [5, pytest.param(4, marks=pytest.mark.slow), 12])
+def test_std_hold_where_each_view_has_a_focal_length_of_its_own(n_views: int) -> None:
+    """Scattered by 0.5 %: with noise alone it would be known far better."""
+    errors, std, noise = [], [], []
+    for seed in range(30):
+        rng = np.random.default_rng([seed, 9])
+        focal = 1.0 + 0.005 * rng.normal(size=n_views)
+        points = photographed(poses(n_views, rng), rng, focal=focal)
+        found = calibrate(points, distortion="k1k2p1p2", outliers="keep", skew=False)
+        errors.append(found.intrinsics.alpha_u - ALPHA)
+        std.append(found.std["alpha_u"])
+        noise.append(noise_std(arrange(points), found))
+    rms, told, by_noise = (np.sqrt(np.mean(np.square(values))) for values in (errors, std, noise))
+    assert rms > 2.0 * by_noise
+    # 30 draws know the rms to an eighth, and few views are a rough measure.
+    assert 0.6 < rms / told < 1.4
+
+
+def test_the_covariance_is_nowhere_below_the_normal_matrix_s(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(view_covariance, "_contradict", lambda *_: True)
+    rng = np.random.default_rng(11)
+    scene = random_flat_set(rng, 6, False, cols=8, rows=6)
+    views = arrange(scene.points(0.2, rng))
+    found = adjust(views.batches, scene.true_state(views), NO_SKEW, True)
+    given = found.normal, NO_SKEW, True, views.n_equations
+    noise = covariance(*given)
+    counted = counting_views(noise, *given, own_poses(6))
+    scale = np.sqrt(np.diagonal(noise.entries))
+    more = (counted.entries - noise.entries) / np.outer(scale, scale)
+    assert np.linalg.eigvalsh(more).min() > -1e-9
+    assert np.trace(more) > 0.01
+    assert (np.linalg.eigvalsh(counted.poses - noise.poses).min() > -1e-9 * noise.poses.max()).all()
+
+
+def test_the_jackknife_is_that_of_calibrations_without_each_view() -> None:
+    rng = np.random.default_rng(12)
+    focal = 1.0 + 0.003 * rng.normal(size=10)
+    points = photographed(poses(10, rng), rng, focal=focal)
+    whole = calibrate(points, skew=False, distortion="k1k2", outliers="keep")
+    others = [
+        calibrate(points.select(points.view_index != k), skew=False, distortion="k1k2", outliers="keep")
+        for k in range(10)
+    ]
+    m = _AtMinimum(whole)
+    told = view_covariance._jackknife(reduced(m.normal, m.free, True))
+    alphas = np.array([c.intrinsics.alpha_u for c in others])
+    jackknife = np.sqrt(0.9 * ((alphas - alphas.mean()) ** 2).sum())
+    assert np.sqrt(told[0, 0]) * m.views.pixel_scale == pytest.approx(jackknife, rel=0.05)
+    assert whole.std["alpha_u"] > 0.95 * jackknife
