@@ -2,13 +2,14 @@
 
 Points may be those that the camera was calibrated from or others. A view that the calibration does
 not know has no pose yet: its pose is estimated with the intrinsic parameters held fixed (type 3),
-so that the error left is what the intrinsic parameters cannot explain.
+so that the error left is what the intrinsic parameters cannot explain. So is the pose of a view of
+which the calibration knows only the name: another image may have been given the same one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +20,15 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.given_points import GivenPoints
 
 __all__ = ["CameraEvaluation", "ViewEvaluation", "evaluate_camera"]
+
+# Most points of the same image lie within these of where the calibration sees them: a user's own noise and
+# small edits do, another image of the board does not. Repeated by tests/test_evaluation.py.
+_NEAR_PX = 2.0
+_NEAR = 5.0  # times the rms error of the calibration
+_FEWEST = 4  # points that a pose can be found from
 
 
 @dataclass(frozen=True)
@@ -65,6 +73,10 @@ class CameraEvaluation:
         Mean residual.
     views : dict of ViewEvaluation by view name
     warnings : tuple of str
+    renamed : tuple of str
+        Fitted views that have the name of a view of the calibration but not its pose.
+    fit : Calibration or None
+        The fitted views, with the camera given.
     """
 
     residuals: Array
@@ -78,11 +90,18 @@ class CameraEvaluation:
     bias_v: float
     views: Mapping[str, ViewEvaluation]
     warnings: tuple[str, ...] = ()
+    renamed: tuple[str, ...] = ()
+    fit: Calibration | None = None
 
     @property
     def fitted_views(self) -> tuple[str, ...]:
         """Names of the views whose pose was estimated here."""
         return tuple(name for name, view in self.views.items() if view.fitted)
+
+    @property
+    def given_points(self) -> GivenPoints:
+        """What a verdict on these points rests on."""
+        return GivenPoints(self.rmse_px, self.n_points, self.n_behind, self.fit)
 
 
 def evaluate_camera(
@@ -110,20 +129,26 @@ def evaluate_camera(
     """
     warnings: list[str] = []
     poses: dict[str, Pose] = {}
+    renamed: tuple[str, ...] = ()
+    fit: Calibration | None = None
     seed = 0
     if isinstance(calibration, Calibration):
-        points = calibration.points if points is None else points
+        given, points = points, calibration.points if points is None else points
         if not len(points):
             raise InputError("the calibration has no points of its own; give the points to evaluate it on")
-        warnings += _compare(calibration, points)
+        _refuse_another_size(calibration, points)
         seed = calibration.seed
         poses = {name: view.pose for name, view in calibration.views.items()}
+        if given is not None:
+            renamed = _other_images(calibration, points)
+            poses = {name: pose for name, pose in poses.items() if name not in renamed}
+            warnings += _compare_units(calibration, points, poses)
     elif points is None:
         raise InputError("intrinsic parameters have no points; give the points to evaluate them on")
     fitted = np.array([name not in poses for name in points.view_names])
     if fitted.any():
-        new_poses, problems = _fit_poses(calibration, points.select(fitted[points.view_index]), seed)
-        poses.update(new_poses)
+        fit, problems = _fit_poses(calibration, points.select(fitted[points.view_index]), seed)
+        poses.update({name: view.pose for name, view in fit.views.items()})
         warnings += problems
     camera = camera_of(calibration)
     predicted, in_front = _predict(camera, [poses[name] for name in points.view_names], points)
@@ -133,18 +158,40 @@ def evaluate_camera(
         warnings.append(
             f"{n_behind} of {len(points)} points lie behind the camera and are left out of all averages"
         )
-    return _measure(residuals, points, fitted, tuple(warnings))
+    return replace(_measure(residuals, points, fitted, tuple(warnings)), renamed=renamed, fit=fit)
 
 
-def _compare(calibration: Calibration, points: Correspondences) -> list[str]:
-    """Refuse points that the calibration does not apply to; return what to warn of."""
+def _refuse_another_size(calibration: Calibration, points: Correspondences) -> None:
     here, there = points.image_size, calibration.image_size
     if here is not None and there is not None and here != there:
         raise InputError(
             f"{points.source}: the points' image_size {here[0]} x {here[1]} differs from the camera's "
             f"{there[0]} x {there[1]}; evaluate on images of the camera's size"
         )
-    if points.unit == calibration.unit or calibration.views.keys().isdisjoint(points.view_names):
+
+
+def _other_images(calibration: Calibration, points: Correspondences) -> tuple[str, ...]:
+    """Views named as some of the calibration, of which most points are not where these see them.
+
+    A view of too few points for a pose of its own keeps the one that it has.
+    """
+    known = [name for name in points.view_names if name in calibration.views]
+    if not known:
+        return ()
+    some = points.select(np.isin(points.view_index, [points.view_names.index(name) for name in known]))
+    predicted, in_front = _predict(
+        calibration.camera, [calibration.views[name].pose for name in some.view_names], some
+    )
+    near = max(_NEAR_PX, _NEAR * calibration.rmse_px)
+    far = ~in_front | ~(np.hypot(*(predicted - some.pixels).T) <= near)
+    count = np.bincount(some.view_index)
+    other = (2 * np.bincount(some.view_index, far) >= count) & (count >= _FEWEST)
+    return tuple(np.array(some.view_names)[other].tolist())
+
+
+def _compare_units(calibration: Calibration, points: Correspondences, poses: Mapping[str, Pose]) -> list[str]:
+    """What to warn of where calibrated poses are used for points in another unit."""
+    if points.unit == calibration.unit or poses.keys().isdisjoint(points.view_names):
         return []
     return [
         f"the points are in {points.unit}, but the poses of the calibration are in {calibration.unit}; "
@@ -154,16 +201,15 @@ def _compare(calibration: Calibration, points: Correspondences) -> list[str]:
 
 def _fit_poses(
     camera: Calibration | Camera | Intrinsics, points: Correspondences, seed: int
-) -> tuple[dict[str, Pose], list[str]]:
+) -> tuple[Calibration, list[str]]:
     """Type 3: poses of views that the calibration does not know, and what to warn of."""
     from neurocal_cli.methods import fit_poses  # the trainers: only when there is something to train
 
     fit = fit_poses(points, camera, seed)
-    poses = {name: view.pose for name, view in fit.views.items()}
     warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
     if not fit.converged:
         warnings.append(f"the poses of the new views did not converge: {fit.stop_reason}")
-    return poses, warnings
+    return fit, warnings
 
 
 def _predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:

@@ -21,6 +21,7 @@ from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.pipeline.result import calibration_of
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.assessment import assess
+from neurocal_cli.verdict.repeated_views import repeated_views
 
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions
@@ -128,10 +129,15 @@ def calibrate(
         _refuse_misfit(found)
         return replace(found, judgement=assess)
     except DegenerateGeometryError as error:
+        text, copies = str(error), repeated_views(points)
+        if copies:
+            text += f"; the rows of {len(copies)} of {points.n_views} views are those of another view"
         # Views and normal matrices do not know the file that the user should look at.
-        if points.lines is None or str(error).startswith(points.source):
+        if points.lines is not None and not text.startswith(points.source):
+            text = f"{points.source}: {text}"
+        if text == str(error):
             raise
-        raise DegenerateGeometryError(f"{points.source}: {error}") from error
+        raise DegenerateGeometryError(text) from error
 
 
 def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:

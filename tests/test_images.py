@@ -130,7 +130,7 @@ def test_a_jpeg_that_is_damaged_inside_is_refused() -> None:
     [
         (b"", "is empty"),
         (b"view,X,Y,Z,u,v\n" * 9, "is not a readable image"),
-        (b"GIF89a" + bytes(50), "is not a readable image"),
+        (b"GIF89a" + bytes(50), "is a GIF file, which is not read"),
         (b"P5\n0 7\n255\n", "0 x 7 px"),
         (b"P5\nx y\n255\n" + bytes(50), "damaged"),
         (b"P5\n5 5\n255\n", "cut off"),

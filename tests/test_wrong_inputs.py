@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from support.wrong_inputs import FLAT, FOLDED, flat, folded, outcome
+from support.wrong_inputs import CAUSES, FLAT, FOLDED, SLOW, UNNAMED, flat, folded, outcome
 from wrong_inputs_table import words
 
 from neurocal_cli import calibrate
@@ -20,21 +20,22 @@ def test_the_points_that_are_spoilt_are_good(scene, seed: int) -> None:
     assert found.n_rejected == 0
 
 
-# Takes seconds, as all explanations are tried; the same in one view does not.
-LONG = "half of the points shifted by a square"
-
-
 @pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=pytest.mark.slow if name == LONG else ()) for name in (*FLAT, *FOLDED)],
+    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in CAUSES]
 )
-def test_no_wrong_input_ends_as_good(name: str) -> None:
-    word, reason = outcome(name)
-    assert word in ("refused", "poor", "usable")
-    assert reason
-    assert ROWS[name] == word
+def test_no_wrong_input_ends_as_good_and_its_cause_is_named(name: str) -> None:
+    found = outcome(name)
+    assert found.word in ("refused", "poor", "usable")
+    assert found.reasons
+    assert ROWS[name] == found.word
+    assert bool(found.named) == (name not in UNNAMED), found.reasons
 
 
 def test_the_table_has_every_wrong_input() -> None:
-    assert set(ROWS) == {*FLAT, *FOLDED}
-    assert len(ROWS) >= 40
+    assert set(ROWS) >= set(CAUSES) == {*FLAT, *FOLDED}
+    assert len(CAUSES) >= 90
+
+
+def test_the_cause_is_named_in_nine_of_ten() -> None:
+    assert set(CAUSES) > UNNAMED
+    assert len(UNNAMED) < 0.1 * len(CAUSES)

@@ -29,9 +29,10 @@ def main() -> None:
     sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
     from support import wrong_inputs, wrong_rigs
 
-    _write(PAGE, {name: wrong_inputs.outcome(name) for name in [*wrong_inputs.FLAT, *wrong_inputs.FOLDED]})
+    found = {name: wrong_inputs.outcome(name) for name in [*wrong_inputs.FLAT, *wrong_inputs.FOLDED]}
+    _write(PAGE, {name: (one.word, one.named or one.reasons[0]) for name, one in found.items()})
     rigs = {name: wrong_rigs.outcome(name) for name in wrong_rigs.WRONG}
-    _write(RIGS, {name: (found.word, found.reasons[0]) for name, found in rigs.items()})
+    _write(RIGS, {name: (rig.word, rig.reasons[0]) for name, rig in rigs.items()})
 
 
 def _write(page: Path, outcomes: dict[str, tuple[str, str]]) -> None:

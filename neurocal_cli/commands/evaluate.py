@@ -64,13 +64,14 @@ def camera(calibration: str, points: str | None, as_json: bool) -> None:
     is sqrt(mean(du^2 + dv^2)); the bias is the mean of du and of dv.
 
     Without POINTS.csv the points of the calibration itself are used, and the error is too optimistic.
-    With POINTS.csv a view of the calibration keeps its calibrated pose. The pose of any other view is
-    fitted first, with the intrinsic parameters fixed, and the view is marked `fitted`. Points behind
-    the camera are counted but are not part of any average.
+    With POINTS.csv a view of the calibration keeps its calibrated pose where most of its points are
+    seen as in the calibration. The pose of any other view is fitted first, with the intrinsic
+    parameters fixed, and the view is marked `fitted`; so is a view of another image that only has the
+    same name. Points behind the camera are counted but are not part of any average.
 
     A calibration also gets a verdict. It rests on the points of the calibration: the cross-validation
     error, the noise floor, the agreement of two halves of the data, the coverage of the image and the
-    uncertainty of predicted pixels.
+    uncertainty of predicted pixels. With POINTS.csv the error on these points is part of it.
 
     \b
     Examples:
@@ -101,10 +102,14 @@ def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluati
     from neurocal_cli.evaluation import evaluate_camera
     from neurocal_cli.io.calibration_yaml import read_calibration
     from neurocal_cli.verdict.assessment import assess
+    from neurocal_cli.verdict.given_points import judged_by_points
 
     try:
         calibration = read_calibration(name)
-        return evaluate_camera(calibration, points), assess(calibration)
+        evaluation, verdict = evaluate_camera(calibration, points), assess(calibration)
+        if verdict is not None and points is not None:
+            verdict = judged_by_points(verdict, calibration, evaluation.given_points)
+        return evaluation, verdict
     except FormatError as error:
         if points is None or name == "-":
             raise
@@ -117,10 +122,15 @@ def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluati
 
 
 def _tell(evaluation: CameraEvaluation) -> None:
-    fitted = evaluation.fitted_views
-    if fitted:
-        names = ", ".join(fitted[:5]) + (", ..." if len(fitted) > 5 else "")
-        note([f"{names}: not in the calibration; the pose is fitted with the intrinsic parameters fixed"])
+    renamed = evaluation.renamed
+    new = tuple(name for name in evaluation.fitted_views if name not in renamed)
+    for names, why in (
+        (new, "not in the calibration"),
+        (renamed, "other points than the calibration has under this name"),
+    ):
+        if names:
+            some = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
+            note([f"{some}: {why}; the pose is fitted with the intrinsic parameters fixed"])
     warn(evaluation.warnings)
 
 

@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
-from neurocal_cli.detection.identity.identify import Located, identify
+from neurocal_cli.detection.identity.identify import Identified, Located, identify
 from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.measuring import measure
+from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -134,7 +135,7 @@ def detect_points(
         The image does not show the board, or not enough of it. The message says why.
     """
     found = find_grids(image, wanted_sizes(board)) if grids is None else grids
-    identified = identify(board, found, image)
+    identified = _identified(board, found, image)
     located = identified.located
     measured = tuple(_sound(measure(image, one.grid, points, gamma)) for one in located)
     labels = [label(one, points_of) for one, points_of in zip(located, measured, strict=True)]
@@ -155,6 +156,16 @@ def detect_points(
         measured,
         identified.warnings,
     )
+
+
+def _identified(board: Board, grids: list[Grid], image: NDArray[np.generic]) -> Identified:
+    try:
+        return identify(board, grids, image)
+    except NoBoardError as error:
+        other = other_target(image)
+        if other:
+            raise NoBoardError(other) from error
+        raise
 
 
 def wanted_sizes(board: Board) -> list[tuple[int, int]]:

@@ -25,6 +25,20 @@ _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
 
+# What a file may be instead, by its first bytes.
+_VIDEO = "video"
+_OTHERS = (
+    (rb".{4}ftyp(heic|heix|hevc|mif1|msf1)", "HEIC"),
+    (rb".{4}ftypavi[fs]", "AVIF"),
+    (rb".{4}(ftyp|moov|mdat|free|wide)", _VIDEO),
+    (rb"RIFF.{4}AVI ", _VIDEO),
+    (rb"RIFF.{4}WEBP", "WebP"),
+    (rb"\x1aE\xdf\xa3", _VIDEO),  # Matroska, WebM
+    (rb"\x00\x00\x01[\xb0-\xbf]", _VIDEO),  # MPEG
+    (rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11", _VIDEO),  # Windows Media
+    (rb"GIF8[79]a", "GIF"),
+)
+
 
 @dataclass(frozen=True)
 class Header:
@@ -69,6 +83,15 @@ def read_header(data: bytes, source: str) -> Header:
         raise FormatError("is empty; give an image", source)
     reader = next((read for mark, read in _READERS if re.match(mark, data, re.DOTALL)), None)
     if reader is None:
+        other = next((what for mark, what in _OTHERS if re.match(mark, data, re.DOTALL)), None)
+        if other == _VIDEO:
+            raise FormatError(
+                "is a video, but images are wanted; extract some, as with "
+                "`ffmpeg -i VIDEO -vf fps=1 frame%03d.png`",
+                source,
+            )
+        if other is not None:
+            raise FormatError(f"is a {other} file, which is not read; save it as PNG or JPEG", source)
         raise FormatError("is not a readable image; give PNG, JPEG, TIFF, BMP, PGM or PPM", source)
     try:
         header = reader(data)

@@ -16,6 +16,7 @@ from typing import IO, TYPE_CHECKING
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.io.files import one_line, reason
 from neurocal_cli.io.outputs import held_back
+from neurocal_cli.io.temporary_files import remove_stale, temporary_name
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -183,7 +184,9 @@ def _status(path: str | Path) -> os.stat_result | None:
 
 def _written_beside(target: str, chunks: Iterable[str | bytes], former: os.stat_result | None) -> str:
     """A temporary file in the target's folder, complete and like the one that it is to replace."""
-    temporary = os.path.join(os.path.dirname(target), f".neurocal-{os.urandom(8).hex()}.tmp")
+    folder = os.path.dirname(target)
+    remove_stale(folder)
+    temporary = os.path.join(folder, temporary_name())
     try:
         # os.open applies the umask to 0o666, as for any new file.
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0)

@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.common_noise import with_common_share
+from neurocal_cli.bundle_adjustment.common_noise import common_share, measured, with_common_share
 from neurocal_cli.bundle_adjustment.measured_directions import single, unit, variance_across
 from neurocal_cli.bundle_adjustment.outlier_views import find_outlier_view
 from neurocal_cli.bundle_adjustment.problem import Problem
@@ -28,12 +28,15 @@ from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.calibration import Rejected
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.consensus import find_consensus
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.median import median
 from neurocal_cli.pipeline.fit import fit, fit_again
+from neurocal_cli.pipeline.odd_views import why_odd
 from neurocal_cli.points import Correspondences
 
 __all__ = ["fit_robustly"]
@@ -49,6 +52,7 @@ _ENOUGH = 12  # points of a view that tell its standard deviation
 _PASSES = 12
 _NO_WORSE = 1.05  # times the rms error with a view that is taken back
 _MAJORITY = 0.5  # share of the points that must be left
+_ORDINARY = 6.0  # times the median error: the points that tell whether stated sigmas hold
 _LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 
 
@@ -197,10 +201,23 @@ class _Search:
         """What was set aside."""
         error = _errors(self.solution, self.points).length
         rows = np.flatnonzero(~self.kept)
+        self._explain()
         if not rows.size:
             return Rejected(views=dict(self.wrong_views))
         known = np.where(np.isfinite(error), error, np.nan)[rows]
         return Rejected(self.points.select(rows), known, dict(self.wrong_views))
+
+    def _explain(self) -> None:
+        """Name what is wrong with each view that was left out, as far as its points tell."""
+        if not self.wrong_views:
+            return
+        matrix = self.solution.problem.matrix(self.solution.state.entries[0])
+        camera = Camera(Intrinsics.from_matrix(matrix), self.solution.state.distortion)
+        rmse = _rms(self.solution)
+        for name, reason in self.wrong_views.items():
+            rows = self.points.view_index == self.points.view_names.index(name)
+            plain = replace(self.points.select(rows), covariance=None, across=None)
+            self.wrong_views[name] = why_odd(plain, camera, rmse, reason)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,11 +249,27 @@ def _errors(solution: Solution, points: Correspondences) -> _Errors:
     residuals = predicted - points.pixels
     stated = None
     if points.covariance is not None:
-        stated = with_common_share(points.covariance, solution.common_noise, points.across)
+        share = solution.common_noise
+        if not measured(points.covariance):
+            share = _borne_out(points.covariance, residuals)
+        stated = with_common_share(points.covariance, share, points.across)
         residuals = _eased(residuals, points.covariance, stated, points.across)
     length = _lengths(residuals, stated, points.across)
     length = np.where(in_front & (view >= 0) & np.isfinite(length), length, np.inf)
     return _Errors(length, _parts(length, residuals, points.across))
+
+
+def _borne_out(covariance: Array, residuals: Array) -> float:
+    """Share of the noise that is the same for all points, whatever sigma somebody stated for each.
+
+    A point with too small a sigma is no outlier. Those that are do not count here.
+    """
+    length = np.hypot(residuals[:, 0], residuals[:, 1])
+    finite = np.isfinite(length)
+    if not finite.any():
+        return 0.0
+    usual = finite & (length <= _ORDINARY * median(length[finite]))
+    return common_share(covariance[usual], residuals[usual])
 
 
 def _eased(residuals: Array, covariance: Array, believed: Array, across: Array | None) -> Array:

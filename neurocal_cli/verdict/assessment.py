@@ -7,6 +7,8 @@ Everything follows from the calibration and its points, so a file can be judged 
   free network (`outlier_views.free_networks`); a common camera that leaves more contradicts the data;
 * how far two halves of the data disagree, in units of their reported uncertainty;
 * whether residuals of neighbours are correlated (`residual_correlation`);
+* whether the views are of two cameras, or of a focal length that changes (`view_groups`);
+* whether the points ask for other values of parameters that were given (`given_parameters`);
 * how much of the image and how many directions the points cover (`coverage`);
 * how far projected pixels would move with other noise (`projection_uncertainty`).
 """
@@ -29,18 +31,23 @@ from neurocal_cli.bundle_adjustment.view_covariance import counting_views, score
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.given_parameters import asked_for
+from neurocal_cli.verdict.noise_shape import noise_shape
 from neurocal_cli.verdict.projection_uncertainty import (
     ProjectionUncertainty,
     image_grid,
     projection_uncertainty,
 )
-from neurocal_cli.verdict.repeated_views import repeated_views, scaled_views
+from neurocal_cli.verdict.repeated_views import repeated_views
 from neurocal_cli.verdict.rules import Verdict, reach_verdict
+from neurocal_cli.verdict.stated_noise import stated_noise
 from neurocal_cli.verdict.view_change import ViewChange, view_change
+from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
 __all__ = ["assess", "gather_evidence"]
 
@@ -101,19 +108,20 @@ class _AtMinimum:
     def _arranged(self) -> Views:
         if self.points.covariance is None:
             return arrange(self.points)
-        predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
-        return weighed(self.points, self.points.pixels - predicted)
+        return weighed(self.points, -self._residuals())
 
     def evidence(self) -> Evidence:
         views = self.views
         precision, contradiction = self._precision()
+        alike, residuals = correlation(views, self.errors), self._residuals()
+        stated = tuple(stated_noise(self.points, residuals))
         return Evidence(
             rmse_px=self.calibration.rmse_px,
             held_out_px=self._held_out(),
             precision_px=precision,
             contradiction=contradiction,
             disagreement=self._disagreement(),
-            correlation=correlation(views, self.errors),
+            correlation=alike,
             condition=self.condition,
             coverage=cover(self.points, views, self.state),
             projection=self._projection(),
@@ -121,9 +129,21 @@ class _AtMinimum:
             poses=self.repeated.n_poses,
             change=self._change(),
             board=self._board(),
-            scaled=scaled_views(self.points),
             mirrored=tuple(seen_from_behind(views, self.state)),
+            asked_for=asked_for(views, self.state, self.calibration.fixed, self.free_poses),
+            noise=(*stated, *noise_shape(self.points, residuals, alike)),
+            groups=None if stated else self._groups(),
         )
+
+    def _residuals(self) -> Array:
+        """(N, 2) predicted minus observed [px], in the order of the points."""
+        predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
+        return predicted - self.points.pixels
+
+    def _groups(self) -> ViewGroups | None:
+        if not (self.free_poses and self.free[:5].any()):
+            return None
+        return view_groups(self.views, self.state, self.normal, self.free)
 
     def _held_out(self) -> float:
         lost = held_out(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)

@@ -31,16 +31,16 @@ class Coverage:
         Share of the image's cells, 6 x 6, that hold a point; nan where the image's size is unknown.
     empty : str
         The emptiest part of the image, as "upper left"; "" where none is.
-    outside : int
-        Points that lie outside the image.
     tilt : float
         Largest angle between two planes of targets [degrees]; 90 for targets that are not flat.
+    relief : float
+        How deep the deepest target is, over its distance; nan where all are flat.
     """
 
     image: float
     empty: str
-    outside: int
     tilt: float
+    relief: float
 
 
 def cover(points: Correspondences, views: Views, state: CameraState) -> Coverage:
@@ -50,15 +50,25 @@ def cover(points: Correspondences, views: Views, state: CameraState) -> Coverage
         normals = (state.R @ views.basis)[:, :, 2]
         smallest = np.abs(normals @ normals.T).min()
         tilt = float(np.degrees(np.arccos(np.clip(smallest, 0, 1))))
+    relief = _relief(points, views, state)
     if points.image_size is None:
-        return Coverage(np.nan, "", 0, tilt)
+        return Coverage(np.nan, "", tilt, relief)
     size = np.array(points.image_size, dtype=float)
     inside = ((points.pixels >= -0.5) & (points.pixels <= size - 0.5)).all(axis=1)
     held = _held(points.pixels[inside], size)
     thirds = held.reshape(3, _CELLS // 3, 3, _CELLS // 3).mean(axis=(1, 3))
     row, column = np.unravel_index(int(np.argmin(thirds)), thirds.shape)
     empty = _THIRDS[row][column] if thirds[row, column] < 0.5 else ""
-    return Coverage(float(held.mean()), empty, int((~inside).sum()), tilt)
+    return Coverage(float(held.mean()), empty, tilt, relief)
+
+
+def _relief(points: Correspondences, views: Views, state: CameraState) -> float:
+    solid = np.flatnonzero(~views.nearly_flat)
+    if not solid.size:
+        return np.nan
+    away = np.linalg.norm(state.t * views.scale[:, None], axis=1)  # of each view's centroid
+    along = [points.world[points.view_index == k] @ views.basis[k][:, 2] for k in solid]
+    return max(float(np.ptp(one)) / float(away[k]) for one, k in zip(along, solid, strict=True))
 
 
 def _held(pixels: Array, size: Array) -> Array:

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.coverage import Coverage
+from neurocal_cli.verdict.findings import Finding
+from neurocal_cli.verdict.given_parameters import AskedFor
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.verdict.view_change import ViewChange
+from neurocal_cli.verdict.view_groups import ViewGroups
 
 __all__ = ["Evidence"]
 
@@ -38,9 +41,14 @@ class Evidence:
     projection : ProjectionUncertainty or None
         At the nearest, the middle and the farthest point's distance, and at ten times that; None
         where the image's size is unknown.
-    repeated, scaled, mirrored : tuple of str
-        Views that are copies of others; whose points lie farther apart than the others'; that show the
-        target from its other side.
+    repeated, mirrored : tuple of str
+        Views that are copies of others; that show the target from its other side.
+    asked_for : tuple of AskedFor
+        Given parameters as the points would have them.
+    noise : tuple of Finding
+        Residuals that are not those of measuring, or not as the points state.
+    groups : ViewGroups or None
+        Two cameras among the views, or a focal length that changes; None where nothing says so.
     poses : int
         Different poses among the views (`repeated_poses`).
     change : ViewChange or None
@@ -59,8 +67,10 @@ class Evidence:
     coverage: Coverage
     projection: ProjectionUncertainty | None
     repeated: tuple[str, ...]
-    scaled: tuple[str, ...]
     mirrored: tuple[str, ...]
+    asked_for: tuple[AskedFor, ...]
+    noise: tuple[Finding, ...]
+    groups: ViewGroups | None
     poses: int
     change: ViewChange | None
     board: BoardShape | None

@@ -2,36 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.geometry import Array
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
-from neurocal_cli.verdict.limits import Limit as _Limit
+from neurocal_cli.verdict.findings import WORDS, Finding, image_diagonal, name_some, pixel_spread
+from neurocal_cli.verdict.given_parameters import AskedFor
+from neurocal_cli.verdict.limits import Limit
+from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
+from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
+from neurocal_cli.verdict.units_of_views import views_of_another_scale
+from neurocal_cli.verdict.view_groups import ViewGroups
 
-__all__ = ["Verdict", "reach_verdict"]
-
+__all__ = ["ERROR", "Verdict", "given_parameters", "reach_verdict"]
 
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and tests/test_verdict.py, in
 # which real and simulated good data are; the errors, angles and shares are what a user would call large.
-_ERROR = _Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
-_CONTRADICTION = _Limit(1.6, 2.3)
-_HELD_OUT = _Limit(1.3, 2.0)  # over the rms error
-_DISAGREEMENT = _Limit(6.0, 40.0)
-_CORRELATION = _Limit(0.5, 0.85)
-_UNCOVERED = _Limit(0.6, 0.9)  # share of the image
-_FLAT = _Limit(-20.0, -5.0)  # degrees of tilt, negative
-_ALPHA = _Limit(0.01, 0.05)  # std over the value
-_CENTRE = _Limit(0.01, 0.05)  # std over alpha
-_PROJECTION = _Limit(0.004, 0.05)  # worst std in the image over its diagonal
-_REJECTED = _Limit(0.02, 0.2)  # share of the points
+ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
+_CONTRADICTION = Limit(1.6, 2.3)
+_HELD_OUT = Limit(1.3, 2.0)  # over the rms error
+_DISAGREEMENT = Limit(6.0, 40.0)
+_CORRELATION = Limit(0.5, 0.85)
+_UNCOVERED = Limit(0.6, 0.9)  # share of the image
+_FLAT = Limit(-20.0, -5.0)  # degrees of tilt, negative
+_ALPHA = Limit(0.01, 0.05)  # std over the value
+_CENTRE = Limit(0.01, 0.05)  # std over alpha
+_PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
+_GIVEN = Limit(0.01, 0.05)  # difference over alpha; 100 cameras given truly stay below 5 std
+_TOLD_APART = 5.0  # standard deviations
+_SHALLOW = 0.1  # depth over distance: the focal length of 200 points is known to about 1 %
 _FEW_POSES = 10  # where views repeat them
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
+_NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
 _TOLD = 3.0  # standard deviations
-
-_Finding = tuple[int, str, str]  # grade, reason, advice
 
 
 def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
@@ -43,7 +51,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
     """
     findings = [f for f in _findings(calibration, evidence) if f[0] > 0]
     findings.sort(key=lambda f: -f[0])
-    word = ("good", "usable", "poor")[max((f[0] for f in findings), default=0)]
+    word = WORDS[max((f[0] for f in findings), default=0)]
     advice = tuple(dict.fromkeys(f[2] for f in findings if f[2]))
     projection = evidence.projection
     worst = float(np.nanmax(projection.std[1])) if projection is not None else float("nan")
@@ -61,26 +69,28 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
     return Verdict(word, tuple(f[1] for f in findings), advice, measures)
 
 
-def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[_Finding]:
+def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
     yield from common_errors(evidence, calibration.unit)
     yield from _errors(calibration, evidence)
+    yield from given_parameters(evidence.asked_for, calibration.intrinsics, calibration.std)
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
     yield from _parameters(calibration, evidence)
 
 
-def _errors(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
-    points = calibration.points
-    spread = float(np.sqrt(points.pixels.var(axis=0).sum()))
-    size = points.image_size or np.ptp(points.pixels, axis=0)
+def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    spread = pixel_spread(calibration.points)
     pairing = "check that each pixel belongs to its point, and that X,Y,Z are those of the true target"
     yield (
-        _ERROR.grade(e.rmse_px / float(np.hypot(*size))),
+        ERROR.grade(e.rmse_px / image_diagonal(calibration.points)),
         f"the rms reprojection error of {e.rmse_px:.3g} px is large",
         pairing,
     )
+    # A target that is too long in one direction makes views differ as well.
+    if e.groups is not None and e.rmse_px > 1e-4 * spread and not _oblong(calibration):
+        yield _of_several_cameras(e.groups)
     if e.rmse_px > 1e-4 * spread:
         yield (
             _CONTRADICTION.grade(e.contradiction),
@@ -101,7 +111,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
         yield (
             _DISAGREEMENT.grade(e.disagreement),
             f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} standard "
-            "deviations",
+            f"deviations{'' if e.groups is not None else _NO_SINGLE_CAMERA}",
             "expect errors larger than the standard deviations; look for a wrong view or a board that is not "
             "flat",
         )
@@ -113,17 +123,64 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
         )
 
 
-def _data(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
-    rejected = calibration.rejected
-    total = len(calibration.points) + len(rejected)
-    share = len(rejected) / total
-    yield (
-        max(_REJECTED.grade(share), int(bool(rejected.views))),
-        f"{len(rejected)} of {total} points are outliers and were left out",
-        "look at the points and views that are listed as outliers",
+def _of_several_cameras(groups: ViewGroups) -> Finding:
+    if groups.scale.size:
+        share = float(np.ptp(groups.scale))
+        return (
+            _ALPHA.grade(share),
+            f"the focal length changes from view to view, by {100 * share:.2g} % in all: the zoom or the "
+            "focus moved",
+            "calibrate one zoom and one focus at a time; switch autofocus off",
+        )
+    first, second = groups.cameras[:, [0, 2, 3, 4]]
+    apart = float(np.abs(first - second).max() / second[0])
+    asked = [f"alpha_u = {c[0]:.5g} px and the centre ({c[2]:.0f}, {c[3]:.0f})" for c in (first, second)]
+    return (
+        _ALPHA.grade(apart),
+        f"the images come from two cameras, or {_alternative(first, second)}: {name_some(groups.names[0])} "
+        f"ask for {asked[0]}, the others for {asked[1]}",
+        "calibrate these views and the others separately",
     )
+
+
+def _alternative(first: Array, second: Array) -> str:
+    """What else than two cameras these are, from alpha_u, alpha_v, u0 and v0."""
+    ratio = first / second
+    near = 2 * _GIVEN.good
+    if np.abs(ratio - ratio[0]).max() < near and abs(ratio[0] - 1) > near:
+        return "are of two sizes"
+    if np.abs(first - second[[1, 0, 3, 2]]).max() < near * second[0]:
+        return "u and v are exchanged in one part"
+    if np.abs(ratio[:2] - 1).max() < near:
+        return "one part is cropped or turned"
+    return "from two zooms"
+
+
+def given_parameters(
+    asked_for: tuple[AskedFor, ...], given: Intrinsics, std: Mapping[str, float]
+) -> Iterator[Finding]:
+    """Given parameters, of these standard deviations, that the points contradict."""
+    told = [a for a in asked_for if abs(a.found - a.given) > _TOLD_APART * np.hypot(a.std, std[a.name])]
+    if not told:
+        return
+    off = max(abs(a.found - a.given) for a in told) / given.alpha_u
+    texts = [f"{a.name} = {a.given:.5g} is given, but the points ask for {a.found:.5g} px" for a in told]
+    yield (
+        _GIVEN.grade(off),
+        ", ".join(texts),
+        "check that what is given is of the same camera at the same zoom, focus and image size",
+    )
+
+
+def _data(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
+    points = with_rejected(calibration)
+    yield from rejected_points(calibration)
+    yield from odd_pixels(points)
+    yield from points_given_twice(points)
+    yield from views_of_another_scale(calibration.points)
+    yield from e.noise
     if e.repeated:
-        yield 1, f"{_names(e.repeated)}: the rows are those of another view", "give each view once"
+        yield 1, f"{name_some(e.repeated)}: the rows are those of another view", "give each view once"
     views = len(calibration.views)
     if e.poses < min(views, _FEW_POSES):
         yield (
@@ -131,23 +188,15 @@ def _data(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
             f"{views} views show only {e.poses} different poses; views that repeat a pose count as one",
             "add views of other poses instead of more frames of the same ones",
         )
-    if e.scaled:
-        yield (
-            1,
-            f"{_names(e.scaled)}: the distances between the points differ from those in most views",
-            "check the unit of X,Y,Z and the size of the squares",
-        )
     if e.mirrored:
         yield (
             1,
-            f"{_names(e.mirrored)}: the target is mirrored",
+            f"{name_some(e.mirrored)}: the target is mirrored",
             "check the order of the points in these views",
         )
-    if e.coverage.outside:
-        yield 2, f"{e.coverage.outside} points lie outside the image", "correct image_size or the points"
 
 
-def _coverage(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
+def _coverage(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     if calibration.type in (3,):
         return
     cover = e.coverage
@@ -166,12 +215,20 @@ def _coverage(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
         )
 
 
-def _parameters(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
+def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     A, std, fixed = calibration.intrinsics, calibration.std, calibration.fixed
     more = "add views in which the target is near, tilted and fills the image"
     if "alpha_u" not in fixed:
         share = max(std["alpha_u"] / A.alpha_u, std["alpha_v"] / A.alpha_v)
         yield _ALPHA.grade(share), f"the std of the focal length is {100 * share:.2g} % of its value", more
+    off_centre = list(_off_centre(calibration))
+    if e.coverage.relief < _SHALLOW and (off_centre or std["alpha_u"] > _ALPHA.good * A.alpha_u):
+        yield (
+            1,
+            f"the target is only {100 * e.coverage.relief:.2g} % as deep as it is far away: too shallow to "
+            "tell the focal length and the centre",
+            "use a deeper target, or several views of it from different angles",
+        )
     if "u0" not in fixed:
         centre = max(std["u0"], std["v0"])
         yield _CENTRE.grade(centre / A.alpha_u), f"the std of the image centre is {centre:.2g} px", more
@@ -186,8 +243,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
     if calibration.type == 3:
         return
     ratio = A.alpha_u / A.alpha_v
-    told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
-    if abs(ratio - 1) > _OBLONG + told:
+    if _oblong(calibration):
         yield (
             1,
             f"the pixels are not square: alpha_u / alpha_v = {ratio:.3f}",
@@ -199,23 +255,31 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[_Finding]:
             f"the image axes are not perpendicular: theta = {np.degrees(A.theta):.1f} degrees",
             "hardly any camera has such axes; check the target, or give --no-skew",
         )
-    yield from _off_centre(calibration)
+    yield from off_centre
 
 
-def _off_centre(calibration: Calibration) -> Iterator[_Finding]:
+def _oblong(calibration: Calibration) -> bool:
+    """Whether the pixels are certainly not square."""
+    A, std = calibration.intrinsics, calibration.std
+    told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
+    return abs(A.alpha_u / A.alpha_v - 1) > _OBLONG + told
+
+
+def _off_centre(calibration: Calibration) -> Iterator[Finding]:
     A, size = calibration.intrinsics, calibration.image_size
     if size is None or ("u0" in calibration.fixed and calibration.type != 2):
         return
     off = np.abs(np.array([A.u0, A.v0]) - (np.array(size) - 1) / 2)
     uncertain = _TOLD * np.array([calibration.std["u0"], calibration.std["v0"]])
-    if (off > _OFF_CENTRE * np.array(size) + uncertain).any():
+    if (off > np.array(size) / 2).any():
+        yield (
+            2,
+            f"the image centre ({A.u0:.0f}, {A.v0:.0f}) lies outside the image",
+            "add views from other angles, or give the centre with --type 2; check image_size",
+        )
+    elif (off > _OFF_CENTRE * np.array(size) + uncertain).any():
         yield (
             1,
             f"the image centre ({A.u0:.0f}, {A.v0:.0f}) is far from the middle of the image",
             "a cropped image has such a centre; otherwise check image_size and the order of u and v",
         )
-
-
-def _names(names: tuple[str, ...]) -> str:
-    shown = ", ".join(names[:3])
-    return shown + (f" and {len(names) - 3} more" if len(names) > 3 else "")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -165,6 +166,73 @@ def with_poses(points: Correspondences, order: list[int], scale: float = 1.0) ->
     return Input(points, {"type": 4, "extrinsics": given})
 
 
+def with_sigma(points: Correspondences, sigma: np.ndarray) -> Correspondences:
+    return replace(points, covariance=np.column_stack([sigma**2, 0 * sigma, sigma**2]))
+
+
+def in_part(points: Correspondences, which: range | list[int], pixels: np.ndarray) -> Correspondences:
+    """Other pixels in some views."""
+    return moved(points, pixels=np.where(in_views(points, which)[:, None], pixels, points.pixels))
+
+
+def of_two(second: Intrinsics) -> Correspondences:
+    """The first five views of one camera, the others of another."""
+    cameras = [CAMERA] * 5 + [second] * 5
+    parts = [
+        seen(board(), [pose], camera.A, 1 + k).pixels
+        for k, (pose, camera) in enumerate(zip(poses(10, 1), cameras, strict=True))
+    ]
+    return moved(flat(), pixels=np.concatenate(parts))
+
+
+def by_rolling_shutter(points: Correspondences, px: float, rng: np.random.Generator) -> Correspondences:
+    """Each view moves by so many pixels while its lines are read."""
+    way = rng.normal(size=(points.n_views, 2))
+    way /= np.linalg.norm(way, axis=1)[:, None]
+    late = points.pixels[:, 1:] / SIZE[1] - 0.5
+    return moved(points, pixels=points.pixels + px * late * way[points.view_index])
+
+
+def shallow(depth: float) -> Correspondences:
+    """One view of points in a slab, a metre away."""
+    rng = np.random.default_rng(3)
+    world = rng.uniform([-200, -150, 0], [200, 150, depth], (200, 3))
+    pose = Pose.from_euler(0.2, -0.3, 0.1, np.array([0, 0, 1000.0]))
+    pixels = project(Intrinsics(1600.0, 1600.0, 800.0, 600.0, np.pi / 2).A, pose, world)[0]
+    return Correspondences(world, pixels + 0.2 * rng.normal(size=(200, 2)), image_size=(1600, 1200))
+
+
+def mistyped(points: Correspondences, places: list[int], by: list[float]) -> Correspondences:
+    """Some points of the board have a wrong place in its file."""
+    world = points.world.copy()
+    world[np.isin(np.arange(len(world)) % len(board()), places)] += by
+    return moved(points, world)
+
+
+def paired_late(points: Correspondences, which: range | list[int], by: int = 1) -> Correspondences:
+    """Pixels stand some rows too low."""
+    pixels = points.pixels.copy()
+    for view in which:
+        rows = np.flatnonzero(points.view_index == view)
+        pixels[rows] = pixels[np.roll(rows, by)]
+    return moved(points, pixels=pixels)
+
+
+def through_fisheye(points: Correspondences) -> np.ndarray:
+    x = (points.pixels - CAMERA.A[:2, 2]) / 600.0
+    r = np.hypot(*x.T)
+    return x * (np.arctan(r) / r)[:, None] * 600.0 + CAMERA.A[:2, 2]
+
+
+def of_points_twice(points: Correspondences) -> Correspondences:
+    """A third of one view's points have a second row with other pixels."""
+    rows = np.flatnonzero(points.view_index == 3)[:30]
+    both = points.select(np.concatenate([np.arange(len(points)), rows]))
+    pixels = both.pixels.copy()
+    pixels[len(points) :] += 25
+    return moved(both, pixels=pixels)
+
+
 FLAT: dict[str, Spoiler] = {
     "pairs shuffled in every view": lambda p, rng: permuted(p, range(10), rng),
     "pairs shuffled in one view of ten": lambda p, rng: permuted(p, [3], rng),
@@ -234,6 +302,72 @@ FLAT: dict[str, Spoiler] = {
     ),
     "type 4 with poses of other views": lambda p, rng: with_poses(p, [*range(1, 10), 0]),
     "type 4 with poses in cm": lambda p, rng: with_poses(p, list(range(10)), 0.1),
+    "one view in inches": lambda p, rng: scaled(p, [1 / 25.4] * 3, [3]),
+    "one view in cm": lambda p, rng: scaled(p, [0.1] * 3, [3]),
+    "a third of the views in metres": lambda p, rng: scaled(p, [0.001] * 3, range(3)),
+    "half of the views of a board with larger squares": lambda p, rng: scaled(p, [1.2] * 3, range(5)),
+    "half of the views with squares too long along X": lambda p, rng: scaled(p, [1.1, 1, 1], range(5)),
+    "one point far outside the image": lambda p, rng: moved(
+        p, pixels=np.where(np.arange(len(p))[:, None] == 500, [700.0, 200.0], p.pixels)
+    ),
+    "sigma of one view ten times too small": lambda p, rng: with_sigma(
+        p, np.where(in_views(p, [3]), 0.02, 0.2)
+    ),
+    "sigma of half of the views ten times too small": lambda p, rng: with_sigma(
+        p, np.where(in_views(p, range(5)), 0.02, 0.2)
+    ),
+    "sigmas at random": lambda p, rng: with_sigma(p, 0.2 * 10 ** rng.uniform(-1, 1, len(p))),
+    "type 3 with a centre 15 px off": lambda p, rng: Input(
+        p, {"type": 3, "intrinsics": Intrinsics(600.0, 600.0, 333.0, 243.0, np.pi / 2)}
+    ),
+    "type 3 with the camera of half the size": lambda p, rng: Input(
+        p, {"type": 3, "intrinsics": Intrinsics(300.0, 300.0, 159.0, 121.5, np.pi / 2)}
+    ),
+    "type 3 with u0 and v0 exchanged": lambda p, rng: Input(
+        p, {"type": 3, "intrinsics": Intrinsics(600.0, 600.0, 243.0, 318.0, np.pi / 2)}
+    ),
+    "type 2 with u0 and v0 exchanged": lambda p, rng: Input(p, {"type": 2, "image_center": (243.0, 318.0)}),
+    "type 4 with poses from camera to world": lambda p, rng: Input(p, {"type": 4, "extrinsics": {
+        f"view{k:02d}": Pose(q.R.T, -q.R.T @ q.t) for k, q in enumerate(poses(10, 1))
+    }}),
+    "left and right images mixed": lambda p, rng: of_two(Intrinsics(612.0, 612.0, 330.0, 231.0, np.pi / 2)),
+    "half of the images through another lens": lambda p, rng: in_part(p, range(5), through_lens([-0.1])),
+    "one image without its lens": lambda p, rng: in_part(p, [3], through_lens([-0.2])),
+    "rolling shutter, 8 px": lambda p, rng: by_rolling_shutter(p, 8.0, rng),
+    "a target 15 mm deep a metre away": lambda p, rng: shallow(15.0),
+    "one point of the board mistyped": lambda p, rng: mistyped(p, [40], [6.0, 0, 0]),
+    "four points of the board out of its plane": lambda p, rng: mistyped(p, [8, 30, 52, 70], [0, 0, 8.0]),
+    "pixels one row late in every view": lambda p, rng: paired_late(p, range(10)),
+    "pixels five rows late in one view": lambda p, rng: paired_late(p, [3], 5),
+    "one view blurred": lambda p, rng: in_part(p, [3], p.pixels + 3 * rng.normal(size=p.pixels.shape)),
+    "half of the views blurred": lambda p, rng: in_part(
+        p, range(5), p.pixels + 3 * rng.normal(size=p.pixels.shape)
+    ),
+    "motion blur along u": lambda p, rng: moved(
+        p, pixels=p.pixels + [3, 0] * rng.normal(size=(len(p), 1))
+    ),
+    "a fisheye, called a pinhole": lambda p, rng: Input(
+        moved(p, pixels=through_fisheye(p)), {"distortion": "none"}
+    ),
+    "points of one view given twice": lambda p, rng: of_points_twice(p),
+    "u and v swapped in one view": lambda p, rng: in_part(p, [3], p.pixels[:, ::-1]),
+    "u and v swapped in half of the views": lambda p, rng: in_part(p, range(5), p.pixels[:, ::-1]),
+    "X and Y swapped in one view": lambda p, rng: moved(
+        p, np.where(in_views(p, [3])[:, None], p.world[:, [1, 0, 2]], p.world)
+    ),
+    "one image flipped": lambda p, rng: in_part(p, [3], [639, 0] + p.pixels * [-1, 1]),
+    "one image upside down": lambda p, rng: in_part(p, [3], [0, 479] + p.pixels * [1, -1]),
+    "pixels clipped to a window": lambda p, rng: moved(p, pixels=np.clip(p.pixels, [120, 80], [520, 400])),
+    "pixels rounded to whole numbers": lambda p, rng: moved(p, pixels=np.round(p.pixels)),
+    "interlaced: v at half resolution": lambda p, rng: moved(p, pixels=p.pixels * [1, 0.5]),
+    "one image interlaced": lambda p, rng: in_part(p, [3], p.pixels * [1, 0.5]),
+    "one image at half size": lambda p, rng: in_part(p, [3], p.pixels / 2),
+    "one image cropped": lambda p, rng: in_part(p, [3], p.pixels - [60, 40]),
+    "pixels from 0 to 1": lambda p, rng: moved(p, pixels=p.pixels / SIZE),
+    "pixels measured from the middle": lambda p, rng: moved(p, pixels=p.pixels - [320, 240]),
+    "two views only": lambda p, rng: p.select(p.view_index < 2),
+    "one view of a flat board": lambda p, rng: p.select(p.view_index < 1),
+    "three points a view": lambda p, rng: p.select(np.arange(len(p)) % 93 < 3),
     "all points on one line": lambda p, rng: moved(p, world=p.world * [1, 0, 0]),
     "world coordinates all zero": lambda p, rng: moved(p, world=0 * p.world),
     "the same pixel everywhere": lambda p, rng: moved(p, pixels=0 * p.pixels + 100.0),
@@ -260,14 +394,185 @@ def leaning(world: np.ndarray) -> np.ndarray:
     return np.column_stack([0 * world[:, 0], 0.1 * world[:, 2], 0 * world[:, 2]])
 
 
-def outcome(name: str) -> tuple[str, str]:
-    """What becomes of a wrong input: "refused", "good", "usable" or "poor", and the first reason."""
+# What the reason has to name: a part of one of the reasons, or of the message of a refusal.
+CAUSES: dict[str, str] = {
+    "pairs shuffled in every view": "pixels do not match the points",
+    "pairs shuffled in one view of ten": "view03 (its pixels do not match",
+    "pairs shuffled in four views of ten": "view00 (its pixels do not match",
+    "one view mirrored": "view04: the target is mirrored",
+    "half of the views mirrored": "the target is mirrored",
+    "columns and rows swapped in reading": "pixels do not match the points",
+    "rows read to and fro": "in most views",
+    "u and v swapped": "u and v, were exchanged",
+    "squares 10 % too long along X": "not square",
+    "squares 5 % too long along Y": "not square",
+    "X in mm, Y in cm": "not square",
+    "half of the views in inches": "inches and millimetres mixed",
+    "one view with another square": "view02: the points lie 1.5 times",
+    "two cameras mixed": "two cameras",
+    "two cameras mixed, 5 % apart": "two cameras",
+    "zoom changing from view to view": "the focal length changes from view to view",
+    "half of the images cropped": "one part is cropped",
+    "half of the images at half size": "of two sizes",
+    "one image of another zoom": "view09 (it asks for another zoom",
+    "all views alike": "parallel",
+    "one view copied ten times": "those of another view",
+    "every view given twice": "rows are those of another view",
+    "every row given twice": "rows are those of another view",
+    "boards all parallel": "parallel",
+    "image size too small": "outside the image: they reach to",
+    "image size too large": "cover 25 % of the image",
+    "image size turned": "width and height",
+    "half of the points shifted by a square": "outliers",
+    "half of the points of one view shifted by a square": "in view06",
+    "board bent by 4 mm": "target",
+    "Z full of noise": "X,Y,Z",
+    "half of the pixels anywhere": "of the points are outliers",
+    "a fifth of the pixels anywhere": "of 930 points are outliers",
+    "noise of 6 px": "noise",
+    "pixels rounded to 8 px": "rounded to multiples of 8 px",
+    "two images under one name": "two images under one name",
+    "boards in a corner of the image only": "cover 3 % of the image",
+    "two tilts of three degrees": "parallel",
+    "strong distortion, called a pinhole": "distortion model",
+    "type 2 with a wrong centre": "u0 = 420 is given",
+    "type 3 with the camera of another zoom": "alpha_u = 720 is given",
+    "type 4 with poses of other views": "the poses",
+    "type 4 with poses in cm": "given pose of view",
+    "all points on one line": "on one line",
+    "world coordinates all zero": "the same world point",
+    "the same pixel everywhere": "all pixels u,v are the same",
+    "one view in inches": "view03: the points lie 25.4 times less far apart",
+    "one view in cm": "view03: the points lie 10 times less far apart",
+    "a third of the views in metres": "metres and millimetres mixed",
+    "half of the views of a board with larger squares": "1.2 times",
+    "half of the views with squares too long along X": "target of another shape",
+    "one point far outside the image": "1 point lies outside",
+    "sigma of one view ten times too small": "view03: the stated sigma is",
+    "sigma of half of the views ten times too small": "the stated sigma is",
+    "sigmas at random": "the stated sigmas",
+    "type 3 with a centre 15 px off": "u0 = 333 is given",
+    "type 3 with the camera of half the size": "alpha_u = 300 is given",
+    "type 3 with u0 and v0 exchanged": "u0 = 243 is given",
+    "type 2 with u0 and v0 exchanged": "v0 = 318 is given",
+    "type 4 with poses from camera to world": "it must map world to camera",
+    "left and right images mixed": "two cameras",
+    "half of the images through another lens": "two cameras",
+    "one image without its lens": "view03 (it asks for another camera",
+    "rolling shutter, 8 px": "rolling shutter",
+    "a target 15 mm deep a metre away": "too shallow",
+    "one point of the board mistyped": "point p40 in most views",
+    "four points of the board out of its plane": "in most views",
+    "pixels one row late in every view": "outliers",
+    "pixels five rows late in one view": "view03 (",
+    "one view blurred": "blurred",
+    "half of the views blurred": "blurred",
+    "motion blur along u": "motion blur",
+    "a fisheye, called a pinhole": "distortion model",
+    "points of one view given twice": "view03: 30 points are given twice",
+    "u and v swapped in one view": "view03 (its u and v are exchanged)",
+    "u and v swapped in half of the views": "u and v are exchanged",
+    "X and Y swapped in one view": "view03: the target is mirrored",
+    "one image flipped": "view03: the target is mirrored",
+    "one image upside down": "view03: the target is mirrored",
+    "pixels clipped to a window": "they are clipped",
+    "pixels rounded to whole numbers": "rounded to whole numbers",
+    "interlaced: v at half resolution": "alpha_u / alpha_v = 2.0",
+    "one image interlaced": "view03 (its v is of half resolution",
+    "one image at half size": "view03 (its image is of half the size",
+    "one image cropped": "view03 (it asks for another camera or crop",
+    "pixels from 0 to 1": "normalised coordinates",
+    "pixels measured from the middle": "measured from its middle",
+    "two views only": "give 3 views",
+    "one view of a flat board": "one view of one plane",
+    "three points a view": "points",
+    "folded target: mirrored": "mirrored",
+    "folded target: X and Y swapped": "mirrored",
+    "folded target: Z turned round": "mirrored",
+    "folded target: the fold at 84 degrees": "target of another shape",
+    "folded target: one plane a square off": "one plane",
+    "folded target: v upwards": "v downwards",
+    "folded target: u,v swapped in one view": "view01",
+    "folded target: squares of one plane 10 % larger": "squares",
+}
+
+# Those of which no reason names the cause yet.
+UNNAMED = frozenset(
+    {
+        "noise of 6 px",
+        "four points of the board out of its plane",
+        "folded target: one plane a square off",
+        "folded target: squares of one plane 10 % larger",
+    }
+)
+# Those that take a second and more, as all explanations are tried.
+SLOW = frozenset(
+    {
+        "X in mm, Y in cm",
+        "a fifth of the pixels anywhere",
+        "board bent by 4 mm",
+        "columns and rows swapped in reading",
+        "folded target: one plane a square off",
+        "folded target: squares of one plane 10 % larger",
+        "half of the images at half size",
+        "half of the pixels anywhere",
+        "half of the points shifted by a square",
+        "half of the views blurred",
+        "half of the views with squares too long along X",
+        "motion blur along u",
+        "one image at half size",
+        "one image cropped",
+        "one image interlaced",
+        "one image of another zoom",
+        "pairs shuffled in every view",
+        "pairs shuffled in four views of ten",
+        "pairs shuffled in one view of ten",
+        "pixels clipped to a window",
+        "pixels five rows late in one view",
+        "pixels one row late in every view",
+        "pixels rounded to 8 px",
+        "rows read to and fro",
+        "type 3 with a centre 15 px off",
+        "type 3 with the camera of another zoom",
+        "type 3 with the camera of half the size",
+        "type 3 with u0 and v0 exchanged",
+        "u and v swapped in half of the views",
+        "zoom changing from view to view",
+    }
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What becomes of a wrong input.
+
+    Attributes
+    ----------
+    word : str
+        "refused", "good", "usable" or "poor".
+    reasons : tuple of str
+        All that speaks against it, or the message of the refusal.
+    named : str
+        The reason that names the cause; empty where none does.
+    """
+
+    word: str
+    reasons: tuple[str, ...]
+    named: str
+
+
+@cache
+def outcome(name: str) -> Outcome:
+    """Calibrate a wrong input."""
     base, spoil = (flat(), FLAT[name]) if name in FLAT else (folded(), FOLDED[name])
     try:
         spoilt = spoil(base, np.random.default_rng(7))
         given = spoilt if isinstance(spoilt, Input) else Input(spoilt, {})
         found: Calibration = calibrate(given.points, **given.options)
     except NeurocalError as error:
-        return "refused", str(error)
-    verdict = assess(found)
-    return verdict.word, (verdict.reasons or ("",))[0]
+        word, reasons = "refused", (str(error),)
+    else:
+        verdict = assess(found)
+        word, reasons = verdict.word, verdict.reasons
+    named = next((reason for reason in reasons if CAUSES[name] in reason), "")
+    return Outcome(word, reasons, named)

@@ -1,0 +1,124 @@
+"""What an image shows in place of a chessboard: a board of markers, or a grid of circles."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["other_target"]
+
+# Repeated by tests/test_other_targets.py: none is seen in noise, in blurred boards and in the sample images.
+_LONGEST = 1000  # px of the image that is looked at; markers and circles of a target are no smaller
+_MARKERS = 3  # of one family; noise shows one at times
+_WINDOW = 23  # px
+_FAMILIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_APRILTAG_36h11")
+_CIRCLES = 16
+_OUTLINE = 16  # px around
+_ELLIPTIC = 0.05  # deviation from an ellipse over its radius; a square's is 0.1
+_EVEN = 0.5  # spread of the distances of neighbours over their median
+_ALIKE = 1.0  # logarithm of the ratio of areas
+_SHARP = 1.25  # times the area at half brightness within a quarter: else a blurred square may be a circle
+_WANTED = "neurocal takes a chessboard; `neurocal detect --help` says which"
+
+
+def other_target(grey: NDArray[np.generic]) -> str:
+    """Say what other target an image shows.
+
+    Parameters
+    ----------
+    grey : (height, width) array
+        Of 8 or 16 bits.
+
+    Returns
+    -------
+    str
+        A message, empty where nothing is recognised.
+    """
+    small = _small(grey)
+    if _shows_markers(small):
+        return f"the image shows markers (ChArUco, ArUco or AprilTag), no plain chessboard; {_WANTED}"
+    if _shows_circles(small):
+        return f"the image shows a grid of circles, no chessboard; {_WANTED}"
+    return ""
+
+
+def _small(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
+    scale = min(1.0, _LONGEST / max(grey.shape))
+    if scale < 1:
+        grey = cv2.resize(np.ascontiguousarray(grey), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    if grey.dtype == np.uint8:
+        return np.ascontiguousarray(grey, dtype=np.uint8)
+    brightest = max(int(grey.max(initial=1)), 1)
+    return (grey.astype(float) * (255.0 / brightest)).astype(np.uint8)
+
+
+def _shows_markers(grey: NDArray[np.uint8]) -> bool:
+    aruco = getattr(cv2, "aruco", None)  # older builds of OpenCV come without
+    if aruco is None or not hasattr(aruco, "ArucoDetector"):
+        return False
+    how = aruco.DetectorParameters()
+    how.adaptiveThreshWinSizeMin = how.adaptiveThreshWinSizeMax = (
+        _WINDOW  # one is quick, and enough for a few
+    )
+    for family in _FAMILIES:
+        detector = aruco.ArucoDetector(aruco.getPredefinedDictionary(getattr(aruco, family)), how)
+        _, ids, _ = detector.detectMarkers(grey)
+        if ids is not None and len(np.unique(ids)) >= _MARKERS:
+            return True
+    return False
+
+
+def _shows_circles(grey: NDArray[np.uint8]) -> bool:
+    if grey.size < _CIRCLES * _OUTLINE:
+        return False
+    return any(_is_grid(image) for image in (grey, 255 - grey))
+
+
+def _is_grid(image: NDArray[np.uint8]) -> bool:
+    """Whether dark ellipses are alike, evenly spaced and sharp."""
+    level, _ = cv2.threshold(image, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    darkest, brightest = np.quantile(image, [0.02, 0.98])
+    found = _ellipses(image, level)
+    if len(found) < _CIRCLES:
+        return False
+    apart = np.hypot(*(found[:, None, :2] - found[None, :, :2]).T)
+    np.fill_diagonal(apart, np.inf)
+    low, middle, high = np.quantile(apart.min(axis=1), [0.1, 0.5, 0.9])
+    if high - low > _EVEN * middle:
+        return False
+    near = 0.2 * middle
+    inner = _matched(found, _ellipses(image, 0.5 * (level + darkest)), near)
+    outer = _matched(found, _ellipses(image, 0.5 * (level + brightest)), near)
+    both = np.isfinite(inner) & np.isfinite(outer)
+    if np.count_nonzero(both) < _CIRCLES:
+        return False
+    return float(np.median(outer[both] / inner[both])) < _SHARP
+
+
+def _matched(found: NDArray[np.float64], others: NDArray[np.float64], near: float) -> NDArray[np.float64]:
+    """(n,) area of the other ellipse at the same place as each; nan where there is none."""
+    if not len(others):
+        return np.full(len(found), np.nan)
+    apart = np.hypot(*(found[:, None, :2] - others[None, :, :2]).T).T
+    return np.where(apart.min(axis=1) < near, others[apart.argmin(axis=1), 2], np.nan)
+
+
+def _ellipses(image: NDArray[np.uint8], level: float) -> NDArray[np.float64]:
+    """(n, 3) centres and areas of the dark ellipses, those of the usual size."""
+    outlines, _ = cv2.findContours((image < level).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)
+    found = []
+    for outline in outlines:
+        if len(outline) < _OUTLINE:
+            continue
+        (x, y), (a, b), turn = cv2.fitEllipse(outline)
+        if not min(a, b) > 0:
+            continue
+        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        across, along = ((outline[:, 0] - [x, y]) @ np.array([[c, -s], [s, c]]) / [a / 2, b / 2]).T
+        radius = np.hypot(across, along)
+        if np.abs(radius.mean() - 1) < _ELLIPTIC and radius.std() < _ELLIPTIC:
+            found.append((x, y, cv2.contourArea(outline)))
+    ellipses = np.array(found).reshape(-1, 3)
+    usual = np.median(ellipses[:, 2]) if len(ellipses) else 0.0
+    return ellipses[np.abs(np.log(np.maximum(ellipses[:, 2], 1e-9) / max(usual, 1e-9))) < _ALIKE]

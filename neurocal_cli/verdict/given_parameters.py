@@ -1,0 +1,78 @@
+"""Whether the points agree with intrinsic parameters that were given, not estimated.
+
+Poses take a wrong focal length or centre upon themselves, so that the error hardly grows: a board that seems
+too large is moved away. What the points themselves ask for is found with these parameters free.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+
+__all__ = ["AskedFor", "asked_for"]
+
+_NAMES = ("alpha_u", "alpha_v", "u0", "v0")
+_PLACES = (0, 2, 3, 4)  # among A's entries
+_THETA = 1  # stays as it is given
+_STEPS = 20
+_WELL_POSED = 1e-7  # smallest eigenvalue of a normal matrix of unit diagonal
+
+
+@dataclass(frozen=True)
+class AskedFor:
+    """A given parameter as the points would have it.
+
+    Attributes
+    ----------
+    name : str
+    given, found, std : float [px]
+    """
+
+    name: str
+    given: float
+    found: float
+    std: float
+
+
+def asked_for(
+    views: Views, state: CameraState, given: frozenset[str], free_poses: bool
+) -> tuple[AskedFor, ...]:
+    """Find what the points ask for in place of the focal lengths and the centre that are given.
+
+    Parameters
+    ----------
+    views : Views
+    state : CameraState
+        In normalised units, at its minimum.
+    given : frozenset of str
+        Names of the parameters that were not estimated.
+    free_poses : bool
+
+    Returns
+    -------
+    tuple of AskedFor
+        None where nothing is given, or where the points do not tell.
+    """
+    if given.isdisjoint(_NAMES):
+        return ()
+    free = np.arange(5 + state.k.shape[-1]) < 5
+    free[_THETA] = "theta" not in given
+    adjusted = adjust(views.batches, state, free, free_poses, _STEPS)
+    cov = covariance(adjusted.normal, free, free_poses, views.n_equations)
+    if not cov.smallest > _WELL_POSED:
+        return ()
+    std = np.zeros(5)
+    std[free[:5]] = np.sqrt(np.diagonal(cov.entries))
+    px, centre = views.pixel_scale, np.array([0, 0, 0, *views.pixel_centre])
+    before, after = px * state.entries[0] + centre, px * adjusted.state.entries[0] + centre
+    return tuple(
+        AskedFor(name, float(before[k]), float(after[k]), float(px * std[k]))
+        for name, k in zip(_NAMES, _PLACES, strict=True)
+        if name in given and np.isfinite(std[k])
+    )

@@ -1,0 +1,95 @@
+"""The verdict on a calibration where it meets points that it was not calibrated from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.verdict.assessment import gather_evidence
+from neurocal_cli.verdict.findings import WORDS, Finding, image_diagonal, pixel_spread
+from neurocal_cli.verdict.limits import Limit
+from neurocal_cli.verdict.rules import ERROR, given_parameters
+
+__all__ = ["GivenPoints", "judged_by_points"]
+
+# Times the error of the calibration. Good cameras stay below on 200 sets of new views of their own:
+# tests/test_given_points.py.
+_LARGER = Limit(1.5, 4.0)
+_CHANCE = 3.0  # standard deviations of an rms error of so few points
+_ROUNDING = 1e-4  # of the pixels' spread: an error below is as good as none
+
+
+@dataclass(frozen=True)
+class GivenPoints:
+    """The error of a calibration on points that were given.
+
+    Attributes
+    ----------
+    rmse_px : float [px]
+        nan where no point lies in front of the camera.
+    n_points, n_behind : int
+    fit : Calibration or None
+        The views among them whose poses were fitted, with the camera given.
+    """
+
+    rmse_px: float
+    n_points: int
+    n_behind: int
+    fit: Calibration | None = None
+
+
+def judged_by_points(verdict: Verdict, calibration: Calibration, given: GivenPoints) -> Verdict:
+    """Add to a verdict what the error on given points says.
+
+    Parameters
+    ----------
+    verdict : Verdict
+        Of the calibration.
+    calibration : Calibration
+    given : GivenPoints
+
+    Returns
+    -------
+    Verdict
+        No better than before.
+    """
+    findings = [_error(verdict, calibration, given)]
+    if given.fit is not None:
+        asked_for = gather_evidence(given.fit).asked_for
+        findings += given_parameters(asked_for, calibration.intrinsics, calibration.std)
+    findings = sorted((f for f in findings if f[0] > 0), key=lambda f: -f[0])
+    if not findings:
+        return verdict
+    grades, reasons, advice = zip(*findings, strict=True)
+    return replace(
+        verdict,
+        word=WORDS[max(*grades, WORDS.index(verdict.word))],
+        reasons=(*reasons, *verdict.reasons),
+        advice=tuple(dict.fromkeys((*advice, *verdict.advice))),
+    )
+
+
+def _error(verdict: Verdict, calibration: Calibration, given: GivenPoints) -> Finding:
+    error, seen = given.rmse_px, given.n_points - given.n_behind
+    if 2 * seen < given.n_points:
+        return (
+            2,
+            f"{given.n_behind} of the {given.n_points} given points lie behind the camera",
+            "check the signs of X,Y,Z, and that the points are of these views",
+        )
+    # With few points of its own a calibration errs less on them than on any others.
+    held_out = verdict.measures.get("held_out_px", np.nan)
+    own = float(np.fmax(calibration.rmse_px, held_out))
+    own = max(own, _ROUNDING * pixel_spread(calibration.points))
+    # Two coordinates a point: the relative standard deviation of an rms error is 1 / sqrt(2 n).
+    ratio = error / (own * (1 + _CHANCE / np.sqrt(4 * seen)))
+    grade = max(_LARGER.grade(ratio), ERROR.grade(error / image_diagonal(calibration.points)))
+    return (
+        grade,
+        f"the rms error of {error:.3g} px on the given points is {error / own:.2g} times the "
+        f"{own:.3g} px of the calibration",
+        "check that the given points are of the same camera at the same zoom and focus; look at the views "
+        "with the largest errors",
+    )

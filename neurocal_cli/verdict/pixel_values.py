@@ -1,0 +1,126 @@
+"""Pixel coordinates that no measurement gives: rounded, clipped, normalised, outside of their image."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.findings import Finding, name_some
+
+__all__ = ["odd_pixels", "points_given_twice"]
+
+_FEWEST = 20  # points of which all are whole numbers: not by chance
+_ALIKE = 6  # points at the very same outermost coordinate, and this share of all
+_ALIKE_SHARE = 0.01
+_BESIDE = 1.0  # px outside of the image: the extent of a point's surroundings
+_SOME = 0.01  # share of the points that may lie outside, as a few wrong ones
+_NORMALISED = 2.0  # no image is that small
+
+
+def odd_pixels(points: Correspondences) -> Iterator[Finding]:
+    """Name what is odd about the pixels as numbers."""
+    rows = np.unique(np.column_stack([points.pixels, points.world]), axis=0)  # copies count once
+    pixels = rows[:, :2]
+    if np.abs(pixels).max() < _NORMALISED:
+        yield (
+            2,
+            "all u,v lie between -2 and 2: they are normalised coordinates, not pixels",
+            "multiply u,v by the width and the height of the image",
+        )
+        return
+    step = _step(pixels)
+    if step:
+        to = "whole numbers" if step == 1 else f"multiples of {step} px"
+        yield (
+            1,
+            f"the pixels are rounded to {to}",
+            "give sub-pixel coordinates, as `neurocal detect` does",
+        )
+    else:
+        yield from _clipped(pixels)
+    yield from _outside(points)
+
+
+def _step(pixels: Array) -> int:
+    """What all coordinates are multiples of; 0 where they are not whole numbers."""
+    if len(pixels) < _FEWEST or np.abs(pixels).max() > 1e9 or (pixels != np.round(pixels)).any():
+        return 0
+    return int(np.gcd.reduce(pixels.astype(np.int64), axis=None))
+
+
+def _clipped(pixels: Array) -> Iterator[Finding]:
+    enough = max(_ALIKE, _ALIKE_SHARE * len(pixels))
+    for name, values in zip("uv", pixels.T, strict=True):
+        for limit in (values.min(), values.max()):
+            count = np.count_nonzero(values == limit)
+            if count >= enough:
+                yield (
+                    1,
+                    f"{count} points have the very same outermost {name} = {limit:.6g}: they are clipped",
+                    "leave out points that are not seen",
+                )
+
+
+def _outside(points: Correspondences) -> Iterator[Finding]:
+    if points.image_size is None:
+        return
+    size = np.array(points.image_size, dtype=float)
+    count = int(_beyond(points.pixels, size).sum())
+    if count == 0:
+        return
+    few = count <= _SOME * len(points)
+    text = f"{count} points lie outside the image" if count > 1 else "1 point lies outside the image"
+    if few:
+        yield 1, text, "correct or leave out these points"
+    elif not _beyond(points.pixels, size[::-1]).any():
+        yield (
+            2,
+            f"{text}, as if its width and height, or u and v, were exchanged",
+            "check the order of u and v and of image_size",
+        )
+    elif not _beyond(points.pixels + size / 2, size).any():
+        yield (
+            2,
+            f"{text}, as if u,v were measured from its middle",
+            "measure u,v from the first pixel of the image",
+        )
+    else:
+        u, v = points.pixels.max(axis=0)
+        yield 2, f"{text}: they reach to ({u:.0f}, {v:.0f})", "correct image_size or the points"
+
+
+def _beyond(pixels: Array, size: Array) -> NDArray[np.bool_]:
+    beyond = (pixels < -0.5 - _BESIDE) | (pixels > size - 0.5 + _BESIDE)
+    return np.asarray(beyond.any(axis=1))
+
+
+def points_given_twice(points: Correspondences) -> Iterator[Finding]:
+    """Name views that have pixels of several images, or several pixels of the same point."""
+    table = np.column_stack([points.view_index, points.world])
+    _, first = np.unique(table, axis=0, return_index=True)
+    rows = np.unique(np.column_stack([table, points.pixels]), axis=0)
+    _, different = np.unique(rows[:, :4], axis=0, return_counts=True)
+    view = points.view_index[first]
+    n_twice = np.bincount(view, different > 1, points.n_views)
+    n_points = np.bincount(view, minlength=points.n_views)
+    names = np.array(points.view_names)
+    whole = 2 * n_twice > n_points
+    if whole.any():
+        yield (
+            1,
+            f"{name_some(names[whole])}: most points are given twice with different pixels, as of two images "
+            "under one name",
+            "give each image a name of its own",
+        )
+    some = (n_twice > 0) & ~whole
+    if some.any():
+        yield (
+            1,
+            f"{name_some(names[some])}: {int(n_twice[some].sum())} points are given twice with different "
+            "pixels",
+            "check the ids and X,Y,Z of these points",
+        )

@@ -1,0 +1,48 @@
+"""Whether the residuals bear out the standard deviations that the points came with."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.common_noise import common_share, measured
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.findings import Finding, name_some
+
+__all__ = ["stated_noise"]
+
+_SHARE = 0.5  # of the noise that is the same for all points, whatever they state
+_FACTOR = 2.0  # between views whose sigma is too small and others; a std of 12 points is known to a fifth
+_FEWEST = 12
+
+
+def stated_noise(points: Correspondences, residuals: Array) -> Iterator[Finding]:
+    """Name views whose sigma is too small, and sigmas that say nothing of the errors.
+
+    Parameters
+    ----------
+    points : Correspondences
+        Covariances that a detector measured are not judged: `reweighting` does.
+    residuals : (N, 2) array [px]
+    """
+    covariance = points.covariance
+    if covariance is None or measured(covariance) or not (residuals**2).sum() > 0:
+        return
+    if common_share(covariance, residuals) < _SHARE:
+        return
+    V = points.n_views
+    counts = np.bincount(points.view_index, minlength=V)
+    squared = (residuals**2).sum(axis=1) / (2 * covariance[:, 0])
+    level = np.sqrt(np.bincount(points.view_index, squared, V) / counts)
+    order = np.sort(level)
+    step = int(np.argmax(order[1:] / order[:-1])) if V > 1 else 0  # the largest gap between two views
+    small = (level > order[step]) & (counts >= _FEWEST)
+    advice = "state sigma as it is in px, or leave the column out: the noise is estimated anyway"
+    if V > 1 and small.any() and order[step + 1] > _FACTOR * order[step]:
+        names = np.array(points.view_names)[small]
+        factor = float(np.median(level[small])) / float(np.median(level[~small]))
+        yield 1, f"{name_some(names)}: the stated sigma is {factor:.2g} times too small", advice
+    else:
+        yield 1, "the stated sigmas say nothing of the residuals", advice

@@ -1,0 +1,92 @@
+"""Views whose world coordinates are in another unit, or of another size of squares, than the others'.
+
+Each view's pose takes such a scale upon itself: the camera does not suffer, but the poses are wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.median import median
+from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.findings import Finding, name_some
+
+__all__ = ["views_of_another_scale"]
+
+_SCALED = 1.1  # times the distance of neighbouring points; boards of one set are equal to rounding
+_SHARED = 0.5  # of a view's points, seen in other views too: the same target, only partly seen
+_MOST_POINTS = 400  # of a view that are looked at
+_ROUND = 0.01  # relative, to which a ratio is one of units
+_UNITS = {
+    25.4: "inches and millimetres",
+    10.0: "centimetres and millimetres",
+    2.54: "inches and centimetres",
+    1000.0: "metres and millimetres",
+    100.0: "metres and centimetres",
+    304.8: "feet and millimetres",
+    12.0: "feet and inches",
+}
+
+
+def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
+    """Name the views in which neighbouring points lie farther apart, or nearer, than in the most views."""
+    if points.n_views < 2:
+        return
+    order = np.argsort(points.view_index, kind="stable")
+    worlds = np.split(points.world[order], np.cumsum(np.bincount(points.view_index))[:-1])
+    step = _steps(worlds)
+    usual = _most_common(step)
+    off = np.abs(np.log(step / usual)) > np.log(_SCALED)
+    if not off.any():
+        return
+    off &= ~_seen_in_others(worlds, off)
+    for ratio in np.unique(np.round(np.log(step[off] / usual), 3)):
+        names = np.array(points.view_names)[off & (np.abs(np.log(step / usual) - ratio) < _ROUND)]
+        factor = float(np.exp(abs(ratio)))
+        unit = next((text for known, text in _UNITS.items() if abs(factor / known - 1) < _ROUND), "")
+        yield (
+            1,
+            f"{name_some(names)}: the points lie {factor:.3g} times {'farther' if ratio > 0 else 'less far'} "
+            "apart than in the other views" + (f", as with {unit} mixed" if unit else ""),
+            "give X,Y,Z of all views in one unit"
+            if unit
+            else "check the unit of X,Y,Z and the size of the squares in these views",
+        )
+
+
+def _steps(worlds: list[Array]) -> Array:
+    """(V,) median distance of a point's nearest neighbour; worked out once for the same points."""
+    known: dict[bytes, float] = {}
+    found = []
+    for world in worlds:
+        world = world[:_MOST_POINTS]
+        key = world.tobytes()
+        if key not in known:
+            squares = ((world[:, None] - world[None]) ** 2).sum(axis=-1)
+            squares[squares == 0] = np.inf
+            known[key] = float(median(np.sqrt(squares.min(axis=1))))
+        found.append(known[key])
+    return np.array(found)
+
+
+def _most_common(step: Array) -> float:
+    """The step that most views have; of two that as many have, the first view's."""
+    near = np.abs(np.log(step[:, None] / step[None])) < np.log(_SCALED)
+    return float(step[np.argmax(near.sum(axis=1))])
+
+
+def _seen_in_others(worlds: list[Array], off: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether the points of each view are those of views that are not off, to rounding."""
+    known = np.unique(
+        np.concatenate([np.round(w, 6) for w, one in zip(worlds, off, strict=True) if not one]), axis=0
+    )
+    shared = np.zeros(len(worlds), dtype=bool)
+    for k in np.flatnonzero(off):
+        both = np.concatenate([known, np.unique(np.round(worlds[k], 6), axis=0)])
+        common = len(both) - len(np.unique(both, axis=0))
+        shared[k] = common > _SHARED * (len(both) - len(known))
+    return shared

@@ -1,0 +1,196 @@
+"""Whether the views are of two cameras, or of one whose focal length changes from view to view.
+
+A common camera puts conditions on the network of each view, two on a flat target's and five on a solid one's.
+What they cost in squared error, over the noise's variance and the number of conditions, is 1 for noise alone.
+Where they cost far more, the views are dealt to two cameras, each to the one that explains it better, and
+both are adjusted, as k-means does it with points. If two cameras leave hardly more than noise, there are two.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.outlier_views import free_networks
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.leave_out import Quadratics
+
+__all__ = ["ViewGroups", "view_groups"]
+
+# By condition, in variances of the noise. Of 200 clean sets of 5 to 40 views none costs more than the first:
+# tests/test_view_groups.py repeats it.
+_CONTRADICTS = 5.0
+_NOISE = 4.0
+_CONDITIONS = (5, 2)  # on the network of a solid and of a flat view
+_FEWEST = 2  # views of a group
+_SPARE = 4  # more conditions than what explains them has parameters
+_DIFFERENT = 0.01  # of the focal length
+_STARTS = 20
+_ROUNDS = 20
+_OWN_STEPS = 40
+_STEPS = 30
+_ADJUSTED = 4  # rounds with cameras that are adjusted, not only followed along the quadratic
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGroups:
+    """What the views ask for.
+
+    Attributes
+    ----------
+    names : two tuples of str
+        The views of each camera, the smaller group first; empty where only the focal length changes.
+    cameras : (2, 5) array [px]
+        alpha_u, theta's entry, alpha_v, u0 and v0 of both; nan where only the focal length changes.
+    scale : (V,) array
+        Focal length of each view over the common one; empty where there are two cameras.
+    """
+
+    names: tuple[tuple[str, ...], tuple[str, ...]]
+    cameras: Array
+    scale: Array
+
+
+def view_groups(
+    views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_]
+) -> ViewGroups | None:
+    """Find two cameras among the views, or a focal length that changes; None where neither explains more.
+
+    Parameters
+    ----------
+    views : Views
+    state : CameraState
+        The common camera, at its minimum with all poses free.
+    normal : (V, 12 + K, 12 + K) array
+    free : (5 + K,) bool array
+    """
+    conditions = np.where(views.nearly_flat, _CONDITIONS[1], _CONDITIONS[0])
+    n_free = int(free[:5].sum())
+    spare = int(conditions.sum()) - n_free
+    freedom = views.n_equations - float((6 + conditions).sum())
+    if spare < n_free + _SPARE or freedom <= 0:
+        return None
+    cost = float(normal[:, -1, -1].sum())
+    own = float(free_networks(views, state).sum())
+    if cost - own < _CONTRADICTS * spare * own / freedom:
+        return None
+    own = float(free_networks(views, state, _OWN_STEPS).sum())
+    noise = _NOISE * own / freedom
+    quadratics = reduced(normal, free, True)
+    scale = _scales(quadratics, state, free)
+    one_each = (cost - _gain_of_scales(quadratics, state, free) - own) / max(spare - views.n_views + 1, 1)
+    if (
+        spare - views.n_views < _SPARE - 1
+        or np.ptp(scale) < _DIFFERENT
+        or not (np.abs(scale - 1) < 0.5).all()
+    ):
+        one_each = np.inf
+    found = _two_cameras(views, state, quadratics, free)
+    two = np.inf
+    if found is not None and _differ(found.cameras):
+        two = (found.cost - own) / (spare - n_free)
+    if min(one_each, two) > noise:
+        return None
+    if found is None or two > one_each + noise / _NOISE:
+        return ViewGroups(((), ()), np.full((2, 5), np.nan), scale)
+    member, cameras = found.member, found.cameras
+    if np.count_nonzero(member) > np.count_nonzero(~member):
+        member, cameras = ~member, cameras[::-1]
+    names = np.array(views.names)
+    px = views.pixel_scale * cameras + np.array([0, 0, 0, *views.pixel_centre])
+    return ViewGroups((tuple(names[member].tolist()), tuple(names[~member].tolist())), px, np.zeros(0))
+
+
+def _differ(cameras: Array) -> bool:
+    return bool((np.abs(cameras[0] - cameras[1])[[0, 2, 3, 4]] > _DIFFERENT * cameras[0, 0]).any())
+
+
+@dataclass(frozen=True, eq=False)
+class _Split:
+    member: NDArray[np.bool_]
+    cameras: Array  # (2, 5), normalised
+    cost: float
+
+
+def _two_cameras(
+    views: Views, state: CameraState, quadratics: Quadratics, free: NDArray[np.bool_]
+) -> _Split | None:
+    member = _dealt(quadratics)
+    found: _Split | None = None
+    for _ in range(_ADJUSTED):
+        if member is None or min(np.count_nonzero(member), np.count_nonzero(~member)) < _FEWEST:
+            return found
+        both = [_adjusted(views, state, np.flatnonzero(group), free) for group in (member, ~member)]
+        cost = np.stack([_cost_of_each(views, state, camera) for camera in both])
+        cameras = np.stack([camera.entries[0] for camera in both])
+        found = _Split(member, cameras, float(cost[0][member].sum() + cost[1][~member].sum()))
+        nearer = cost[0] < cost[1]
+        if (nearer == member).all():
+            return found
+        member = nearer
+    return found
+
+
+def _dealt(quadratics: Quadratics) -> NDArray[np.bool_] | None:
+    """The best division into two that random ones lead to."""
+    rng = np.random.default_rng(0)
+    V = len(quadratics.cost)
+    best, division = np.inf, None
+    for _ in range(_STARTS):
+        member = rng.random(V) < 0.5
+        for _ in range(_ROUNDS):
+            steps = quadratics.steps(np.array([member, ~member], dtype=float))
+            if not np.isfinite(steps).all():
+                break
+            cost = np.stack([quadratics.at(step) for step in steps])
+            total, nearer = float(cost.min(axis=0).sum()), cost[0] < cost[1]
+            if total < best:
+                best, division = total, nearer
+            if (nearer == member).all():
+                break
+            member = nearer
+    return division
+
+
+def _adjusted(
+    views: Views, state: CameraState, which: NDArray[np.intp], free: NDArray[np.bool_]
+) -> CameraState:
+    start = CameraState(state.entries, state.R[which], state.t[which], state.model, state.k)
+    return adjust(views.subset(which).batches, start, free, True, _STEPS).state
+
+
+def _cost_of_each(views: Views, state: CameraState, camera: CameraState) -> Array:
+    """(V,) squared error of each view through a camera, with the pose that suits it best."""
+    start = CameraState(camera.entries, state.R, state.t, camera.model, camera.k)
+    return adjust(views.batches, start, np.zeros(5 + camera.k.shape[-1], dtype=bool), True, _STEPS).cost
+
+
+def _direction(state: CameraState, free: NDArray[np.bool_]) -> Array:
+    """Of a change of the focal length, among the free parameters."""
+    scaled = np.zeros(len(free))
+    scaled[:3] = state.entries[0][:3]
+    return np.asarray(scaled[free])
+
+
+def _scales(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> Array:
+    """(V,) focal length of each view over the common one, by one step."""
+    d = _direction(state, free)
+    return np.asarray(1 + (q.g @ d) / np.einsum("i,vij,j->v", d, q.S, d))
+
+
+def _gain_of_scales(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> float:
+    """Squared error that a focal length of each view's own would spare, the rest common to all."""
+    d = _direction(state, free)
+    Sd, gd = q.S @ d, q.g @ d
+    weight = 1 / np.maximum(Sd @ d, 1e-300)
+    S = (q.S - weight[:, None, None] * Sd[:, :, None] * Sd[:, None, :]).sum(axis=0)
+    g = (q.g - (weight * gd)[:, None] * Sd).sum(axis=0)
+    scale = 1 / np.sqrt(np.maximum(np.diagonal(q.S.sum(axis=0)), 1e-300))
+    common = np.linalg.pinv(S * np.outer(scale, scale), rcond=1e-9, hermitian=True) @ (scale * g)
+    return float((weight * gd**2).sum() + (scale * g) @ common)

@@ -1,0 +1,86 @@
+"""What the rows of a points file say before any camera: units, pixels as numbers, outliers by their kind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.wrong_inputs import flat, moved, scaled
+
+from neurocal_cli import Correspondences, calibrate
+from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
+from neurocal_cli.verdict.units_of_views import views_of_another_scale
+
+POINTS = flat()
+
+
+@pytest.mark.parametrize(
+    ("factor", "views", "said"),
+    [
+        (1 / 25.4, [3], "view03: the points lie 25.4 times less far apart"),
+        (1 / 25.4, range(5), "inches and millimetres mixed"),
+        (0.1, range(4), "centimetres and millimetres mixed"),
+        (1.2, [2], "view02: the points lie 1.2 times farther apart than in the other views"),
+    ],
+)
+def test_the_part_of_the_views_in_another_unit_is_named(factor: float, views, said: str) -> None:
+    (finding,) = views_of_another_scale(scaled(POINTS, [factor] * 3, views))
+    assert said in finding[1]
+
+
+def test_a_view_with_few_of_the_points_is_in_no_other_unit() -> None:
+    """Only horizontal edges were found, as in blurred images: neighbours lie 1.4 times farther apart."""
+    row = np.arange(len(POINTS)) % 93
+    some = POINTS.select((POINTS.view_index % 2 == 0) | (row < 40))
+    assert list(views_of_another_scale(some)) == []
+
+
+@pytest.mark.parametrize(
+    ("pixels", "said"),
+    [
+        (POINTS.pixels / [640, 480], "normalised coordinates"),
+        (np.round(POINTS.pixels), "rounded to whole numbers"),
+        (4 * np.round(POINTS.pixels / 4), "rounded to multiples of 4 px"),
+        (np.clip(POINTS.pixels, 0, [500, 480]), "the very same outermost u = 500"),
+        (POINTS.pixels[:, ::-1], "as if its width and height, or u and v, were exchanged"),
+        (POINTS.pixels - [320, 240], "as if u,v were measured from its middle"),
+        (2 * POINTS.pixels, "points lie outside the image: they reach to"),
+    ],
+)
+def test_odd_pixels_are_named(pixels: np.ndarray, said: str) -> None:
+    points = replace(POINTS, pixels=pixels)
+    assert said in next(iter(odd_pixels(points)))[1]
+
+
+def test_the_points_of_good_images_are_not_odd() -> None:
+    for seed in range(20):
+        points = flat(seed)
+        inside = ((points.pixels > 0) & (points.pixels < [639, 479])).all(axis=1)
+        points = points.select(inside)
+        assert [*odd_pixels(points), *points_given_twice(points), *views_of_another_scale(points)] == []
+
+
+def test_a_point_just_outside_the_border_is_no_fault_and_one_far_outside_not_poor() -> None:
+    pixels = POINTS.pixels.copy()
+    pixels[np.argmax(pixels[:, 0]), 0] = 640.2
+    assert list(odd_pixels(moved(POINTS, pixels=pixels))) == []
+    pixels[0] = [700.0, 100.0]
+    ((grade, reason, _),) = odd_pixels(moved(POINTS, pixels=pixels))
+    assert (grade, reason) == (1, "1 point lies outside the image")
+
+
+def test_two_images_under_one_name_are_named() -> None:
+    names = np.where(np.asarray(POINTS.view) == "view01", "view00", np.asarray(POINTS.view))
+    points = Correspondences(POINTS.world, POINTS.pixels, names, POINTS.image_size)
+    ((_, reason, _),) = points_given_twice(points)
+    assert reason.startswith("view00: most points are given twice with different pixels, as of two images")
+
+
+def test_outliers_are_named_by_what_they_have_in_common() -> None:
+    world = POINTS.world.copy()
+    world[np.arange(len(world)) % 93 == 40, 0] += 6
+    verdict = calibrate(moved(POINTS, world)).verdict
+    assert verdict is not None
+    assert verdict.word == "usable"
+    assert verdict.reasons == ("10 of 930 points are outliers and were left out: point p40 in most views",)

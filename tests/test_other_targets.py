@@ -1,0 +1,101 @@
+"""Images that show no chessboard but another target, and files that are no images, are named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.command_line import run
+
+from neurocal_cli.detection.other_targets import other_target
+from neurocal_cli.io.images import read_image
+
+SAMPLES = Path(__file__).resolve().parents[1] / "sample_data"
+
+
+def photographed(target: np.ndarray) -> np.ndarray:
+    """A target of 1000 x 750 px seen askew, on grey."""
+    corners = np.float32([[0, 0], [1000, 0], [1000, 750], [0, 750]])
+    seen = np.float32([[100, 60], [540, 90], [520, 430], [80, 440]])
+    homography = cv2.getPerspectiveTransform(corners, seen)
+    image = cv2.warpPerspective(target, homography, (640, 480), borderValue=128, flags=cv2.INTER_AREA)
+    return cv2.GaussianBlur(image, (0, 0), 0.7)
+
+
+def markers(kind: str) -> np.ndarray:
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_100)
+    if kind == "charuco":
+        board = cv2.aruco.CharucoBoard((8, 6), 30.0, 22.0, family)
+    else:
+        board = cv2.aruco.GridBoard((6, 4), 30.0, 8.0, family)
+    return board.generateImage((1000, 750), marginSize=60)
+
+
+def circles(staggered: bool, light: bool = False) -> np.ndarray:
+    image = np.full((750, 1000), 20 if light else 255, dtype=np.uint8)
+    for row in range(8):
+        for column in range(10):
+            middle = (90 + 80 * column + (40 if staggered and row % 2 else 0), 80 + 80 * row)
+            cv2.circle(image, middle, 26, 240 if light else 0, -1, cv2.LINE_AA)
+    return image
+
+
+@pytest.mark.skipif(not hasattr(cv2, "aruco"), reason="this OpenCV has no markers")
+@pytest.mark.parametrize("kind", ["charuco", "aruco"])
+def test_markers_are_recognised(kind: str) -> None:
+    assert "markers (ChArUco" in other_target(photographed(markers(kind)))
+
+
+@pytest.mark.parametrize(("staggered", "light"), [(False, False), (True, False), (True, True)])
+def test_grids_of_circles_are_recognised(staggered: bool, light: bool) -> None:
+    assert "grid of circles" in other_target(photographed(circles(staggered, light)))
+    deep = photographed(circles(staggered, light)).astype(np.uint16) * 200
+    assert "grid of circles" in other_target(deep)
+
+
+@pytest.mark.parametrize("blur", [0.0, 3.0, 8.0])
+def test_no_other_target_is_seen_in_chessboards(blur: float) -> None:
+    image = np.array(read_image(SAMPLES / "board02.png").grey)
+    assert other_target(cv2.GaussianBlur(image, (0, 0), blur) if blur else image) == ""
+
+
+def test_no_target_is_seen_in_noise() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
+    assert other_target(noise) == ""
+    assert other_target(cv2.GaussianBlur(noise, (0, 0), 3.0)) == ""
+    assert other_target(np.zeros((1, 1), dtype=np.uint8)) == ""
+
+
+@pytest.mark.slow
+def test_no_other_target_is_seen_in_real_images(real_files: Callable[[str], list[Path]]) -> None:
+    for pattern in ("opencv_stereo/*.jpg", "sony_chess/*.jpg", "fisheye_stereo/*.jpg", "zhang_planar/*.png"):
+        for path in real_files(pattern):
+            assert other_target(np.array(read_image(path).grey)) == "", path.name
+
+
+def test_detect_says_what_the_image_shows(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "dots.png"), photographed(circles(False)))
+    result = run("detect", tmp_path / "dots.png", "--cols", 9, "--rows", 6, "--square", 25)
+    assert result.exit_code == 1
+    assert "dots.png: the image shows a grid of circles, no chessboard; " in result.stderr
+    assert "evenly lit" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"\0\0\0\x20ftypisom\0\0", "is a video, but images are wanted; extract some, as with `ffmpeg"),
+        (b"RIFF\0\0\0\0AVI LIST", "is a video"),
+        (b"\x1aE\xdf\xa3\0\0", "is a video"),
+        (b"\0\0\0\x18ftypheic\0\0", "is a HEIC file, which is not read; save it as PNG"),
+        (b"RIFF\0\0\0\0WEBPVP8 ", "is a WebP file"),
+    ],
+)
+def test_files_that_are_no_images_are_named(data: bytes, said: str, tmp_path: Path) -> None:
+    (tmp_path / "v.mp4").write_bytes(data)
+    result = run("detect", tmp_path / "v.mp4", "--cols", 9, "--rows", 6, "--square", 25)
+    assert result.exit_code == 1
+    assert said in result.stderr
