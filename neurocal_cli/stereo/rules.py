@@ -93,9 +93,6 @@ def _pairs(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
     found = e.contradiction
     if found is None:
         return
-    if found.odd.any() and found.kind != "moved":
-        names = [pair_name(pair) for pair, is_odd in zip(e.names, found.odd, strict=True) if is_odd]
-        yield 1, f"{', '.join(names[:3])}: the relative pose contradicts that of the other pairs", _MOMENT
     if found.kind in ("left focal", "right focal", "late", "early"):
         yield _changed(e, found)
         return
