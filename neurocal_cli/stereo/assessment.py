@@ -74,9 +74,15 @@ def gather_rig_evidence(rig: Rig) -> RigEvidence:
         contradiction=found,
         displacement=_displacement(poses, used),
         held_out_px=_held_out(rig, poses, used),
-        depth=float(median(depth[np.isfinite(depth)])) if np.isfinite(depth).any() else nan,
-        depth_share=float(np.sqrt(np.nanmean((std / depth) ** 2))) if np.isfinite(std).any() else nan,
+        depth=_share(depth),
+        depth_share=_share(std / depth),
     )
+
+
+def _share(of_points: Array) -> float:
+    """The median over the points that exist; nan where none does."""
+    fine = np.isfinite(of_points)
+    return float(median(of_points[fine])) if fine.any() else float("nan")
 
 
 def _moved(
