@@ -14,6 +14,7 @@ from neurocal_cli.geometry import rotation_step, rotation_vector
 from neurocal_cli.stereo.adjust import adjust_rig
 from neurocal_cli.stereo.consensus import find_consensus
 from neurocal_cli.stereo.contradiction import Contradiction, contradiction
+from neurocal_cli.stereo.odd_pairs import odd_pairs
 from neurocal_cli.stereo.pair_covariance import not_smaller
 from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, rig_problem
@@ -23,8 +24,8 @@ from neurocal_cli.stereo.rig import Rig
 Points = tuple[Correspondences, Correspondences]
 
 
-def made(points: Points) -> tuple[RigProblem, RelativePoses]:
-    cameras = [calibrate(side, distortion="none", skew=False) for side in points]
+def made(points: Points, distortion: str = "none", skew: bool = False) -> tuple[RigProblem, RelativePoses]:
+    cameras = [calibrate(side, distortion=distortion, skew=skew) for side in points]
     problem = rig_problem(*cameras, pair_views(points[0].view_names, points[1].view_names))
     free = estimated_parameters(cameras[0]), estimated_parameters(cameras[1])
     poses = relative_poses(problem, free, find_consensus(problem).rig)
@@ -157,3 +158,11 @@ def test_the_criterion_is_still_where_there_is_nothing_but_noise() -> None:
     assert alarms == 0
     assert abs(np.mean(scatter)) < 0.35
     assert np.std(scatter) < 1.5
+
+
+@pytest.mark.parametrize("seed", [49, 104, 137])
+def test_three_pairs_of_cameras_that_are_poorly_known_are_not_blamed(seed: int) -> None:
+    """Two of them fit each other best with wrong cameras, and then predict the third far off."""
+    some = random_rig(np.random.default_rng(seed), "verging", 3, lens="k1k2")
+    points = seen(replace(some, names=("left{}", "right{}")), 0.7, seed)
+    assert not odd_pairs(made(points, "k1k2", True)[1], np.ones(3, dtype=bool)).any()

@@ -29,6 +29,7 @@ from neurocal_cli.zoom_lens.interpolation import (
     spline_matrix,
     thin_plate_matrix,
 )
+from neurocal_cli.zoom_lens.judgement import judge_lens
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
@@ -54,6 +55,20 @@ def test_a_smooth_lens_is_known_between_its_settings() -> None:
     assert (
         covered(smooth(), "c", between(5, 3)) > 0.7
     )  # one lens; the errors of its settings are not independent
+
+
+def test_the_verdict_on_a_lens() -> None:
+    good = judge_lens(smooth(), evaluate_lens(smooth(), seen("c", between(5, 3), seed=2)).rmse_px)
+    assert good is not None
+    assert (good.word, good.reasons) == ("good", ())
+    far = judge_lens(smooth(), 2.0)
+    assert far is not None
+    assert far.word == "poor"
+    assert "error at the given points is 2 px" in far.reasons[0]
+    coarse = judge_lens(replace(smooth(), left_out_px=0.4))
+    assert coarse is not None
+    assert coarse.word == "usable"
+    assert "changes too much between the settings" in coarse.reasons[0]
 
 
 def test_the_error_by_setting_adds_up_to_the_whole() -> None:
@@ -117,10 +132,18 @@ def test_a_setting_with_wrong_pixels_is_left_out() -> None:
     lens = fit_lens(spoilt, distortion="none", topologies=FEW)
     assert [r.setting for r in lens.rejected] == [tuple(points.settings[7])]
     assert any("left out" in warning for warning in lens.warnings)
+    verdict = judge_lens(lens)
+    assert verdict is not None
+    assert verdict.word == "usable"
+    assert "1 of 15 settings contradict the others and were left out" in verdict.reasons[0]
     assert evaluate_lens(lens, seen("c", between(5, 3), seed=13)).rmse_px < 1.15 * FLOOR
     kept = fit_lens(spoilt, distortion="none", topologies=((0, 2),), outliers="keep")
     assert not kept.rejected
     assert kept.rmse_px > 3 * lens.rmse_px
+    worst = judge_lens(kept)
+    assert worst is not None
+    assert worst.word in ("usable", "poor")
+    assert any("that of the other settings" in reason for reason in worst.reasons)
 
 
 @pytest.mark.slow

@@ -322,6 +322,10 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     at once. If the camera stood still during the calibration, its pose is used; otherwise the pose of
     each view is fitted with the intrinsic parameters fixed.
 
+    The lens also gets a verdict: good, usable or poor, with the reasons. It rests on the settings that were
+    left out, on the error at these points and at settings predicted from all others, both over the noise
+    floor, and on the uncertainty of the focal length between the settings. `neurocal lens fit` prints it too.
+
     \b
     Examples:
       neurocal lens fit sample_data/zoom.csv -o lens.yaml
@@ -335,6 +339,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     from neurocal_cli.io.lens_points import read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens
     from neurocal_cli.zoom_lens.evaluation import evaluate_lens
+    from neurocal_cli.zoom_lens.judgement import judge_lens
     from neurocal_cli.zoom_lens.report import evaluation_json, evaluation_report
 
     learnt = read_lens(lens_file)
@@ -342,13 +347,14 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     data = read_lens_points(points, notes=notes)
     note(notes)
     evaluation = evaluate_lens(learnt, data)
+    verdict = judge_lens(learnt, evaluation.rmse_px)
     if plot is not None:
         from neurocal_cli.io.writing import write_whole
         from neurocal_cli.zoom_lens.plots import draw_evaluation
 
         write_whole(plot, draw_evaluation(evaluation, learnt.controls, os.path.splitext(plot)[1][1:].lower()))
     if as_json:
-        click.echo(json.dumps(evaluation_json(evaluation), indent=2, allow_nan=False))
+        click.echo(json.dumps(evaluation_json(evaluation, verdict), indent=2, allow_nan=False))
     else:
-        click.echo(evaluation_report(evaluation, learnt.controls))
+        click.echo(evaluation_report(evaluation, learnt.controls, verdict))
     warn(evaluation.warnings)

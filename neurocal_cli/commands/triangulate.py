@@ -89,7 +89,6 @@ def triangulate(
     check_one_stdin(*inputs)
     check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
-    _warn_of_poor(rig)
     from neurocal_cli.io.matches_csv import read_matches
     from neurocal_cli.io.points_in_space_csv import format_space_points
     from neurocal_cli.io.writing import write_chunks
@@ -113,7 +112,9 @@ def _rig(names: tuple[str, ...]) -> Rig:
     if len(names) == 1:
         from neurocal_cli.io.rig_yaml import read_rig
 
-        return read_rig(names[0])
+        rig = read_rig(names[0])
+        _warn_of_poor(rig)
+        return rig
     from neurocal_cli.io.calibration_yaml import read_calibration
     from neurocal_cli.stereo.fit_rig import fit_rig
 
@@ -122,6 +123,8 @@ def _rig(names: tuple[str, ...]) -> Rig:
     views = "1 view" if len(rig.pairs) == 1 else f"{len(rig.pairs)} views"
     note([f"the rig is fitted to {views} of both cameras: baseline {rig.baseline:.6g} {rig.unit}"])
     warn(rig.warnings)
+    if not rig.warnings:
+        _warn_of_poor(rig)
     return rig
 
 

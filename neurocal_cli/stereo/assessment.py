@@ -63,7 +63,7 @@ def gather_rig_evidence(rig: Rig) -> RigEvidence:
     if poses is None:
         return RigEvidence(cameras, pairs, np.zeros(0), None, None, nan, nan, nan, nan)
     used = np.array([pair not in rig.left_out for pair in poses.names])
-    found = contradiction(poses, used)
+    found = contradiction(poses, used, seek_odd=False)
     covariance = rig_covariance(poses, used, found)
     depth, std = depth_std(rig, problem, poses, covariance, _some_points(rig))
     return RigEvidence(
@@ -72,11 +72,17 @@ def gather_rig_evidence(rig: Rig) -> RigEvidence:
         size=poses.size,
         moved=_moved(rig, poses, used, found),
         contradiction=found,
-        displacement=_displacement(poses, used & ~found.odd),
+        displacement=_displacement(poses, used),
         held_out_px=_held_out(rig, poses, used),
-        depth=float(median(depth[np.isfinite(depth)])) if np.isfinite(depth).any() else nan,
-        depth_share=float(np.sqrt(np.nanmean((std / depth) ** 2))) if np.isfinite(std).any() else nan,
+        depth=_share(depth),
+        depth_share=_share(std / depth),
     )
+
+
+def _share(of_points: Array) -> float:
+    """The median over the points that exist; nan where none does."""
+    fine = np.isfinite(of_points)
+    return float(median(of_points[fine])) if fine.any() else float("nan")
 
 
 def _moved(

@@ -103,7 +103,9 @@ def is_significant(squares: float, degrees: int) -> bool:
     return bool(squares / degrees > (1.0 - part + _LEVEL * np.sqrt(part)) ** 3)
 
 
-def contradiction(poses: RelativePoses, used: NDArray[np.bool_] | None = None) -> Contradiction:
+def contradiction(
+    poses: RelativePoses, used: NDArray[np.bool_] | None = None, seek_odd: bool = True
+) -> Contradiction:
     """Explain how the relative poses of the used pairs differ.
 
     Parameters
@@ -111,11 +113,14 @@ def contradiction(poses: RelativePoses, used: NDArray[np.bool_] | None = None) -
     poses : RelativePoses
     used : (P,) bool array, optional
         Pairs that are not known to be wrong; default all.
+    seek_odd : bool
+        Whether pairs that contradict most others are one of the explanations. Once they are left out they are
+        not, as among what is left some would always be the oddest.
     """
     used = np.ones(len(poses), dtype=bool) if used is None else used
     found = _best(poses, used)
     odd = np.zeros_like(used)
-    if is_significant(_squares(poses, used), _degrees(used)):
+    if seek_odd and is_significant(_squares(poses, used), _degrees(used)):
         odd = odd_pairs(poses, used)
     if odd.any() and (_score(poses, used & ~odd, None, 6 * int(odd.sum())) < _score(poses, used, found)):
         return _told(poses, used & ~odd, _best(poses, used & ~odd), odd)

@@ -35,7 +35,7 @@ class RigEvidence:
     depth : float [world unit]
         Median depth of the points.
     depth_share : float
-        Standard deviation of triangulated depth over the depth, rms over the points, for exact pixels.
+        Standard deviation of triangulated depth over the depth, median over the points, for exact pixels.
     """
 
     cameras: tuple[Verdict | None, Verdict | None]

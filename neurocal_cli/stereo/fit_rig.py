@@ -131,7 +131,7 @@ def _covariance(
     if poses is None:
         return None
     used = np.ones(len(poses), dtype=bool)
-    found = contradiction(poses, used)
+    found = contradiction(poses, used, seek_odd=False)
     if not held and not is_significant(found.scatter**2 * found.degrees, found.degrees):
         return None
     moved = free[estimated]

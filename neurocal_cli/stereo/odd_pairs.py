@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.median import median
 from neurocal_cli.stereo.relative_poses import RelativePoses
 
@@ -39,7 +40,7 @@ def odd_pairs(poses: RelativePoses, used: NDArray[np.bool_]) -> NDArray[np.bool_
         if sum_of_core < lowest:
             best, lowest = core, sum_of_core
     for _ in range(_STEPS):
-        distance = poses.excess(poses.solution(best))
+        distance = _predicted(poses, best)
         limit = _SUSPECT * max(1.0, float(median(distance[places])) / _MEDIAN)
         odd = used & (distance > limit) & (distance > _OWN_SHARE * poses.n_equations)
         if (best == (used & ~odd)).all():
@@ -66,5 +67,19 @@ def _concentrated(
         if (nearest == core).all():
             break
         core = nearest
-        distance = poses.excess(poses.solution(core))
+        distance = _predicted(poses, core)
     return distance, core
+
+
+def _predicted(poses: RelativePoses, core: NDArray[np.bool_]) -> Array:
+    """(P,) squared distances from the rig of some pairs; of the others, with the uncertainty of that rig.
+
+    Few pairs determine the rig poorly, as it follows the errors of both cameras. What they predict of others
+    may be far off for no other reason.
+    """
+    S, g = poses.normal(core)
+    solved = solve_scaled(S, np.column_stack([np.eye(len(S)), g]))
+    apart = poses.offset - poses.design @ solved[:, -1]
+    spread = poses.design @ solved[:, :-1] @ np.swapaxes(poses.design, 1, 2)
+    covariance = poses.covariance + np.where(core[:, None, None], 0.0, spread)
+    return np.asarray((apart * solve_scaled(covariance, apart[..., None])[..., 0]).sum(axis=1))

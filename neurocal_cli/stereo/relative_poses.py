@@ -115,10 +115,6 @@ class RelativePoses:
         S, g = self.normal(used)
         return np.asarray(solve_scaled(S, g[:, None])[:, 0])
 
-    def excess(self, unknowns: Array) -> Array:
-        """(P,) squared distance of each pair's relative pose from the rig, over its covariance."""
-        return self.pairs.at(unknowns)
-
 
 def relative_poses(
     problem: RigProblem, free: tuple[NDArray[np.bool_], NDArray[np.bool_]], reference: Pose

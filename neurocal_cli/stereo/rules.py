@@ -68,11 +68,11 @@ def _findings(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
     yield from _precision(rig, e)
     for side, verdict in zip(("left", "right"), e.cameras, strict=True):
         if verdict is not None:
-            # The reasons come the worst first.
-            grades = [_WORDS.index(verdict.word), *[1] * len(verdict.reasons)]
-            for grade, reason in zip(grades, verdict.reasons, strict=False):
-                yield grade, f"{side} camera: {reason}", ""
-            yield from ((1, "", advice) for advice in verdict.advice)
+            # Reasons and advice come the worst first.
+            for k, reason in enumerate(verdict.reasons):
+                yield (1 if k else _WORDS.index(verdict.word)), f"{side} camera: {reason}", ""
+            for k, advice in enumerate(verdict.advice):
+                yield (1 if k else _WORDS.index(verdict.word)), "", advice
 
 
 def _pairs(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
@@ -93,9 +93,6 @@ def _pairs(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
     found = e.contradiction
     if found is None:
         return
-    if found.odd.any() and found.kind != "moved":
-        names = [pair_name(pair) for pair, is_odd in zip(e.names, found.odd, strict=True) if is_odd]
-        yield 1, f"{', '.join(names[:3])}: the relative pose contradicts that of the other pairs", _MOMENT
     if found.kind in ("left focal", "right focal", "late", "early"):
         yield _changed(e, found)
         return

@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.report import align, number_or_none, rounded
+from neurocal_cli.verdict.report import verdict_json, verdict_lines
 from neurocal_cli.zoom_lens.evaluation import LensEvaluation
+from neurocal_cli.zoom_lens.judgement import judge_lens
 from neurocal_cli.zoom_lens.settings import CONTROLS
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
@@ -28,7 +30,7 @@ _UNITS = {"alpha_u": "px", "alpha_v": "px", "u0": "px", "v0": "px"}
 
 
 def lens_report(lens: ZoomLens) -> str:
-    """Summary of a lens: its data, its networks and its errors."""
+    """Summary of a lens: its data, its networks, its errors and the verdict."""
     kind = "known cameras" if lens.known else "camera still" if lens.still else "camera moving"
     points = "" if lens.known else f", {int(lens.counts.sum())} points"
     head = f"zoom lens: {len(lens.settings)} settings of {' and '.join(lens.controls)}{points}, {kind}"
@@ -49,7 +51,11 @@ def lens_report(lens: ZoomLens) -> str:
     training = _TRAININGS.get(lens.training, lens.training)
     tail.append(f"networks: committee of {len(lens.members)}, alpha on a {scale} scale, {training}")
     tail.append("converged" if lens.converged else "not converged: training stopped before the error settled")
-    return "\n\n".join([*blocks, "\n".join(tail)])
+    blocks.append("\n".join(tail))
+    verdict = judge_lens(lens)
+    if verdict is not None:
+        blocks.append("\n".join(verdict_lines(verdict)))
+    return "\n\n".join(blocks)
 
 
 def _scatter_text(lens: ZoomLens, scatter: list[float]) -> str:
@@ -95,8 +101,10 @@ def camera_report(calibration: Calibration) -> str:
     return f"{calibration.camera_name}: {calibration.stop_reason}\n\n" + "\n".join(align(rows))
 
 
-def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...]) -> str:
-    """Errors of a lens as aligned text: overall, of the baselines, at the worst settings."""
+def evaluation_report(
+    evaluation: LensEvaluation, controls: tuple[str, ...], verdict: Verdict | None = None
+) -> str:
+    """Errors of a lens as aligned text: overall, of the baselines, at the worst settings; the verdict."""
     shown = sorted(evaluation.settings, key=lambda setting: -np.nan_to_num(setting.rmse_px))[:_MOST_SETTINGS]
     settings = [[*controls, "points", "rms [px]", "max [px]"]]
     for setting in shown:
@@ -108,9 +116,10 @@ def evaluation_report(evaluation: LensEvaluation, controls: tuple[str, ...]) -> 
         f"maximum {_pixels(evaluation.max_px)} px"
     )
     title = "settings with the largest error:" if len(evaluation.settings) > len(shown) else "settings:"
-    return "\n\n".join(
-        [head, "\n".join(align(_baseline_rows(evaluation))), "\n".join([title, *align(settings)])]
-    )
+    blocks = [[head], align(_baseline_rows(evaluation)), [title, *align(settings)]]
+    if verdict is not None:
+        blocks.append(verdict_lines(verdict))
+    return "\n\n".join("\n".join(block) for block in blocks)
 
 
 def _baseline_rows(evaluation: LensEvaluation) -> list[list[str]]:
@@ -125,7 +134,7 @@ def _baseline_rows(evaluation: LensEvaluation) -> list[list[str]]:
     return rows
 
 
-def evaluation_json(evaluation: LensEvaluation) -> dict[str, Any]:
+def evaluation_json(evaluation: LensEvaluation, verdict: Verdict | None = None) -> dict[str, Any]:
     """An evaluation as JSON values; None for numbers that do not exist."""
     return {
         "n_points": evaluation.n_points,
@@ -141,6 +150,7 @@ def evaluation_json(evaluation: LensEvaluation) -> dict[str, Any]:
             for setting in evaluation.settings
         ],
         "rivals": {name: number_or_none(value) for name, value in evaluation.baselines.items()},
+        **({} if verdict is None else {"verdict": verdict_json(verdict)}),
     }
 
 

@@ -1,0 +1,143 @@
+"""One word on a zoom lens, good, usable or poor, with the reasons and what to do next.
+
+It rests on what the lens itself holds: the settings that were left out, the error of the networks and of the
+settings predicted from all others, both over the noise floor, and the standard deviation of the focal length
+at the settings and between them. The noise floor is the error of a separate camera at each setting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from neurocal_cli.calibration import Verdict
+from neurocal_cli.geometry import Array
+from neurocal_cli.verdict.limits import Limit
+from neurocal_cli.zoom_lens.settings import describe
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+
+__all__ = ["judge_lens"]
+
+# Repeated by test_the_verdict_on_a_lens. The networks of smooth lenses stay within 1.04 of the noise floor
+# even between settings (slow tests in tests/test_zoom_lens.py).
+_CONTRADICTION = Limit(1.3, 2.3)  # rms error over the noise floor
+_BETWEEN = Limit(1.5, 4.0)  # rms error of settings left out over the noise floor
+_ONE = Limit(2.5, 10.0)  # rms error of the worst setting over the median
+_REJECTED = Limit(0.0, 0.2)  # share of the settings
+_ALPHA = Limit(0.01, 0.05)  # std over the value, of the worst setting
+_ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal, as of one camera
+
+_Finding = tuple[int, str, str]  # grade, reason, advice
+
+
+def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict | None:
+    """Weigh what a lens holds; None for a lens of known cameras, which has no points.
+
+    Parameters
+    ----------
+    lens : ZoomLens
+    elsewhere_px : float [px]
+        Rms reprojection error at other points, if there are any.
+    """
+    if lens.known:
+        return None
+    found = [*_findings(lens), _elsewhere(lens, elsewhere_px)]
+    findings = sorted((f for f in found if f[0] > 0), key=lambda finding: -finding[0])
+    word = ("good", "usable", "poor")[findings[0][0] if findings else 0]
+    measures = {
+        "held_out_px": lens.left_out_px,
+        "precision_px": _floor(lens),
+        "alpha_share": _alpha_share(lens),
+    }
+    return Verdict(
+        word, tuple(f[1] for f in findings), tuple(dict.fromkeys(f[2] for f in findings)), measures
+    )
+
+
+def _floor(lens: ZoomLens) -> float:
+    """Rms error [px] of a separate camera at each setting, freedom accounted for."""
+    return float(np.sqrt(2 * lens.variance))
+
+
+def _alpha_share(lens: ZoomLens) -> float:
+    """Largest std of alpha_u over its value, at the settings and between them."""
+    prediction = lens.predict(np.concatenate([lens.settings, _between(lens)]))
+    return float((prediction.std[:, 0] / prediction.local[:, 0]).max())
+
+
+def _between(lens: ZoomLens) -> Array:
+    """Middles between each setting and its nearest neighbours, one for each control; (M, D)."""
+    scaled = (lens.settings - lens.low) / np.maximum(lens.high - lens.low, 1e-300)
+    apart = np.abs(scaled[:, None] - scaled)
+    middles = [np.zeros((0, len(lens.controls)))]
+    for k in range(len(lens.controls)):
+        # The nearest with another value of this control, others alike if there is one.
+        distance = np.where(apart[..., k] > 0, 2 * apart.sum(axis=2) - apart[..., k], np.inf)
+        nearest = distance.argmin(axis=1)
+        known = np.isfinite(distance.min(axis=1))
+        middles.append(0.5 * (lens.settings + lens.settings[nearest])[known])
+    return np.concatenate(middles)
+
+
+def _elsewhere(lens: ZoomLens, px: float) -> _Finding:
+    """What the error at other points says, such as at settings between."""
+    floor = _floor(lens)
+    return (
+        _BETWEEN.grade(px / max(floor, 1e-9)),
+        f"the error at the given points is {px:.3g} px, but the noise floor {floor:.3g} px",
+        "check that target and camera are where they were, or add settings where the parameters change most",
+    )
+
+
+def _findings(lens: ZoomLens) -> Iterator[_Finding]:
+    if not lens.converged:
+        yield (
+            2,
+            "training did not converge, so the settings may contradict each other",
+            "check that the lens returns to the same position; give more settings or a simpler --distortion",
+        )
+    floor = _floor(lens)
+    rejected = lens.rejected
+    if rejected:
+        total = len(lens.settings) + len(rejected)
+        first = f"{describe(lens.controls, np.array(rejected[0].setting))}: {rejected[0].reason}"
+        yield (
+            _REJECTED.grade(len(rejected) / total),
+            f"{len(rejected)} of {total} settings contradict the others and were left out ({first})",
+            "check the names and the points of these settings",
+        )
+    if lens.image_size is not None:
+        yield (
+            _ERROR.grade(lens.rmse_px / float(np.hypot(*lens.image_size))),
+            f"the rms reprojection error of {lens.rmse_px:.3g} px is large",
+            "check that each pixel belongs to its point, and that X,Y,Z are those of the true target",
+        )
+    worst, typical = int(lens.rmse.argmax()), float(np.median(lens.rmse))
+    yield (
+        _ONE.grade(float(lens.rmse[worst]) / max(typical, 1e-9)),
+        f"the error at {describe(lens.controls, lens.settings[worst])} is {lens.rmse[worst]:.3g} px, that of "
+        f"the other settings {typical:.3g} px",
+        "check the name and the points of this setting",
+    )
+    contradiction = _CONTRADICTION.grade(lens.rmse_px / max(floor, 1e-9))
+    yield (
+        contradiction,
+        f"the error is {lens.rmse_px / max(floor, 1e-9):.2f} times the noise floor, which is {floor:.3g} px "
+        "(the error of a separate camera for each setting)",
+        "check that the lens returns to the same position, that camera and target stay where they are (or "
+        "give --camera moving), and that the settings have their true names",
+    )
+    if not contradiction:
+        yield (
+            _BETWEEN.grade(lens.left_out_px / max(floor, 1e-9)),
+            f"the error at settings left out is {lens.left_out_px:.3g} px, but the noise floor "
+            f"{floor:.3g} px, so the lens changes too much between the settings",
+            "add settings where the parameters change most",
+        )
+    share = _alpha_share(lens)
+    yield (
+        _ALPHA.grade(share),
+        f"the std of the focal length is up to {100 * share:.2g} % of its value between the settings",
+        "add settings where the parameters change most, and points",
+    )
