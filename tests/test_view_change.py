@@ -91,7 +91,7 @@ def clean_sets_told(seeds: range) -> int:
 
 
 def test_clean_views_are_of_one_camera_and_a_flat_board() -> None:
-    assert clean_sets_told(range(20)) <= 1
+    assert clean_sets_told(range(12)) <= 1
 
 
 @pytest.mark.slow

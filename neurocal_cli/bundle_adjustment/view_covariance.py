@@ -8,8 +8,8 @@ step, d_v = -(S - S_v)^-1 g_v with the poses eliminated, and
     covariance = (V - 1) / V  sum_v (d_v - mean) (d_v - mean)^T.
 
 With few views it is a rough measure. Taken always, it would make the std of clean data a third too large at
-five views, and a fifth at ten. So it is taken only where views contradict each other more than chance allows,
-and nowhere below the normal matrix's. Views that repeat a pose (`repeated_poses`) are one view here.
+five views, and a quarter at ten. So it is taken only where views contradict each other more than chance
+allows, and nowhere below the normal matrix's. Views that repeat a pose (`repeated_poses`) are one view here.
 """
 
 from __future__ import annotations
