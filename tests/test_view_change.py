@@ -76,7 +76,7 @@ def test_a_camera_that_changes_is_told_with_the_cause(change: str, share: float)
 @pytest.mark.parametrize("change", list(CHANGES))
 def test_changes_of_all_sizes(change: str, share: float) -> None:
     make, words = CHANGES[change]
-    least = {0.002: 0, 0.005: 0 if change == "any half scaled" else 10, 0.01: 20, 0.02: 24}[share]
+    least = {0.002: 0, 0.005: 0 if change == "any half scaled" else 7, 0.01: 20, 0.02: 24}[share]
     assert told(make(share), share, words, range(30)) >= least
 
 
