@@ -68,7 +68,7 @@ def test_curls_of_all_sizes(by: float) -> None:
         wrong = off > 3 * cal.std["alpha_u"] or off > 0.01 * ALPHA
         assert not (wrong and cal.verdict.word == "good")
         named += any("it seems bent by" in reason for reason in cal.verdict.reasons)
-    assert named >= 27 - 6 * (by < 0.3)
+    assert named >= (21 if by < 0.4 else 27)
 
 
 @pytest.mark.parametrize(

@@ -84,7 +84,7 @@ def test_the_std_of_frames_is_that_of_their_poses(own: float) -> None:
 
 
 def test_frames_do_not_ask_for_coefficients_that_their_poses_do_not() -> None:
-    found = [calibrate(frames(5, 8, np.random.default_rng([seed, 8]), 0.02)) for seed in range(4)]
+    found = [calibrate(frames(5, 8, np.random.default_rng([seed, 8]), 0.02)) for seed in range(2)]
     # Of five poses, a fisheye's two coefficients predict as well as k1 and k2.
     assert all(c.distortion_model in ("k1k2", "k1k2p1p2", "plumb_bob", "fisheye") for c in found)
     assert all("40 views show only 5 different poses" in " ".join(c.verdict.reasons) for c in found)

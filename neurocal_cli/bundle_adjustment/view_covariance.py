@@ -8,8 +8,8 @@ step, d_v = -(S - S_v)^-1 g_v with the poses eliminated, and
     covariance = (V - 1) / V  sum_v (d_v - mean) (d_v - mean)^T.
 
 With few views it is a rough measure. Taken always, it would make the std of clean data a third too large at
-five views, and a fifth at ten. So it is taken only where views contradict each other more than chance allows,
-and nowhere below the normal matrix's. Views that repeat a pose (`repeated_poses`) are one view here.
+five views, and a quarter at ten. So it is taken only where views contradict each other more than chance
+allows, and nowhere below the normal matrix's. Views that repeat a pose (`repeated_poses`) are one view here.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
-from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
+from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan, solve_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 
 __all__ = ["counting_views", "scores_of_poses"]
@@ -34,6 +34,8 @@ _CHANCE = 1.645  # sigmas: one clean set in twenty
 _FEWEST = 3  # poses, of which one can be left out and two still differ
 
 
+# What nothing determines is infinite or nan, and told so by the results.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def counting_views(
     found: Covariance,
     normal: Array,
@@ -72,6 +74,7 @@ def counting_views(
     return replace(found, entries=entries, poses=_followed(found, normal, free, free_poses, entries))
 
 
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def scores_of_poses(
     normal: Array, free: NDArray[np.bool_], free_poses: bool, repeated: RepeatedPoses
 ) -> Quadratics:
@@ -81,8 +84,7 @@ def scores_of_poses(
 
 def _weighed(q: Quadratics, times: Array) -> Quadratics:
     S, g = q.S / times[:, None, None], q.g / times[:, None]
-    step = np.linalg.solve(S.sum(axis=0), g.sum(axis=0))
-    return Quadratics(S, g - S @ step, q.cost / times)
+    return Quadratics(S, g - S @ solve_or_nan(S.sum(axis=0), g.sum(axis=0)), q.cost / times)
 
 
 def _by_pose(q: Quadratics, repeated: RepeatedPoses) -> Quadratics:

@@ -180,7 +180,7 @@ class _ScoreTest:
             chi = self.s**2 / self.information / self.variance
             shared = ((self.B @ self.S_inverse) * self.B).sum(axis=1) / self.information
         usable = np.isfinite(chi) & np.isfinite(shared)
-        return float(chi[usable].sum()), float((1.0 - shared[usable]).sum())
+        return float(chi[usable].sum()), max(float((1.0 - shared[usable]).sum()), 1.0)
 
 
 def _patterns(test: _ScoreTest, place: Array) -> Iterator[tuple[str, NDArray[np.bool_], float, float]]:
