@@ -35,6 +35,13 @@ def test_a_print_that_is_stretched_is_measured(by: float) -> None:
     assert board.stretch == pytest.approx(by, rel=0.2)
 
 
+def test_a_stretch_is_named_before_its_effects() -> None:
+    verdict = stretched(0.005, 1).verdict
+    assert verdict is not None
+    assert "it seems stretched by 0.49 % along X" in verdict.reasons[0]
+    assert "two halves" in " ".join(verdict.reasons[1:])
+
+
 @pytest.mark.slow
 def test_no_flat_board_is_called_bent_or_stretched() -> None:
     for seed in range(200):

@@ -72,8 +72,11 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
-    yield from common_errors(evidence, calibration.unit)
-    yield from _errors(calibration, evidence)
+    errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
+    # What the errors have in common is their cause, even where it costs the camera little.
+    for grade, reason, advice in common_errors(evidence, calibration.unit):
+        yield max(grade, int(bool(errors))), reason, advice
+    yield from errors
     yield from given_parameters(evidence.asked_for, calibration.intrinsics, calibration.std)
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
@@ -95,11 +98,9 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         yield (
             _CONTRADICTION.grade(e.contradiction),
             f"the error is {e.contradiction:.2g} times the noise floor, which is {e.precision_px:.3g} px "
-            "(the "
-            "error of a separate camera for each view)",
+            "(the error of a separate camera for each view)",
             "check that all views are of one camera at one zoom and focus, that the target has the true "
-            "shape, "
-            "and that given parameters are right",
+            "shape, and that given parameters are right",
         )
     if e.rmse_px > 1e-6 * spread:
         yield (
