@@ -84,7 +84,8 @@ def test_standard_deviations_of_a_rig_hold(rigs: int) -> None:
             rig = calibrate_stereo(*points, skew=False, distortion="none", outliers="keep")
             kept.append([(rig.t[k] - scene.rig.t[k]) / rig.std[f"t_{axis}"] for k, axis in enumerate("xyz")])
     assert 1 - 1.1 / np.sqrt(rigs) < rms(one_way) < 1 + 1.1 / np.sqrt(rigs)  # 0.2 for thirty
-    assert rms(both_ways) > 2.0
+    # The jackknife over pairs makes up for taking places along the edges for measurements of their own.
+    assert 0.7 < rms(both_ways) < 1.5  # 2.0 and more for those of the normal matrix
 
 
 def test_the_level_of_the_noise_is_that_of_the_measurement() -> None:
