@@ -84,7 +84,8 @@ def test_standard_deviations_of_a_rig_hold(rigs: int) -> None:
             rig = calibrate_stereo(*points, skew=False, distortion="none", outliers="keep")
             kept.append([(rig.t[k] - scene.rig.t[k]) / rig.std[f"t_{axis}"] for k, axis in enumerate("xyz")])
     assert 1 - 1.1 / np.sqrt(rigs) < rms(one_way) < 1 + 1.1 / np.sqrt(rigs)  # 0.2 for thirty
-    assert rms(both_ways) > 2.0
+    # Taken for measured both ways, the pairs contradict each other by more than noise, so pairs are counted.
+    assert rms(both_ways) < 1.6  # more than 2 where points are counted
 
 
 def test_the_level_of_the_noise_is_that_of_the_measurement() -> None:
