@@ -68,10 +68,11 @@ def select_model(solution: Solution, more_starts: Callable[[], Iterable[CameraSt
     problem, views = solution.problem, solution.problem.views
     by_views = _views_can_spare_any(solution)
     fitted = fit_candidates(problem, solution.state, by_views)
-    limit = _limit(views, fitted)
-    if limit > 0:
+    if (limit := _limit(views, fitted)) > 0:
         for start in more_starts():
             _join(fitted, fit_candidates(problem, start, by_views), limit)
+            if (limit := _limit(views, fitted)) == 0:
+                break
     if not fitted:  # not even the pinhole settled: as it is
         return replace(solution, model_errors={})
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first

@@ -6,8 +6,9 @@ camera and a pose. The division model (Fitzgibbon 2001), with a second term, tak
     m_u = c + (m - c) / (1 + lambda_1 (|m - c| / r)^2 + lambda_2 (|m - c| / r)^4),
 
 c being the middle of the image and r the distance of the farthest point. Of many values of the two numbers
-those are taken whose pixels the free networks of all views fit best, in units of the spread of these
-pixels: nothing about the camera need be known for that. The camera that follows from these networks, with
+those are taken with which the free networks of all views fit best, as seen in the pixels that were given:
+every undistorted pixel has the noise of a given one, magnified. Nothing about the camera need be known for
+that. The camera that follows from these networks, with
 the distortion expressed by a model's coefficients, is a start for bundle adjustment.
 """
 
@@ -126,23 +127,40 @@ class _Search:
         """The problem of a pinhole that sees the pixels without this distortion."""
         points = self.problem.points
         away = points.pixels - self.middle
-        share = (away**2).sum(axis=1, keepdims=True) / self.reach**2
-        pixels = self.middle + away / _divisor(strength, share)
-        seen = Correspondences(points.world, pixels, points.view)
+        share = self._share()
+        variance = _magnification(strength, share)
+        seen = Correspondences(
+            points.world,
+            self.middle + away / _divisor(strength, share)[:, None],
+            points.view,
+            covariance=np.column_stack([variance, np.zeros_like(variance), variance]),
+        )
         return self.problem.with_model("none").with_points(seen)
 
     def error(self, strength: Array) -> float:
-        """Squared error of all free networks, in units of the spread of the pixels."""
+        """Squared error of all free networks in the pixels that were given."""
         problem, scan = self.corrected(strength), options_for("lm", _SCAN_STARTS, self.options.seed)
         able = np.ones(problem.views.n_views, dtype=bool)
         groups, _ = train_networks(problem, scan, np.random.default_rng(scan.seed), able)
-        error = sum(float(group.bound.sum()) for group in groups)
-        return error if np.isfinite(error) else np.inf
+        # The networks' weights have mean 1.
+        weight = problem.views.pixel_scale**2 * (1 / _magnification(strength, self._share())).mean()
+        error = weight * sum(float(group.bound.sum()) for group in groups)
+        return float(error) if np.isfinite(error) else np.inf
+
+    def _share(self) -> Array:
+        """(N,) squared distances from the middle, the farthest being 1."""
+        return np.asarray(((self.problem.points.pixels - self.middle) ** 2).sum(axis=1) / self.reach**2)
 
 
 def _divisor(strength: Array, share: Array) -> Array:
     """Of the division model, at a share of the farthest point's squared distance."""
     return np.asarray(1 + share * (strength[0] + strength[1] * share))
+
+
+def _magnification(strength: Array, share: Array) -> Array:
+    """By which an area of the image becomes larger: along the radius times across it."""
+    D, slope = _divisor(strength, share), strength[0] + 2 * strength[1] * share
+    return np.asarray((D - 2 * share * slope) / D**3)
 
 
 def _one_to_one(strength: Array) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +14,11 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.distortion.candidate_models import fit_candidates
+from neurocal_cli.distortion.candidate_models import fit_candidates, supported
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
+from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
 from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.initialisation.options import Options
@@ -25,6 +27,9 @@ from neurocal_cli.points import Correspondences
 
 __all__ = ["fit", "fit_again"]
 
+# Joins the pinhole's networks where a radial model leads to nothing, as with a centre of distortion far off.
+# Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
+_FIRST_MODEL = "k1k2"
 # Starts that lead to a pole of the distortion, or into the camera's plane, are told so by what they cost.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
@@ -105,6 +110,10 @@ def _distorted_starts(problem: Problem, options: Options) -> Iterator[CameraStat
     found = radial_start(problem, options)
     if found is not None:
         yield found.state
+    first = supported(problem, _FIRST_MODEL)
+    if first is not None:
+        with suppress(DegenerateGeometryError):
+            yield _turned(solve(first, options)).state
 
 
 def _through_distortion(problem: Problem, options: Options) -> Solution | None:
