@@ -6,6 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.cross_validation import left_out_errors
 from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions
 from neurocal_cli.zoom_lens.joint_training import Joint
@@ -61,10 +63,18 @@ def _without_views(constants: Constants, still: bool) -> Constants:
 
 
 def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions) -> ZoomLens:
-    """The lens with its errors and warnings."""
+    """The lens with its errors and warnings.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The networks follow no camera at one of the settings.
+    """
     lens = provisional(start, joints, options)
     x = start.controls
-    local = np.mean([member.nets.local(x) for member in lens.members], axis=0)
+    each = np.array([member.nets.local(x) for member in lens.members])
+    _refuse_contradiction(lens, each)
+    local = each.mean(axis=0)
     constants = start.tables.constants if not lens.still else lens.predict(lens.settings[:1]).constants
     constants = replace(constants, theta=float(np.mean([joint.constants.theta for joint in joints])))
     there, _ = start.data.linearise(local, constants)
@@ -76,6 +86,18 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
     finished = replace(lens, rmse=rmse, left_out_px=left_out)
     return replace(finished, warnings=_warnings(finished, start, tables_rms))
+
+
+def _refuse_contradiction(lens: ZoomLens, each: Array) -> None:
+    """Networks (M, S, L) that give no camera at a setting which they learnt: the settings are of no one lens."""
+    valid = (np.isfinite(each).all(axis=2) & (each[:, :, :2] > 0).all(axis=2)).all(axis=0)
+    if valid.all():
+        return
+    where = describe(lens.controls, lens.settings[int(np.argmin(valid))])
+    raise DegenerateGeometryError(
+        f"no lens fits all the settings: the networks give no camera at {where}; check the names, the unit "
+        "of X,Y,Z and the image size of every setting"
+    )
 
 
 def _warnings(lens: ZoomLens, start: CalibratedSettings, tables_rms: float) -> tuple[str, ...]:
