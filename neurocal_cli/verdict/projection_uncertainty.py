@@ -47,6 +47,12 @@ class ProjectionUncertainty:
     depths: Array
     std: Array
 
+    @property
+    def worst(self) -> float:
+        """Largest one at the points' middle distance [px]; nan where the camera sees no place of the image."""
+        seen = self.std[1][np.isfinite(self.std[1])]
+        return float(seen.max()) if seen.size else float("nan")
+
 
 def image_grid(size: tuple[int, int]) -> Array:
     """Places all over an image, its corners among them; (G, 2)."""

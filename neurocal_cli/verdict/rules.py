@@ -54,7 +54,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
     word = WORDS[max((f[0] for f in findings), default=0)]
     advice = tuple(dict.fromkeys(f[2] for f in findings if f[2]))
     projection = evidence.projection
-    worst = float(np.nanmax(projection.std[1])) if projection is not None else float("nan")
+    worst = projection.worst if projection is not None else float("nan")
     measures = {
         "held_out_px": evidence.held_out_px,
         "precision_px": evidence.precision_px,
@@ -234,7 +234,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         centre = max(std["u0"], std["v0"])
         yield _CENTRE.grade(centre / A.alpha_u), f"the std of the image centre is {centre:.2g} px", more
     if e.projection is not None and calibration.type != 3:
-        worst = float(np.nanmax(e.projection.std[1]))
+        worst = e.projection.worst
         diagonal = float(np.hypot(*(calibration.image_size or (np.nan, np.nan))))
         yield (
             _PROJECTION.grade(worst / diagonal),
