@@ -49,7 +49,7 @@ class ProjectionUncertainty:
 
     @property
     def worst(self) -> float:
-        """Largest one at the points' middle distance [px]; nan where the camera sees no place of the image."""
+        """Largest one at the points' middle distance [px]; nan where the camera sees nothing of the image."""
         seen = self.std[1][np.isfinite(self.std[1])]
         return float(seen.max()) if seen.size else float("nan")
 
