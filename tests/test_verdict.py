@@ -11,7 +11,7 @@ from support.distorted import bent_set
 from support.scenes import Scene, pinhole, random_flat_set, table_1
 from support.wrong_inputs import flat
 
-from neurocal_cli import Calibration, Correspondences, calibrate
+from neurocal_cli import Calibration, Correspondences, Pose, calibrate
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
 from neurocal_cli.verdict.assessment import assess, gather_evidence
 
@@ -109,3 +109,17 @@ def test_a_calibration_without_an_image_size_is_judged_without_the_image() -> No
 def test_zhangs_views_are_good_with_their_lens_and_not_without(zhang: Correspondences) -> None:
     assert assess(calibrate(zhang)).word == "good"
     assert assess(calibrate(zhang, distortion="none")).word == "usable"
+
+
+def test_poses_with_points_behind_the_camera_are_poor() -> None:
+    found = calibrate(flat(10))
+    name, view = next(iter(found.views.items()))
+    for depth in (0.0, -500.0):
+        # The first point lies in the camera's plane, or behind it.
+        first = found.points.world[found.points.view_index == 0][0]
+        t = view.pose.t + np.array([0.0, 0.0, depth - view.pose.R[2] @ first - view.pose.t[2]])
+        edited = replace(found, views={**found.views, name: replace(view, pose=Pose(view.pose.R, t))})
+        verdict = assess(edited)
+        assert verdict is not None
+        assert verdict.word == "poor"
+        assert "behind the camera" in verdict.reasons[0]

@@ -52,10 +52,13 @@ from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 __all__ = ["assess", "gather_evidence"]
 
 _STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
+_IN_PLANE = 1e-9  # depth over the largest one that rounding leaves of 0
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
 
+# A file that was edited may have points in the camera's plane: what is measured of it says so.
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def gather_evidence(calibration: Calibration) -> Evidence:
     """Measure how good a calibration is.
 
@@ -71,7 +74,24 @@ def assess(calibration: Calibration) -> Verdict | None:
     """Good, usable or poor, with the reasons; None for a calibration that holds no points of its own."""
     if not calibration.views or set(calibration.points.view_names) != set(calibration.views):
         return None
+    behind = _views_behind(calibration)
+    if behind:
+        return Verdict(
+            "poor",
+            (f"points lie behind the camera in {behind} of {len(calibration.views)} views",),
+            ("calibrate again, because the poses of these views were changed",),
+            {},
+        )
     return reach_verdict(calibration, gather_evidence(calibration))
+
+
+def _views_behind(calibration: Calibration) -> int:
+    """How many views have points behind the camera, or in its plane, as their stored poses say."""
+    points = calibration.points
+    poses = [calibration.views[name].pose for name in points.view_names]
+    axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
+    depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
+    return len(np.unique(points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]))
 
 
 class _AtMinimum:
