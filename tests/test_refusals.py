@@ -417,7 +417,7 @@ def anything_is_answered_or_refused(seed: int) -> None:
                 assert "\n" not in str(error)  # noqa: PT017
 
 
-@settings(max_examples=3, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=2, deadline=None, suppress_health_check=list(HealthCheck))
 @given(st.integers(0, 10**9))
 def test_any_numbers_are_answered_or_refused(seed: int) -> None:
     anything_is_answered_or_refused(seed)

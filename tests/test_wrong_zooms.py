@@ -7,17 +7,14 @@ import re
 import pytest
 from support.wrong_zooms import WRONG, good, outcome
 
-QUICK = "one setting with wrong pixels"
-
 
 @pytest.mark.slow
 def test_the_points_that_are_spoilt_are_good() -> None:
     assert outcome(good()) == ("good", ())
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == QUICK else pytest.mark.slow) for name in WRONG]
-)
+@pytest.mark.slow  # tests/test_zoom_lens.py has a quick one
+@pytest.mark.parametrize("name", WRONG)
 def test_no_wrong_zoom_lens_ends_as_good(name: str) -> None:
     spoilt, cause = WRONG[name]
     word, reasons = outcome(spoilt())
