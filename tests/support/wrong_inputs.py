@@ -499,6 +499,7 @@ CAUSES: dict[str, str] = {
 # Those of which no reason names the cause yet.
 UNNAMED = frozenset(
     {
+        "X in mm, Y in cm",
         "noise of 6 px",
         "four points of the board out of its plane",
         "folded target: one plane a square off",
