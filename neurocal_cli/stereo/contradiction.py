@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.stereo.odd_pairs import odd_pairs
 from neurocal_cli.stereo.relative_poses import RelativePoses
@@ -96,11 +97,7 @@ def is_significant(squares: float, degrees: int) -> bool:
     >>> is_significant(70.0, 54), is_significant(100.0, 54)
     (False, True)
     """
-    if degrees < 1:
-        return False
-    # Wilson and Hilferty (1931): the cube root of a chi-squared variable is nearly normal.
-    part = 2.0 / (9.0 * degrees)
-    return bool(squares / degrees > (1.0 - part + _LEVEL * np.sqrt(part)) ** 3)
+    return degrees > 0 and bool(squares / degrees > exceeded_by_chance(degrees, _LEVEL))
 
 
 def contradiction(

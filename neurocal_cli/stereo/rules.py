@@ -11,6 +11,7 @@ from neurocal_cli.stereo.contradiction import Contradiction
 from neurocal_cli.stereo.evidence import RigEvidence
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import MOVED, pair_name, told_of_faults, told_of_move
+from neurocal_cli.verdict.findings import WORDS, Finding, verdict_of
 from neurocal_cli.verdict.limits import Limit
 
 __all__ = ["reach_rig_verdict"]
@@ -26,8 +27,6 @@ _DEPTH = Limit(0.01, 0.05)  # std over the depth
 _BASELINE = Limit(0.01, 0.05)  # std over the baseline
 _LEFT_OUT = Limit(0.0, 0.34)  # share of the pairs
 
-_Finding = tuple[int, str, str]  # grade, reason, advice
-_WORDS = ("good", "usable", "poor")
 _MOMENT = (
     "trigger both cameras at the same moment, or hold the target still; check that the cameras are fixed"
 )
@@ -40,9 +39,6 @@ def reach_rig_verdict(rig: Rig, evidence: RigEvidence) -> Verdict:
     -------
     Verdict
     """
-    findings = [finding for finding in _findings(rig, evidence) if finding[0] > 0]
-    findings.sort(key=lambda finding: -finding[0])
-    word = _WORDS[max((finding[0] for finding in findings), default=0)]
     nan = float("nan")
     found = evidence.contradiction
     measures = {
@@ -53,15 +49,10 @@ def reach_rig_verdict(rig: Rig, evidence: RigEvidence) -> Verdict:
         "depth": evidence.depth,
         "depth_share": evidence.depth_share,
     }
-    return Verdict(
-        word,
-        tuple(dict.fromkeys(finding[1] for finding in findings if finding[1])),
-        tuple(dict.fromkeys(finding[2] for finding in findings if finding[2])),
-        measures,
-    )
+    return verdict_of(_findings(rig, evidence), measures)
 
 
-def _findings(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
+def _findings(rig: Rig, e: RigEvidence) -> Iterator[Finding]:
     if not rig.converged:
         yield 2, f"training did not converge: {rig.stop_reason}", "increase --starts"
     yield from _pairs(rig, e)
@@ -70,12 +61,12 @@ def _findings(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
         if verdict is not None:
             # Reasons and advice come the worst first.
             for k, reason in enumerate(verdict.reasons):
-                yield (1 if k else _WORDS.index(verdict.word)), f"{side} camera: {reason}", ""
+                yield (1 if k else WORDS.index(verdict.word)), f"{side} camera: {reason}", ""
             for k, advice in enumerate(verdict.advice):
-                yield (1 if k else _WORDS.index(verdict.word)), "", advice
+                yield (1 if k else WORDS.index(verdict.word)), "", advice
 
 
-def _pairs(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
+def _pairs(rig: Rig, e: RigEvidence) -> Iterator[Finding]:
     """Whether the pairs agree on one rig."""
     if len(rig.pairs) == 1:
         yield 1, "the rig rests on one pair of views, and nothing checks it", "add pairs of views"
@@ -109,14 +100,14 @@ def _pairs(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
     )
 
 
-def _rig_moved(rig: Rig, e: RigEvidence, found: Contradiction) -> _Finding:
+def _rig_moved(rig: Rig, e: RigEvidence, found: Contradiction) -> Finding:
     used = set(rig.pairs)
     kept = [part for part in (e.names[: found.at], e.names[found.at :]) if used & set(part)]
     text, advice = told_of_move(e.names, e.size, found.at, kept[0] if len(kept) == 1 else ())
     return _CHANGE.grade(found.gain), text, advice
 
 
-def _changed(e: RigEvidence, found: Contradiction) -> _Finding:
+def _changed(e: RigEvidence, found: Contradiction) -> Finding:
     """A focal length that changed, or images that were taken at different moments."""
     grade = _CHANGE.grade(found.gain)
     if found.kind in ("late", "early"):
@@ -138,7 +129,7 @@ def _changed(e: RigEvidence, found: Contradiction) -> _Finding:
     )
 
 
-def _precision(rig: Rig, e: RigEvidence) -> Iterator[_Finding]:
+def _precision(rig: Rig, e: RigEvidence) -> Iterator[Finding]:
     more = "add pairs of views in which the target is near, tilted and fills both images"
     yield (
         _DEPTH.grade(e.depth_share),

@@ -8,6 +8,7 @@ import numpy as np
 
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.findings import Finding, name_some
 from neurocal_cli.verdict.view_change import ViewChange
 
 __all__ = ["common_errors"]
@@ -21,9 +22,6 @@ _SIGMAS = 2.0
 # Times the noise floor that may be left when a cause is taken away: what leaves more is not the cause, or not
 # the only one. Of the wrong inputs, true causes leave up to 1.04 and others 1.38 and more.
 _LEFT = 1.25
-_SHOWN = 3  # names
-
-Finding = tuple[int, str, str]  # grade, reason, advice
 
 
 def common_errors(evidence: Evidence, unit: str) -> Iterator[Finding]:
@@ -61,11 +59,9 @@ def _changed(change: ViewChange) -> Finding:
     elif change.pattern == "step":
         reason = f"{what} {grows} by {percent} from view {change.views[0]} on, so zoom or focus has moved"
     else:
-        shown = ", ".join(change.views[:_SHOWN])
-        more = f" and {len(change.views) - _SHOWN} more" if len(change.views) > _SHOWN else ""
         reason = (
-            f"{shown}{more}: these views are scaled by {1 + change.amount:.4g} against the others, so the "
-            "images are of two sizes, or of two settings of zoom or focus"
+            f"{name_some(change.views)}: these views are scaled by {1 + change.amount:.4g} against the "
+            "others, so the images are of two sizes, or of two settings of zoom or focus"
         )
     return (
         int(size > _CHANGED) + int(size > _MUCH_CHANGED),

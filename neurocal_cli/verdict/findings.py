@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
+from neurocal_cli.calibration import Verdict
 from neurocal_cli.points import Correspondences
 
-__all__ = ["WORDS", "Finding", "image_diagonal", "name_some", "pixel_spread"]
+__all__ = ["WORDS", "Finding", "image_diagonal", "name_some", "pixel_spread", "verdict_of"]
 
 WORDS = ("good", "usable", "poor")
 """By grade."""
@@ -17,6 +18,17 @@ Finding = tuple[int, str, str]
 """Grade (0 good, 1 usable, 2 poor), reason, advice."""
 
 _SHOWN = 3
+
+
+def verdict_of(findings: Iterable[Finding], measures: Mapping[str, float]) -> Verdict:
+    """The word of the worst finding, with all reasons and advice, the worst first and each once."""
+    found = sorted((f for f in findings if f[0] > 0), key=lambda f: -f[0])
+    return Verdict(
+        WORDS[found[0][0] if found else 0],
+        tuple(dict.fromkeys(f[1] for f in found if f[1])),
+        tuple(dict.fromkeys(f[2] for f in found if f[2])),
+        measures,
+    )
 
 
 def name_some(names: Iterable[object]) -> str:

@@ -11,7 +11,7 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.geometry import Array
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
-from neurocal_cli.verdict.findings import WORDS, Finding, image_diagonal, name_some, pixel_spread
+from neurocal_cli.verdict.findings import Finding, image_diagonal, name_some, pixel_spread, verdict_of
 from neurocal_cli.verdict.given_parameters import AskedFor
 from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
@@ -49,10 +49,6 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
     -------
     Verdict
     """
-    findings = [f for f in _findings(calibration, evidence) if f[0] > 0]
-    findings.sort(key=lambda f: -f[0])
-    word = WORDS[max((f[0] for f in findings), default=0)]
-    advice = tuple(dict.fromkeys(f[2] for f in findings if f[2]))
     projection = evidence.projection
     worst = projection.worst if projection is not None else float("nan")
     measures = {
@@ -66,7 +62,7 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
         "projection_px": worst,
         "condition": evidence.condition,
     }
-    return Verdict(word, tuple(f[1] for f in findings), advice, measures)
+    return verdict_of(_findings(calibration, evidence), measures)
 
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:

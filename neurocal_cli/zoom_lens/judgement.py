@@ -13,6 +13,7 @@ import numpy as np
 
 from neurocal_cli.calibration import Verdict
 from neurocal_cli.geometry import Array
+from neurocal_cli.verdict.findings import Finding, verdict_of
 from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.zoom_lens.settings import describe
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
@@ -28,8 +29,6 @@ _REJECTED = Limit(0.0, 0.2)  # share of the settings
 _ALPHA = Limit(0.01, 0.05)  # std over the value, of the worst setting
 _ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal, as of one camera
 
-_Finding = tuple[int, str, str]  # grade, reason, advice
-
 
 def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict | None:
     """Weigh what a lens holds; None for a lens of known cameras, which has no points.
@@ -42,17 +41,12 @@ def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict | 
     """
     if lens.known:
         return None
-    found = [*_findings(lens), _elsewhere(lens, elsewhere_px)]
-    findings = sorted((f for f in found if f[0] > 0), key=lambda finding: -finding[0])
-    word = ("good", "usable", "poor")[findings[0][0] if findings else 0]
     measures = {
         "held_out_px": lens.left_out_px,
         "precision_px": _floor(lens),
         "alpha_share": _alpha_share(lens),
     }
-    return Verdict(
-        word, tuple(f[1] for f in findings), tuple(dict.fromkeys(f[2] for f in findings)), measures
-    )
+    return verdict_of((*_findings(lens), _elsewhere(lens, elsewhere_px)), measures)
 
 
 def _floor(lens: ZoomLens) -> float:
@@ -80,7 +74,7 @@ def _between(lens: ZoomLens) -> Array:
     return np.concatenate(middles)
 
 
-def _elsewhere(lens: ZoomLens, px: float) -> _Finding:
+def _elsewhere(lens: ZoomLens, px: float) -> Finding:
     """What the error at other points says, such as at settings between."""
     floor = _floor(lens)
     return (
@@ -90,7 +84,7 @@ def _elsewhere(lens: ZoomLens, px: float) -> _Finding:
     )
 
 
-def _findings(lens: ZoomLens) -> Iterator[_Finding]:
+def _findings(lens: ZoomLens) -> Iterator[Finding]:
     if not lens.converged:
         yield (
             2,
