@@ -37,6 +37,7 @@ _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
 # Each with coefficients that the one before lacks.
 _CHAIN = ("k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")
 _SHORT = 1.4  # times the rms error of free networks: the camera may be a wrong one
+_VIEWS_THAT_TELL = 60  # of it: 1000 views take as long as these
 _BEHIND = 1.5  # times the squared error
 _LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
@@ -246,9 +247,15 @@ class _Chain:
 
 
 def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
-    """Whether every view by itself fits far better than the best of the common cameras."""
+    """Whether every view by itself fits far better than the best of the common cameras.
+
+    Of many views, some that lie evenly among them tell.
+    """
     best = min(fitted, key=lambda c: c.cost)
-    return best.cost > _SHORT**2 * float(free_networks(views, best.adjusted.state, _STEPS).sum()) + 1e-20
+    some = np.unique(np.linspace(0, views.n_views - 1, _VIEWS_THAT_TELL).round().astype(np.intp))
+    state = best.adjusted.state
+    own = free_networks(views.subset(some), replace(state, R=state.R[some], t=state.t[some]), _STEPS)
+    return float(best.adjusted.normal[some, -1, -1].sum()) > _SHORT**2 * float(own.sum()) + 1e-20
 
 
 def is_weak(problem: Problem, state: CameraState, cov: Covariance) -> bool:
