@@ -26,8 +26,10 @@ HOMES = {
 LEVELS = (
     {"errors", "geometry"},
     {"board", "camera", "least_squares", "median", "network", "points"},
+    {"target"},
     {"calibration", "training"},
     {"bundle_adjustment"},
+    {"target_shape"},
     {"verdict", "distortion", "initialisation"},
     {"pipeline"},
     {"methods"},
