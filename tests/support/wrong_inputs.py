@@ -425,7 +425,7 @@ CAUSES: dict[str, str] = {
     "image size turned": "width and height",
     "half of the points shifted by a square": "outliers",
     "half of the points of one view shifted by a square": "in view06",
-    "board bent by 4 mm": "target",
+    "board bent by 4 mm": "it seems bent by",
     "Z full of noise": "X,Y,Z",
     "half of the pixels anywhere": "of the points are outliers",
     "a fifth of the pixels anywhere": "of 930 points are outliers",
@@ -499,7 +499,6 @@ CAUSES: dict[str, str] = {
 # Those of which no reason names the cause yet.
 UNNAMED = frozenset(
     {
-        "X in mm, Y in cm",
         "noise of 6 px",
         "four points of the board out of its plane",
         "folded target: one plane a square off",
