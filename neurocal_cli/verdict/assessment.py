@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.bundle_adjustment.cross_validation import disagreement, held_out
+from neurocal_cli.bundle_adjustment.cross_validation import Minimum, disagreement, held_out
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
@@ -176,8 +176,11 @@ class _AtMinimum:
             return None
         return view_groups(self.views, self.state, self.normal, self.free)
 
+    def _minimum(self) -> Minimum:
+        return Minimum(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
+
     def _held_out(self) -> float:
-        lost = held_out(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
+        lost = held_out(self._minimum())
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
 
     def _precision(self) -> tuple[float, float]:
@@ -213,9 +216,7 @@ class _AtMinimum:
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:
             return np.nan
-        difference, cov = disagreement(
-            self.views, self.state, self.normal, self.free, self.free_poses, self.repeated
-        )
+        difference, cov = disagreement(self._minimum())
         if not np.isfinite(cov).all():
             return np.nan
         scale = np.sqrt(np.diagonal(cov))

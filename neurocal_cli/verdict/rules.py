@@ -41,6 +41,7 @@ _TOLD_APART = 5.0  # standard deviations
 _SHALLOW = 0.1  # depth over distance: the focal length of 200 points is known to about 1 %
 _FEW_POSES = 10  # where views repeat them
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
+_STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, however uncertain it is
 _NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
 _TOLD = 3.0  # standard deviations
 
@@ -267,10 +268,11 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 
 def _oblong(calibration: Calibration) -> bool:
-    """Whether the pixels are certainly not square."""
+    """Whether the pixels are not square: beyond doubt, or by far."""
     A, std = calibration.intrinsics, calibration.std
+    ratio = A.alpha_u / A.alpha_v
     told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
-    return abs(A.alpha_u / A.alpha_v - 1) > _OBLONG + told
+    return abs(ratio - 1) > _OBLONG + told or max(ratio, 1 / ratio) > _STRETCHED
 
 
 def _off_centre(calibration: Calibration) -> Iterator[Finding]:
