@@ -35,6 +35,7 @@ class StopReason(str, Enum):
     CONVERGED = "converged: the reprojection error is at a minimum"
     MAX_ITERATIONS = "stopped at the maximum number of iterations before the reprojection error settled"
     NO_AGREEMENT = "no two of the random starts agreed"
+    NOT_MINIMISED = "solved; the method does not minimise the reprojection error"
 
 
 @dataclass(frozen=True, eq=False)

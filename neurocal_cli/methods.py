@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DISTORTIONS", "METHODS", "OUTLIERS", "TRAINERS", "calibrate", "fit_poses"]
 
-METHODS = ("neuro",)
+METHODS = ("neuro", "linear", "nonlinear", "tsai")
 TRAINERS = ("lm", "backprop")
 DISTORTIONS = ("auto", *MODELS, "plumb-line")
 OUTLIERS = ("reject", "keep")
@@ -74,12 +74,15 @@ def calibrate(
         Type 3. The first two bring their distortion with them.
     extrinsics : dict of Pose by view name, optional
         Type 4.
-    method : {"neuro"}
+    method : {"neuro", "linear", "nonlinear", "tsai"}
+        The network; or one of the methods that the paper compares it with (`baselines`). These use all
+        points, outliers included, and have no random starts.
     trainer : {"lm", "backprop"}
     distortion : {"auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"}
         The distortion model whose coefficients are estimated with everything else; auto: the simplest that
-        the points support (`lens_choice`); plumb-line, the paper's way: k1, k2, p1 and p2 from the images
-        of straight lines alone, then the pinhole camera. Type 3 takes the one of the given camera instead.
+        the points support (`lens_choice`), with another method none, with tsai k1; plumb-line, the paper's
+        way: k1, k2, p1 and p2 from the images of straight lines alone, then the pinhole camera. Type 3 takes
+        the one of the given camera instead.
     skew : bool
         False: theta is pi/2.
     outliers : {"reject", "keep"}
@@ -113,6 +116,8 @@ def calibrate(
     given = None if intrinsics is None else camera_of(intrinsics)
     known, model = (given.intrinsics, given.distortion) if given else (None, Distortion())
     type_3 = isinstance(type, (int, np.integer)) and type == 3
+    if method != "neuro" and not type_3:
+        distortion = _distortion_of(method, distortion)
     if not type_3:
         model = Distortion() if distortion in _FOUND else Distortion(distortion)
     elif distortion not in ("auto", "none", model.model):
@@ -123,6 +128,12 @@ def calibrate(
     options = options_for(trainer, starts, seed, distortion=way, backprop=backprop, progress=progress)
     try:
         problem = problem_for(points, type, image_center, known, extrinsics, skew, model)
+        if method != "neuro":
+            from neurocal_cli.baselines.calibrate_by import calibrate_by
+
+            found = calibrate_by(method, problem, camera_name)
+            _refuse_misfit(found)
+            return replace(found, judgement=assess)
         if outliers == "reject":
             solution, rejected = fit_robustly(problem, options)
         else:
@@ -159,6 +170,15 @@ def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics
     problem = problem_for(points, 3, intrinsics=given.intrinsics, distortion=given.distortion)
     solution = fit(problem, options_for("lm", _STARTS, seed))
     return calibration_of(solution, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
+
+
+def _distortion_of(method: str, distortion: str) -> str:
+    """The distortion model of a method other than the network's."""
+    if distortion == "plumb-line":
+        raise UsageError(f"distortion plumb-line needs the method neuro, but the method is {method}")
+    if distortion == "auto":
+        return "k1" if method == "tsai" else "none"
+    return distortion
 
 
 def _refuse_misfit(calibration: Calibration) -> None:

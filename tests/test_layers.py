@@ -20,7 +20,7 @@ HOMES = {
     "rich": ("commands/",),
     "matplotlib": ("plots.py", "zoom_lens/plots.py"),
     "yaml": ("io/",),
-    "cv2": ("detection/", "simulation/", "io/images.py", "distortion/remapping.py"),
+    "cv2": ("baselines/opencv.py", "detection/", "simulation/", "io/images.py", "distortion/remapping.py"),
 }
 # Rooms, a folder or a module each, from the ground up: each imports from itself and from lower levels only.
 LEVELS = (
@@ -32,6 +32,7 @@ LEVELS = (
     {"target_shape"},
     {"verdict", "distortion", "initialisation"},
     {"pipeline"},
+    {"baselines"},
     {"methods"},
     {"evaluation"},
     {"report"},
