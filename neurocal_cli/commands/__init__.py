@@ -25,7 +25,7 @@ __all__ = ["neurocal"]
 # stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
     "calibrate": "Calibrate a camera from known points and their pixels.",
-    "convert": "Convert a camera or a rig to the format of another program.",
+    "convert": "Convert cameras, rigs and points to the formats of other programs.",
     "detect": "Detect chessboards in images and measure points on them.",
     "evaluate": "Measure the error of a calibrated camera or stereo rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
