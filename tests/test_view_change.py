@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.grouped_views import ALPHA, photographed, poses, rescaled
 from support.real_data import RealFiles
+from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate, read_points
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
@@ -67,7 +68,7 @@ CHANGES = {
 }
 
 
-@pytest.mark.parametrize("share", [0.01, 0.02])
+@pytest.mark.parametrize("share", slow_but((0.01,), (0.01, 0.02)))
 @pytest.mark.parametrize("change", ["drift", "every other image scaled"])
 def test_a_camera_that_changes_is_told_with_the_cause(change: str, share: float) -> None:
     make, words = CHANGES[change]

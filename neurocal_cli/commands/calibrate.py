@@ -70,6 +70,7 @@ def calibrate(
           --intrinsics camera.yaml -o poses.yaml
       neurocal calibrate sample_data/flat.csv --type 4 --extrinsics camera.yaml
       neurocal calibrate sample_data/flat.csv --method neuro --starts 40 --seed 1
+      neurocal calibrate sample_data/points.csv --method linear -o linear.yaml
       neurocal calibrate sample_data/points.csv --trainer backprop \\
           --epochs 20000 --rate 0.05 --rate-gamma 0.4
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -

@@ -72,6 +72,11 @@ class Estimation:
             raise UsageError("--type 3 does not change the given camera; leave out --no-skew")
         if self.type == "3" and self.distortion not in ("auto", "none"):
             raise UsageError("--type 3 uses the distortion model of the given camera; leave out --distortion")
+        if self.trainer != "lm" and self.method != "neuro":
+            raise UsageError(
+                f"--trainer {self.trainer} needs --method neuro, but the method is {self.method}; leave out "
+                "--trainer"
+            )
         for name, option in _BACKPROP_ONLY.items():
             if getattr(self, name) is not None and self.trainer != "backprop":
                 raise UsageError(
@@ -235,9 +240,11 @@ _OPTIONS = [
     ),
     click.option(
         "--method",
-        type=click.Choice(["neuro"]),
+        type=click.Choice(["neuro", "linear", "nonlinear", "tsai"]),
         default="neuro",
-        help="Estimation method: neuro trains the network and refines its result by bundle adjustment.",
+        help="Estimation method: neuro trains the network and refines its result by bundle adjustment. "
+        "linear is a closed form, nonlinear is Levenberg-Marquardt from it, tsai is two-stage radial "
+        "alignment; these three are for comparison, and use all points.",
     ),
     click.option(
         "--trainer",
