@@ -8,10 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.board import Board, Plane
+from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["TARGETS", "Target", "distinct_points", "planes_of"]
+__all__ = ["TARGETS", "Target", "board_of", "distinct_points", "is_flat", "planes_of"]
 
 TARGETS = ("auto", "given", "flat", "free")
 
@@ -91,6 +93,47 @@ class Target:
             along, across = np.linalg.svd(linear, compute_uv=False)
             worst = max(worst, float(along / across - 1))
         return worst
+
+
+def board_of(target: Target, unit: str) -> Board:
+    """The chessboard that a target is, with its points as they were found.
+
+    Raises
+    ------
+    InputError
+        The points have no ids of a chessboard.
+    """
+    if target.point is None:
+        raise InputError(
+            "the points have no ids, so they are no board's; calibrate from points that detect found"
+        )
+    planes: dict[str, list[tuple[tuple[float, float], Array, Array]]] = {}
+    for label, given, found in zip(target.point.tolist(), target.given, target.found, strict=True):
+        name, place = _place(str(label))
+        planes.setdefault(name, []).append((place, given, found))
+    return Board(tuple(_plane(name, rows) for name, rows in planes.items()), unit)
+
+
+def _place(label: str) -> tuple[str, tuple[float, float]]:
+    """Plane and grid place of an id ``[plane/]c:r``, ``[plane/]h:c:r`` or ``[plane/]v:c:r``."""
+    name, _, place = label.rpartition("/")
+    *kind, c, r = place.split(":") if place.count(":") in (1, 2) else ("?", "", "")
+    half = {(): (0.0, 0.0), ("h",): (0.5, 0.0), ("v",): (0.0, 0.5)}.get(tuple(kind))
+    if half is None or not (c.isdecimal() and r.isdecimal()):
+        raise InputError(f"the point {label!r} has no id of a chessboard; calibrate from points of detect")
+    return name, (int(c) + half[0], int(r) + half[1])
+
+
+def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> Plane:
+    grid = np.array([place for place, _, _ in rows])
+    given, found = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
+    unknowns = np.linalg.lstsq(np.column_stack([np.ones(len(grid)), grid]), given, rcond=None)[0]
+    square = float(np.linalg.norm(unknowns[1]))
+    x_axis, y_axis = unknowns[1:] / np.linalg.norm(unknowns[1:], axis=1)[:, None]
+    cols, rows_ = (np.ceil(grid.max(axis=0)) + 1).astype(int).tolist()
+    origin, x, y = (tuple((np.round(v, _DIGITS) + 0.0).tolist()) for v in (unknowns[0], x_axis, y_axis))
+    measured = tuple(map(tuple, np.column_stack([grid, found]).tolist()))
+    return Plane(name, cols, rows_, round(square, _DIGITS), origin, x, y, measured)
 
 
 def distinct_points(

@@ -18,14 +18,12 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.pipeline.fit import fit_again
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
-from neurocal_cli.target import Target, distinct_points
-from neurocal_cli.target_shape.find import Found, enough_views, find_target
+from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
+from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 
 __all__ = ["with_target"]
 
-# Of the logarithm of the evidence: a size for each of four parts, each at a level of one in a hundred.
-# Repeated by tests/test_target_shape.py (slow: clean sets keep the given target).
-_GAIN = 10.0
 _ROUNDS = 3
 
 
@@ -51,7 +49,7 @@ def with_target(
     if choice == "given" or solution.refusal or options.distortion == "plumb-line":
         return solution, rejected
     found = _found(solution, choice, None)
-    if found is None or (choice == "auto" and found.target.evidence < _GAIN):
+    if found is None or (choice == "auto" and found.target.evidence < LEAST_GAIN):
         return solution, rejected
     best: tuple[Solution, Rejected] = solution, rejected
     for _ in range(_ROUNDS):
@@ -71,11 +69,14 @@ def with_target(
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
     problem, views = solution.problem, solution.problem.views
-    _, label, _ = distinct_points([problem.points])
+    given, label, point = distinct_points([problem.points])
     repeated = repeated_poses(views, solution.state, point_residuals(views, solution.state))
-    if not enough_views(label, repeated.n_poses):
+    plane = planes_of(given, point) if known is None else known.plane
+    if not enough_views(label, repeated.n_poses, int(plane.max()) + 1):
         return None
-    return find_target([(problem, solution.adjusted)], choice == "flat", known)
+    # Only a lens that nobody named may change.
+    find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
+    return find([(problem, solution.adjusted)], choice == "flat", known)
 
 
 def _fitted_to(

@@ -22,12 +22,15 @@ from neurocal_cli.target_shape.information import Information, Sight, informatio
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, posterior
 from neurocal_cli.target_shape.prior import prior_of
 
-__all__ = ["Found", "enough_views", "find_target"]
+__all__ = ["LEAST_GAIN", "Found", "enough_views", "find_target"]
 
 _STEPS = 10
 _SETTLED = 0.02  # of the cameras' standard deviations
 _LARGEST = 0.02  # of the target's size: more is no target that happens to be bent
-_FEWEST = 3  # different views of most points
+_FEWEST, _FEWEST_OF_FOLDED = 3, 2  # different views of most points
+LEAST_GAIN = 10.0
+"""Of the logarithm of the evidence, for a target to be found unasked: sizes for four parts, each at a level
+of one in a hundred. tests/test_target_shape.py (slow) holds that clean sets keep the given target."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,15 +42,22 @@ class Found:
     target : Target
     fits : tuple of (Problem, Adjusted)
         Each problem's points are where the target has them.
+    evidence : float
+        Its logarithm, for cameras of any lens.
     """
 
     target: Target
     fits: tuple[tuple[Problem, Adjusted], ...]
+    evidence: float
 
 
-def enough_views(label: NDArray[np.intp], n_different: int) -> bool:
-    """Whether the points are seen often enough, from different sides, for a target to be found."""
-    return n_different >= _FEWEST and bool(np.median(np.bincount(label)) >= _FEWEST)
+def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -> bool:
+    """Whether the points are seen often enough, from different sides, for a target to be found.
+
+    Two views tell how the planes of a folded target stand; the bend of one plane takes three.
+    """
+    least = _FEWEST if n_planes == 1 else _FEWEST_OF_FOLDED
+    return n_different >= least and bool(np.median(np.bincount(label)) >= least)
 
 
 def find_target(
@@ -108,7 +118,7 @@ class _Search:
                 break
         gain = found.evidence - evidence_of_given(info)
         self._align()
-        return Found(self._target(found, gain), tuple(self.fits))
+        return Found(self._target(found, gain), tuple(self.fits), found.evidence)
 
     def _information(self) -> Information:
         sights = [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]

@@ -70,6 +70,7 @@ def target_uncertainty(
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
     found = known_sizes(info.around_given(offsets), prior, target.sizes, info.cost / spare)
     followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
+    followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # points of no target: -1
     normal = _efficient(views, state, np.flatnonzero(free), labelled(views, label), followed)
     return TargetUncertainty(found.variance * found.camera, normal, found.determined)
 
