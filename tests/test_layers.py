@@ -18,7 +18,7 @@ LIBRARY = [name for name in MODULES if not name.startswith("commands/") and name
 HOMES = {
     "click": ("commands/",),
     "rich": ("commands/",),
-    "matplotlib": ("plots.py", "zoom_lens/plots.py"),
+    "matplotlib": ("plots.py", "target_plot.py", "zoom_lens/plots.py"),
     "yaml": ("io/",),
     "cv2": (
         "baselines/opencv.py",
@@ -45,6 +45,7 @@ LEVELS = (
     {"report"},
     {"stereo"},
     {"plots"},
+    {"target_plot"},
     {"zoom_lens"},
     {"simulation"},
     {"io"},
