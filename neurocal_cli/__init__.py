@@ -10,7 +10,9 @@ network, training                     the calibrating network and its trainers
 bundle_adjustment                     the reprojection error of all views, its minimum, its covariance
 initialisation                        from random weights to a camera
 distortion                            which distortion model the data support; undistortion
-pipeline, methods                     `calibrate`: the fit, without outliers, as a result
+pipeline                              the fit, without outliers, as a result
+baselines                             the methods that the paper compares the network with, and OpenCV's
+methods                               `calibrate`
 verdict, evaluation, report           what a result is worth
 stereo, zoom_lens, plots              two cameras; a camera whose zoom and focus move; pictures
 simulation                            synthetic images and zoom lenses with their exact truth; not installed

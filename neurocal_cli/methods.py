@@ -19,7 +19,9 @@ from neurocal_cli.initialisation.options import Progress, options_for
 from neurocal_cli.pipeline.fit import fit
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.pipeline.result import calibration_of
+from neurocal_cli.pipeline.target_choice import with_target
 from neurocal_cli.points import Correspondences
+from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.verdict.assessment import assess
 from neurocal_cli.verdict.repeated_views import repeated_views
 
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
 
 __all__ = ["DISTORTIONS", "METHODS", "OUTLIERS", "TRAINERS", "calibrate", "fit_poses"]
 
-METHODS = ("neuro",)
+METHODS = ("neuro", "linear", "nonlinear", "tsai")
 TRAINERS = ("lm", "backprop")
 DISTORTIONS = ("auto", *MODELS, "plumb-line")
 OUTLIERS = ("reject", "keep")
@@ -51,6 +53,7 @@ def calibrate(
     outliers: str = "reject",
     seed: int = 0,
     *,
+    target: str | Target = "auto",
     starts: int = _STARTS,
     backprop: BackpropOptions | None = None,
     camera_name: str = "camera",
@@ -71,18 +74,25 @@ def calibrate(
         Type 3. The first two bring their distortion with them.
     extrinsics : dict of Pose by view name, optional
         Type 4.
-    method : {"neuro"}
+    method : {"neuro", "linear", "nonlinear", "tsai"}
+        The network; or one of the methods that the paper compares it with (`baselines`). These use all
+        points, outliers included, and have no random starts.
     trainer : {"lm", "backprop"}
     distortion : {"auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"}
         The distortion model whose coefficients are estimated with everything else; auto: the simplest that
-        the points support (`lens_choice`); plumb-line, the paper's way: k1, k2, p1 and p2 from the images
-        of straight lines alone, then the pinhole camera. Type 3 takes the one of the given camera instead.
+        the points support (`lens_choice`), with another method none, with tsai k1; plumb-line, the paper's
+        way: k1, k2, p1 and p2 from the images of straight lines alone, then the pinhole camera. Type 3 takes
+        the one of the given camera instead.
     skew : bool
         False: theta is pi/2.
     outliers : {"reject", "keep"}
         Whether points, and whole views, that contradict the others are set aside (`outlier_rejection`).
     seed : int
         Of the random weights; the same seed gives the same result.
+    target : {"auto", "given", "flat", "free"} or Target
+        Where the points of the target are: given, as they are given; free, found with the camera; flat,
+        found, but each left in its plane; auto: found where the data ask for it (`target_shape`). A target
+        that was found already: there.
     starts : int
         Most random starts for each network, at least 2.
     backprop : BackpropOptions, optional
@@ -103,10 +113,16 @@ def calibrate(
     InputError, DegenerateGeometryError
         Points that cannot give an answer, with the reason.
     """
-    _check_options(method, trainer, distortion, outliers, starts, seed)
+    known_target = target if isinstance(target, Target) else None
+    choice = "given" if isinstance(target, Target) else target
+    _check_options(method, trainer, distortion, outliers, choice, starts, seed)
+    if known_target is not None:
+        points = known_target.applied(points)
     given = None if intrinsics is None else camera_of(intrinsics)
     known, model = (given.intrinsics, given.distortion) if given else (None, Distortion())
     type_3 = isinstance(type, (int, np.integer)) and type == 3
+    if method != "neuro" and not type_3:
+        distortion = _distortion_of(method, distortion)
     if not type_3:
         model = Distortion() if distortion in _FOUND else Distortion(distortion)
     elif distortion not in ("auto", "none", model.model):
@@ -117,10 +133,19 @@ def calibrate(
     options = options_for(trainer, starts, seed, distortion=way, backprop=backprop, progress=progress)
     try:
         problem = problem_for(points, type, image_center, known, extrinsics, skew, model)
+        if method != "neuro":
+            from neurocal_cli.baselines.calibrate_by import calibrate_by
+
+            found = calibrate_by(method, problem, camera_name)
+            _refuse_misfit(found)
+            return replace(found, judgement=assess)
         if outliers == "reject":
             solution, rejected = fit_robustly(problem, options)
         else:
             solution, rejected = fit(problem, options), Rejected()
+        solution, rejected = with_target(problem, solution, rejected, options, choice)
+        if known_target is not None:
+            solution = replace(solution, target=known_target)
         if solution.refusal:
             raise DegenerateGeometryError(solution.refusal)
         found = calibration_of(
@@ -154,6 +179,15 @@ def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics
     return calibration_of(solution, Rejected(), trainer="lm", method="neuro", seed=seed, name="camera")
 
 
+def _distortion_of(method: str, distortion: str) -> str:
+    """The distortion model of a method other than the network's."""
+    if distortion == "plumb-line":
+        raise UsageError(f"distortion plumb-line needs the method neuro, but the method is {method}")
+    if distortion == "auto":
+        return "k1" if method == "tsai" else "none"
+    return distortion
+
+
 def _refuse_misfit(calibration: Calibration) -> None:
     """A camera that does not fit its points at all is no answer."""
     spread = np.sqrt(calibration.points.pixels.var(axis=0).sum())
@@ -166,12 +200,15 @@ def _refuse_misfit(calibration: Calibration) -> None:
     )
 
 
-def _check_options(method: str, trainer: str, distortion: str, outliers: str, starts: int, seed: int) -> None:
+def _check_options(
+    method: str, trainer: str, distortion: str, outliers: str, target: str, starts: int, seed: int
+) -> None:
     for name, value, choices in (
         ("method", method, METHODS),
         ("trainer", trainer, TRAINERS),
         ("distortion", distortion, DISTORTIONS),
         ("outliers", outliers, OUTLIERS),
+        ("target", target, TARGETS),
     ):
         if value not in choices:
             raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")

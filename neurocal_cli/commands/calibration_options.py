@@ -42,6 +42,7 @@ class Estimation:
     distortion: str
     no_skew: bool
     outliers: str
+    target: str
 
     @property
     def stdin_candidates(self) -> tuple[str | None, ...]:
@@ -72,6 +73,11 @@ class Estimation:
             raise UsageError("--type 3 does not change the given camera; leave out --no-skew")
         if self.type == "3" and self.distortion not in ("auto", "none"):
             raise UsageError("--type 3 uses the distortion model of the given camera; leave out --distortion")
+        if self.trainer != "lm" and self.method != "neuro":
+            raise UsageError(
+                f"--trainer {self.trainer} needs --method neuro, but the method is {self.method}; leave out "
+                "--trainer"
+            )
         for name, option in _BACKPROP_ONLY.items():
             if getattr(self, name) is not None and self.trainer != "backprop":
                 raise UsageError(
@@ -100,6 +106,7 @@ class Estimation:
             "distortion": self.distortion,
             "skew": not self.no_skew,
             "outliers": self.outliers,
+            "target": self.target,
             "seed": self.seed,
             "starts": self.starts,
             "backprop": self._backprop(),
@@ -235,9 +242,11 @@ _OPTIONS = [
     ),
     click.option(
         "--method",
-        type=click.Choice(["neuro"]),
+        type=click.Choice(["neuro", "linear", "nonlinear", "tsai"]),
         default="neuro",
-        help="Estimation method: neuro trains the network and refines its result by bundle adjustment.",
+        help="Estimation method: neuro trains the network and refines its result by bundle adjustment. "
+        "linear is a closed form, nonlinear is Levenberg-Marquardt from it, tsai is two-stage radial "
+        "alignment; these three are for comparison, and use all points.",
     ),
     click.option(
         "--trainer",
@@ -302,5 +311,13 @@ _OPTIONS = [
         default="reject",
         help="Treatment of outliers, which are points or whole views that contradict the others: reject "
         "leaves them out and lists them, keep uses all points.",
+    ),
+    click.option(
+        "--target",
+        type=click.Choice(["auto", "given", "flat", "free"]),
+        default="auto",
+        help="Where the points of the target are: given takes X, Y, Z as they are; free finds with the "
+        "camera how the target is bent and printed, which takes 3 views or more; flat does so within its "
+        "plane; auto finds it where the points ask for it.",
     ),
 ]

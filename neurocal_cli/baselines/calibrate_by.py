@@ -1,0 +1,94 @@
+"""A calibration by one of the baselines: the same checks, result and refusals as the network's."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.baselines.found import Found
+from neurocal_cli.baselines.linear import linear
+from neurocal_cli.baselines.nonlinear import nonlinear
+from neurocal_cli.baselines.opencv import opencv
+from neurocal_cli.baselines.tsai import tsai
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import normal_blocks
+from neurocal_cli.bundle_adjustment.solution import Solution, TrainingRecord
+from neurocal_cli.calibration import Calibration, Rejected, StopReason
+from neurocal_cli.distortion.given_distortion import check_distortion
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.pipeline.result import calibration_of
+
+__all__ = ["BASELINES", "calibrate_by"]
+
+BASELINES: dict[str, Callable[[Problem], Found]] = {
+    "linear": linear,
+    "nonlinear": nonlinear,
+    "tsai": tsai,
+    "opencv": opencv,
+}
+
+
+def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibration:
+    """Solve a problem by a baseline, with all of its points.
+
+    Parameters
+    ----------
+    method : str
+        One of `BASELINES`.
+    problem : Problem
+    name : str
+        Of the camera.
+
+    Returns
+    -------
+    Calibration
+        Its standard deviations are of the normal matrix at the answer. Where the method does not minimise
+        the reprojection error, they are what least squares would have, and a warning says so.
+
+    Raises
+    ------
+    UsageError
+        What the method cannot do.
+    InputError, DegenerateGeometryError
+        Points that cannot give an answer, with the reason.
+    """
+    found = BASELINES[method](problem)
+    solution = _solution(found)
+    calibration = calibration_of(solution, Rejected(), trainer="none", method=method, seed=0, name=name)
+    warnings = (*found.remarks, *calibration.warnings)
+    if not found.minimised:
+        warnings = (
+            f"the method {method} does not minimise the reprojection error; its standard deviations are "
+            "those of a fit that does",
+            *warnings,
+        )
+    reason = StopReason.CONVERGED if found.minimised else StopReason.NOT_MINIMISED
+    if not found.converged:
+        reason = StopReason.MAX_ITERATIONS
+    return replace(
+        calibration,
+        network=None,
+        converged=found.converged,
+        stop_reason=reason.value,
+        warnings=warnings,
+    )
+
+
+def _solution(found: Found) -> Solution:
+    """The answer as a solution of the problem, with the normal matrices that belong to it."""
+    problem, state = found.problem, found.state
+    normal, sensible = normal_blocks(problem.views.batches, state)
+    if not (sensible.all() and np.isfinite(normal).all()):
+        name = problem.views.names[int(np.argmin(sensible))]
+        raise DegenerateGeometryError(
+            f"the method finds a camera that has points of view {name!r} behind it; check that each pixel "
+            "belongs to its point, or use the method neuro"
+        )
+    cost = normal[:, -1, -1].copy()
+    adjusted = Adjusted(state, normal, cost, found.iterations, np.array([found.converged]))
+    record = TrainingRecord(np.full(problem.views.n_views, 2))
+    solution = Solution(problem, adjusted, record)
+    return check_distortion(solution) if problem.free_distortion else solution

@@ -1,0 +1,55 @@
+"""Homogeneous linear least squares with a unit constraint on the last few unknowns."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import Array
+
+__all__ = ["smallest"]
+
+_SINGULAR = 1e-12  # of a diagonal entry over the largest, below which rounding rules
+
+
+def smallest(rows: Array, constrained: int) -> Array:
+    """Minimise ``|C y + D z|`` over y, and over z with ``|z| = 1``, where ``rows = [C D]``.
+
+    QR takes y out: what is left is the smallest right singular vector of D's triangular remainder
+    (Faugeras and Toscani 1986 do the same on the normal equations, which costs half of the digits).
+
+    Parameters
+    ----------
+    rows : (K, m, n) array
+        K problems of m equations each.
+    constrained : int
+        Columns of D, the last ones.
+
+    Returns
+    -------
+    solution : (K, n) array
+        (y, z), each problem's sign open.
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The equations leave y open.
+    """
+    K, m, n = rows.shape
+    if m < n:
+        rows = np.concatenate([rows, np.zeros((K, n - m, n))], axis=1)
+    R = cast("Array", np.linalg.qr(rows, mode="r"))
+    free = n - constrained
+    z = np.linalg.svd(R[:, free:, free:])[2][:, -1]
+    if not free:
+        return np.asarray(z)
+    C, right = R[:, :free, :free], R[:, :free, free:] @ z[..., None]
+    diagonal = np.abs(np.diagonal(C, axis1=1, axis2=2))
+    if not (diagonal.min(axis=1) > _SINGULAR * diagonal.max(axis=1)).all():
+        raise DegenerateGeometryError(
+            "the points do not determine the linear equations of this method; give points that spread over "
+            "the image and in depth, or use the method neuro"
+        )
+    return np.concatenate([-np.linalg.solve(C, right)[..., 0], z], axis=1)

@@ -1,0 +1,88 @@
+"""OpenCV's `calibrateCamera`, for comparison: the tool that most people use.
+
+It has no skew, and a distortion model of its own choice; here the one that is asked for. Flat boards start
+from its closed form. For other targets it wants a first camera: it gets the one that tutorials give, with the
+centre in the middle of the image and a focal length of the image's width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.baselines.found import Found
+from neurocal_cli.bundle_adjustment.observability import check_points
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
+from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.errors import DegenerateGeometryError, UsageError
+
+__all__ = ["opencv"]
+
+_EPOCHS, _EPSILON = 1000, 1e-14
+_COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6
+
+
+def opencv(problem: Problem) -> Found:
+    """Calibrate by ``cv2.calibrateCamera`` (types 1 and 2).
+
+    Raises
+    ------
+    UsageError
+        Types 3 and 4; a distortion model that it does not have.
+    DegenerateGeometryError
+        OpenCV refuses, with its reason, or ends at numbers that are no camera.
+    """
+    import cv2
+
+    if problem.type not in (1, 2) or problem.distortion.model == "fisheye":
+        raise UsageError("OpenCV's calibrateCamera solves types 1 and 2, with the models none to rational")
+    free = problem.free.copy()
+    free[1] = False
+    problem = replace(problem, free=free, fixed=problem.fixed | {"theta"})
+    check_points(problem)
+    views, points = problem.views, problem.points
+    order = np.arange(len(points)) if views.order is None else views.order
+    parts = np.split(order, views.first[1:])
+    world = [np.ascontiguousarray(points.world[rows], dtype=np.float32) for rows in parts]
+    pixels = [np.ascontiguousarray(points.pixels[rows], dtype=np.float32) for rows in parts]
+    size = points.image_size or tuple(int(side) + 1 for side in points.pixels.max(axis=0))
+    names = problem.distortion.model if problem.free_distortion else "none"
+    flags = _flags(cv2, names)
+    guess = np.array([[size[0], 0, (size[0] - 1) / 2], [0, size[0], (size[1] - 1) / 2], [0, 0, 1.0]])
+    in_z = all(np.ptp(one[:, 2]) == 0 for one in world)
+    if problem.type == 2:
+        guess[:2, 2] = problem.entries[3:]
+        flags |= cv2.CALIB_FIX_PRINCIPAL_POINT
+    if not in_z or problem.type == 2:
+        flags |= cv2.CALIB_USE_INTRINSIC_GUESS
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, _EPOCHS, _EPSILON)
+    try:
+        found = cv2.calibrateCamera(
+            world, pixels, size, guess, np.zeros(_COEFFICIENTS), flags=flags, criteria=criteria
+        )
+    except cv2.error as error:
+        raise DegenerateGeometryError(f"OpenCV refuses these points: {error.err}") from error
+    _, A, k, turns, shifts = found[:5]
+    R = np.array([cv2.Rodrigues(turn)[0] for turn in turns], dtype=float)
+    t = np.array([np.ravel(shift) for shift in shifts], dtype=float)
+    width = len(problem.free_camera) - 5
+    state = CameraState(np.array([A[ENTRIES]]), R, t, names, np.array(k, dtype=float).ravel()[:width])
+    if not (np.isfinite(state.entries).all() and (state.entries[0, [0, 2]] > 0).all()):
+        raise DegenerateGeometryError("OpenCV ended at numbers that are no camera")
+    remarks = ("OpenCV's calibrateCamera has no skew: theta is a right angle",)
+    return Found(problem, normalised(state, views), minimised=True, remarks=remarks)
+
+
+def _flags(cv2: object, model: str) -> int:
+    """Flags that leave the coefficients of a model free, and no others."""
+    free = {
+        "none": 0, "k1": 1, "k1k2": 2, "k1k2p1p2": 2, "plumb_bob": 3, "rational": 6,
+    }[model]  # fmt: skip
+    names = [f"CALIB_FIX_K{n}" for n in range(free + 1, 7)]
+    if model in ("none", "k1", "k1k2"):
+        names.append("CALIB_ZERO_TANGENT_DIST")
+    if model == "rational":
+        names.append("CALIB_RATIONAL_MODEL")
+    return sum(getattr(cv2, name) for name in names)

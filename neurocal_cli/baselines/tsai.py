@@ -1,0 +1,272 @@
+"""Tsai's two stages (Tsai 1987): the radial alignment of each view first, then what it leaves open.
+
+With the image's centre c known and the image axes at right angles, a radial distortion moves a pixel along
+the ray from c, whatever its law. So (x, y) = m - c has the direction of (s X_c, Y_c), s = alpha_u / alpha_v:
+
+    x (r_2.M + t_y) = y s (r_1.M + t_x)
+
+1. R, t_x and t_y of each view from these equations, which are linear in s r_1, s t_x and r_2 over t_y. That
+   fails where t_y is 0; Tsai asks the user for a world's origin that is seen well above or below the centre,
+   and here it is moved to the target's point of which that holds best. Solid views tell s. A flat view has
+   two columns of R; what is left of them has length 1 each and a right angle, and of the two signs the one
+   whose focal length is positive is taken.
+2. alpha_v and t_z by linear least squares, then with k1 (and s, where all views are flat) by nonlinear least
+   squares on the pixels. R, t_x and t_y stay.
+
+The distortion acts here as everywhere in this package, x' = x (1 + k1 r^2); Tsai's own polynomial takes the
+distortion off. Stage 1 sees neither.
+
+The equations of stage 1 have the noise in their coefficients too, so that its errors have a mean that is not
+0 (tests/test_tsai.py; with the world's origin of the paper's scene left where it is, it would be ten times as
+large). Stage 2 does not mend that, and a wrong centre goes into everything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.baselines.constrained_least_squares import smallest
+from neurocal_cli.baselines.found import Found, as_seen
+from neurocal_cli.baselines.least_squares import least_squares
+from neurocal_cli.baselines.linear import whole_groups
+from neurocal_cli.baselines.nonlinear import whitened_residuals
+from neurocal_cli.bundle_adjustment.observability import check_points
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.projection import normalised_points
+from neurocal_cli.errors import DegenerateGeometryError, UsageError
+from neurocal_cli.geometry import Array, nearest_rotation
+
+__all__ = ["tsai"]
+
+_FEWEST = 5, 7  # points of a flat and of a solid view: one equation each
+_DISTORTIONS = ("none", "k1")
+
+
+def tsai(problem: Problem) -> Found:
+    """Calibrate by radial alignment.
+
+    Raises
+    ------
+    UsageError
+        Type 4; a distortion other than k1; no image centre.
+    DegenerateGeometryError
+        Too few points; equations that no camera fulfils.
+    """
+    if problem.type == 4:
+        raise UsageError("the method tsai estimates poses, which type 4 gives; choose another method")
+    if problem.type == 3:
+        check_points(problem)
+        return Found(*as_seen(problem, _poses_of_given_camera(problem)), minimised=False)
+    if problem.free_distortion and problem.distortion.model not in _DISTORTIONS:
+        raise UsageError(
+            f"the method tsai estimates k1 alone; give distortion {' or '.join(_DISTORTIONS)}, or another "
+            "method"
+        )
+    problem, remarks = _with_centre(problem)
+    check_points(problem)
+    state, least = _camera_and_poses(problem)
+    return Found(problem, state, False, least.iterations, least.converged, remarks)
+
+
+def _with_centre(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
+    """The problem with the image centre and the right angle given."""
+    entries, points = problem.entries.copy(), problem.points
+    remarks: tuple[str, ...] = ()
+    if problem.type == 1:
+        centre = points.image_center
+        if centre is None and points.image_size is not None:
+            centre = (points.image_size[0] - 1) / 2, (points.image_size[1] - 1) / 2
+        if centre is None:
+            raise UsageError(
+                "the method tsai needs the image centre; give type 2 with the centre, or put image_size into "
+                "the points file"
+            )
+        entries[3:] = centre
+        remarks = (
+            f"the method tsai takes the image centre for known; ({centre[0]:g}, {centre[1]:g}) is used, and "
+            "the true centre may be tens of pixels away",
+        )
+    free = np.array([True, False, True, False, False])
+    entries[:3] = 0.0
+    fixed = frozenset({"u0", "v0", "theta"})
+    return replace(problem, entries=entries, free=free, fixed=fixed), remarks
+
+
+@dataclass(frozen=True, eq=False)
+class _Alignment:
+    """What stage 1 finds of a group of views.
+
+    Attributes
+    ----------
+    views : (K,) int array
+    flat : bool
+    rows : (K, 2, 4) array
+        s r_1 with s t_x, and r_2 with t_y; of flat views up to scale, and without the columns of R that are
+        not seen, in the coordinates of the plane.
+    """
+
+    views: NDArray[np.intp]
+    flat: bool
+    rows: Array
+
+    @property
+    def aspect(self) -> Array:
+        """(K,) s as each solid view tells it."""
+        return np.asarray(np.linalg.norm(self.rows[:, 0, :3], axis=1))
+
+    def poses(self, s: float, sign: Array) -> tuple[Array, Array, Array]:
+        """R (K, 3, 3) and t_x, t_y (K,) for an aspect s; `sign` (K,) chooses a flat view's pose."""
+        rows = self.rows.copy()
+        rows[:, 0] /= s
+        if self.flat:
+            rows[:, :, :] /= np.linalg.svd(rows[:, :, :2])[1][:, 0, None, None]
+            left = np.sqrt(np.maximum(1 - (rows[:, :, :2] ** 2).sum(axis=2), 0.0))
+            dot = (rows[:, 0, :2] * rows[:, 1, :2]).sum(axis=1)
+            rows[:, 0, 2] = sign * left[:, 0]
+            rows[:, 1, 2] = sign * np.where(dot > 0, -left[:, 1], left[:, 1])
+        r1, r2 = rows[:, 0, :3], rows[:, 1, :3]
+        R = nearest_rotation(np.stack([r1, r2, np.cross(r1, r2)], axis=1))
+        return R, rows[:, 0, 3], rows[:, 1, 3]
+
+
+def _align(views: Views, x: Array, y: Array, members: NDArray[np.intp], flat: bool) -> _Alignment:
+    """Stage 1: the radial alignment of some views; x and y (N,) are the points from the centre."""
+    patterns = views.patterns(members, flat, int(views.counts.max()))
+    M, w = patterns.inputs[..., :-1], np.sqrt(patterns.weights)[..., None]
+    rank = np.minimum(np.arange(M.shape[1]), views.counts[members][:, None] - 1)
+    place = views.first[members][:, None] + rank
+    px, py = x[place][..., None], y[place][..., None]
+    # The world's origin, where Tsai wants it: at the point that is seen farthest from the line y = 0.
+    highest = np.abs(py * (w > 0)).argmax(axis=1)[:, :, None]
+    origin = np.take_along_axis(M, highest, axis=1)
+    M = M - origin
+    n = M.shape[2]
+    # Unknowns s r_1, s t_x and r_2, all over t_y, and 1.
+    found = smallest(np.concatenate([-py * M, -py, px * M, px], axis=2) * w, 1)
+    found = found / found[:, -1:]
+    r1, r2 = found[:, :n], found[:, n + 1 : -1]
+    rows = np.zeros((len(members), 2, 4))
+    rows[:, 0, :n], rows[:, 1, :n] = r1, r2
+    rows[:, 0, 3] = found[:, n] - (r1 * origin[:, 0]).sum(axis=1)
+    rows[:, 1, 3] = 1.0 - (r2 * origin[:, 0]).sum(axis=1)
+    if not flat:
+        rows /= np.linalg.norm(r2, axis=1)[:, None, None]
+    # t_y < 0 where the points would lie on the other side of the centre from where they are seen.
+    X, Y = M @ r1[..., None] + found[:, None, n, None], M @ r2[..., None] + 1.0
+    side = ((px * X + py * Y) * w**2).sum(axis=(1, 2))
+    return _Alignment(members, flat, rows * np.where(side < 0, -1.0, 1.0)[:, None, None])
+
+
+class _Stages:
+    """Both stages of all views, as functions of what stage 2 varies."""
+
+    def __init__(self, problem: Problem, x: Array, y: Array) -> None:
+        self.views = problem.views
+        self.x, self.y = x, y
+        self.groups = [
+            _align(self.views, x, y, members, flat) for members, flat in whole_groups(problem, _FEWEST)
+        ]
+        self.sign = np.ones(self.views.n_views)
+
+    @property
+    def aspect(self) -> float | None:
+        """Mean aspect that solid views tell, weighted by their points; None where all are flat."""
+        for group in self.groups:
+            if not group.flat:
+                return float(np.average(group.aspect, weights=self.views.counts[group.views]))
+        return None
+
+    def poses(self, s: float) -> tuple[Array, Array]:
+        """R (V, 3, 3), and t (V, 3) with t_z = 0."""
+        V = self.views.n_views
+        R, t = np.zeros((V, 3, 3)), np.zeros((V, 3))
+        for group in self.groups:
+            k = group.views
+            R[k], t[k, 0], t[k, 1] = group.poses(s, self.sign[k])
+            if group.flat:
+                R[k] = R[k] @ np.swapaxes(self.views.basis[k], 1, 2)
+        return R, t
+
+    def depths(self, s: float, f: float | None) -> tuple[Array, float]:
+        """Stage 2, linear: t_z (V,) and f, without distortion; f may be given.
+
+        In the plane of a pixel's ray, f (s X_c, Y_c) = (x, y) (r_3.M + t_z).
+        """
+        views = self.views
+        R, t = self.poses(s)
+        Xc = (R[views.index] @ views.local[..., None])[..., 0] + t[views.index]
+        g, m, w = Xc[:, :2] * [s, 1.0], np.column_stack([self.x, self.y]), Xc[:, 2]
+
+        def total(a: Array, b: Array, weight: Array) -> Array:
+            return np.asarray(np.add.reduceat(weight * (a * b).sum(axis=1), views.first))
+
+        one = views.weights
+        gg, gm, mm = total(g, g, one), total(g, m, one), total(m, m, one)
+        wgm, wmm = total(g, m, one * w), total(m, m, one * w)
+        alone, right = gg - gm**2 / mm, wgm - gm * wmm / mm  # of each view's f, its t_z taken out
+        flat = np.zeros(views.n_views, dtype=bool)
+        for group in self.groups:
+            flat[group.views] = group.flat
+        other = flat & (right < 0)  # the other sign of a flat view's depths fits better, with f > 0
+        self.sign[other] *= -1
+        right, wmm = np.where(other, -right, right), np.where(other, -wmm, wmm)
+        if f is None:
+            f = float(right.sum() / alone.sum())
+        return (f * gm - wmm) / mm, f
+
+
+def _poses_of_given_camera(problem: Problem) -> CameraState:
+    """Type 3: both stages with f = s = 1 on normalised image points."""
+    views, entries = problem.views, problem.normalised_entries
+    x, y = normalised_points(tuple(entries), views.pixels[:, 0], views.pixels[:, 1])
+    stages = _Stages(problem, x, y)
+    depth, _ = stages.depths(1.0, 1.0)
+    R, t = stages.poses(1.0)
+    t[:, 2] = depth
+    return CameraState(entries[None], R, t)
+
+
+def _camera_and_poses(problem: Problem) -> tuple[CameraState, Any]:
+    """Types 1 and 2: both stages."""
+    views, centre = problem.views, problem.normalised_entries[3:]
+    stages = _Stages(problem, *(views.pixels - centre).T)
+    known = stages.aspect
+    s = 1.0 if known is None else known
+    depth, f = stages.depths(s, None)
+    if not f > 0:
+        raise DegenerateGeometryError(
+            "the radial alignment of these points has no positive focal length; tilt the target more, check "
+            "the image centre and that each pixel belongs to its point, or use the method neuro"
+        )
+    # Stage 2: f, s where no solid view tells it, k1 where it is asked for, and t_z of each view.
+    model = problem.distortion.model if problem.free_distortion else "none"
+    V, free_s, free_k = views.n_views, known is None, model == "k1"
+    start = np.concatenate([[np.log(f)], [0.0] * free_s, [0.0] * free_k, depth / f])
+    error = whitened_residuals(views)
+
+    def state(p: Array) -> CameraState:
+        f = np.exp(p[0])
+        aspect = np.exp(p[1]) if free_s else s
+        R, t = stages.poses(float(aspect))
+        t[:, 2] = p[-V:] * f
+        entries = np.array([[aspect * f, 0.0, f, *centre]])
+        return CameraState(entries, R, t, model, p[1 + free_s : 2 + free_s] if free_k else np.zeros(0))
+
+    least = least_squares(lambda p: error(state(p)), start, _sparsity(views, len(start) - V))
+    return state(least.x), least
+
+
+def _sparsity(views: Views, n_camera: int) -> Any:
+    """Each residual depends on the camera and on the t_z of its view."""
+    from scipy.sparse import csr_matrix, hstack
+
+    batches = views.batches
+    view = np.repeat(batches.view, 2 * batches.local.shape[2])
+    depths = csr_matrix((np.ones(len(view)), (np.arange(len(view)), view)), shape=(len(view), views.n_views))
+    return hstack([csr_matrix(np.ones((len(view), n_camera))), depths]).tocsr()

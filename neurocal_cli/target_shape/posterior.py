@@ -1,0 +1,360 @@
+"""Offsets of the target's points from the pixels and the prior, and the prior's sizes from the evidence.
+
+With the noise's variance as the unit, the squared error and the prior make one quadratic
+
+    E = |r|^2 + sum_g lambda_g |w_g|^2,    lambda_g = sigma^2 / size_g^2,
+
+over the cameras, the poses and the parts w of the offsets. Whichever of poses and points has more unknowns
+is eliminated first, block by block; what is left is dense, so the cost grows linearly with views (or with
+points). MacKay's (1992) steps find the sizes: of the n_g coefficients of a part, the data determine
+
+    gamma_g = n_g - lambda_g tr (H^-1)_gg,    lambda_g <- gamma_g sigma^2 / |w_g|^2.
+
+The evidence, with the noise's variance marginalised too, tells whether there are offsets at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.target_shape.information import Information
+from neurocal_cli.target_shape.prior import Prior
+
+__all__ = ["Posterior", "evidence_of_given", "known_sizes", "posterior"]
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The most probable offsets, and what is known of the rest.
+
+    Attributes
+    ----------
+    offsets : (n, 3) array [world unit]
+        Along each point's axes.
+    variance : float
+        Of the noise [px^2].
+    camera_step : (f,) array
+        Of the cameras' free parameters.
+    camera : (f, f) array
+        Their covariance in units of the noise's variance; that the offsets are uncertain is in it.
+    followed : (f, n, 3) array
+        S_cd S_dd^-1: how the cameras' scores follow those of the offsets.
+    std : (n, 3) array [world unit]
+        Of the offsets, along each point's axes.
+    sizes : dict of float by name [world unit]
+    determined : float
+        How many of the offsets' unknowns the data determine.
+    evidence : float
+        Its logarithm, up to a constant that is the same with and without offsets.
+    """
+
+    offsets: Array
+    variance: float
+    camera_step: Array
+    camera: Array
+    followed: Array
+    std: Array
+    sizes: dict[str, float]
+    determined: float
+    evidence: float
+
+
+_SINGLE = {"place": [0, 1], "height": [2]}  # axes of a point by itself
+_OUT_OF_PLANE = ("bend", "height")
+_START = {
+    "fold": 3e-3,
+    "bend": 3e-3,
+    "stretch": 1e-3,
+    "warp": 5e-4,
+    "place": 3e-4,
+    "height": 3e-4,
+}  # of the target's size
+# Two coefficients tell no size, and a skew of the image axes looks like a shear of the target: prints are
+# stretched by a few thousandths.
+_MOST = {"stretch": 2e-3}
+_NOTHING = 1e-7  # of its size
+_OF_NO_ACCOUNT = 3e-6
+_SETTLED = 0.03  # relative change of the sizes
+_SAME_NOISE = 1e-3  # relative change of the variance
+_PASSES = 40
+
+
+def evidence_of_given(info: Information) -> float:
+    """Logarithm of the evidence of the target as it is given."""
+    spare = info.equations - len(info.camera) - 6 * len(info.pose)
+    if len(info.pose):
+        root = np.linalg.inv(np.linalg.cholesky(info.pose))
+        rows = root @ np.concatenate([info.pose_camera, info.pose_right[..., None]], axis=2)
+        logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        flat = rows.reshape(-1, rows.shape[2])
+    else:
+        flat, logdet = np.zeros((0, len(info.camera) + 1)), 0.0
+    S = info.camera - flat[:, :-1].T @ flat[:, :-1]
+    g = info.camera_right - flat[:, :-1].T @ flat[:, -1]
+    step = np.linalg.solve(S, g) if len(g) else g
+    logdet += float(np.linalg.slogdet(S)[1]) if len(g) else 0.0
+    cost = info.cost - float(flat[:, -1] @ flat[:, -1]) - float(g @ step)
+    return float(-0.5 * spare * np.log(cost) - 0.5 * logdet)
+
+
+class _System:
+    """The quadratic with its parts: what does not depend on the sizes is computed once."""
+
+    def __init__(self, info: Information, prior: Prior) -> None:
+        self.info, self.prior = info, prior
+        self.n, self.P = len(info.point), len(info.pose)
+        self.f, self.m = len(info.camera), prior.basis.shape[2]
+        basis = prior.basis
+        by_basis = info.point @ basis  # (n, 3, m)
+        across = np.einsum("nif,nim->fm", info.point_camera, basis)
+        inner = np.einsum("nim,nik->mk", basis, by_basis)
+        self.shared = np.block([[info.camera, across], [across.T, inner]])
+        self.right = np.concatenate([info.camera_right, np.einsum("nim,ni->m", basis, info.point_right)])
+        self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
+        pose_basis = info.pose_point.reshape(self.P * 6, 3 * self.n) @ basis.reshape(3 * self.n, self.m)
+        self.pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, 6, self.m)], axis=2)
+        self.points_first = 3 * self.n >= 6 * self.P
+        if not self.points_first:
+            self._eliminate_poses()
+
+    @property
+    def s(self) -> int:
+        return self.f + self.m
+
+    def _eliminate_poses(self) -> None:
+        info, s = self.info, self.s
+        root = np.linalg.inv(np.linalg.cholesky(info.pose))
+        columns = [self.pose_shared, info.pose_point.reshape(self.P, 6, -1), info.pose_right[..., None]]
+        rows = root @ np.concatenate(columns, axis=2)
+        flat = rows.reshape(6 * self.P, -1)
+        dim = s + 3 * self.n
+        M = np.zeros((dim + 1, dim + 1))
+        M[:s, :s] = self.shared
+        M[:s, s:dim] = self.point_shared.reshape(3 * self.n, s).T
+        M[s:dim, :s] = M[:s, s:dim].T
+        for i in range(3):
+            for j in range(3):
+                at = s + 3 * np.arange(self.n)
+                M[at + i, at + j] = info.point[:, i, j]
+        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.point_right.reshape(-1), info.cost
+        M[-1, :dim] = M[:dim, -1]
+        self.dense = M - flat.T @ flat
+        self.logdet_poses = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+
+    def solve(self, smooth: Array, single: Array) -> _Solved:
+        """At given precisions (m,) of the smooth parts and (3,) of a point by itself."""
+        return self._points_first(smooth, single) if self.points_first else self._poses_first(smooth, single)
+
+    def _poses_first(self, smooth: Array, single: Array) -> _Solved:
+        s, f = self.s, self.f
+        dim = s + 3 * self.n
+        M = self.dense[:dim, :dim].copy()
+        at = np.arange(dim)
+        M[at[f:s], at[f:s]] += smooth
+        M[at[s:], at[s:]] += np.tile(single, self.n)
+        inverse, logdet = _inverse(M)
+        x = inverse @ self.dense[:dim, -1]
+        cost = float(self.dense[-1, -1] - self.dense[:dim, -1] @ x)
+        var_single = np.diagonal(inverse)[s:].reshape(self.n, 3)
+        with_offsets = self._with_offsets(inverse[:f, f:s], inverse[:f, s:].reshape(f, self.n, 3))
+        var = self._variance(inverse[f:s, f:s], inverse[f:s, s:].reshape(self.m, self.n, 3), var_single)
+        return _Solved(
+            x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
+            np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], with_offsets, var,
+        )  # fmt: skip
+
+    def _points_first(self, smooth: Array, single: Array) -> _Solved:
+        info, s, f, n, P = self.info, self.s, self.f, self.n, self.P
+        root = np.linalg.inv(np.linalg.cholesky(info.point + np.diag(single)))  # (n, 3, 3)
+        poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, 6 * P, 3).swapaxes(1, 2)
+        rows = root @ np.concatenate([self.point_shared, poses, info.point_right[..., None]], axis=2)
+        flat = rows.reshape(3 * n, -1)
+        dim = s + 6 * P
+        M = np.zeros((dim + 1, dim + 1))
+        M[:s, :s] = self.shared
+        at = np.arange(f, s)
+        M[at, at] += smooth
+        M[:s, s:dim] = self.pose_shared.reshape(6 * P, s).T
+        M[s:dim, :s] = M[:s, s:dim].T
+        at = s + 6 * np.arange(P)
+        for i in range(6):
+            for j in range(6):
+                M[at + i, at + j] = info.pose[:, i, j]
+        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.pose_right.reshape(-1), info.cost
+        M[-1, :dim] = M[:dim, -1]
+        M -= flat.T @ flat
+        inverse, logdet = _inverse(M[:dim, :dim])
+        x = inverse @ M[:dim, -1]
+        cost = float(M[-1, -1] - M[:dim, -1] @ x)
+        # The points' own: how they follow all the others.
+        back = np.swapaxes(root, 1, 2)
+        e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
+        follow = back @ rows[:, :, :-1]  # (n, 3, dim)
+        spread = follow.reshape(3 * n, dim) @ inverse  # (3 n, dim)
+        var_single = np.diagonal(back @ root, axis1=1, axis2=2) + (
+            (spread * follow.reshape(3 * n, dim)).sum(axis=1).reshape(n, 3)
+        )
+        logdet -= 2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        cross = -spread.T.reshape(dim, n, 3)
+        var = self._variance(inverse[f:s, f:s], cross[f:s], var_single)
+        return _Solved(
+            x[:f], x[f:s], e, cost, logdet, np.diagonal(inverse)[f:s], var_single,
+            inverse[:f, :f], self._with_offsets(inverse[:f, f:s], cross[:f]), var,
+        )  # fmt: skip
+
+    def _with_offsets(self, smooth: Array, single: Array) -> Array:
+        """(f, n, 3) covariance between the cameras and the whole offsets."""
+        return np.asarray(np.einsum("fm,nim->fni", smooth, self.prior.basis) + single)
+
+    def _variance(self, smooth: Array, cross: Array, single: Array) -> Array:
+        """(n, 3) variance of the whole offsets."""
+        basis = self.prior.basis
+        return np.asarray(
+            ((basis @ smooth) * basis).sum(axis=2) + 2 * np.einsum("nim,mni->ni", basis, cross) + single
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    camera: Array
+    smooth: Array
+    single: Array
+    cost: float
+    logdet: float
+    smooth_variance: Array
+    single_variance: Array
+    camera_covariance: Array
+    camera_offsets: Array
+    offset_variance: Array
+
+
+def _inverse(M: Array) -> tuple[Array, float]:
+    scale = 1.0 / np.sqrt(np.diagonal(M))
+    scaled = M * scale[:, None] * scale
+    root = np.linalg.inv(np.linalg.cholesky(scaled))
+    logdet = -2 * float(np.log(np.diagonal(root)).sum() + np.log(scale).sum())
+    return (root.T @ root) * scale[:, None] * scale, logdet
+
+
+def posterior(
+    info: Information, prior: Prior, sizes: Mapping[str, float] | None = None, flat: bool = False
+) -> Posterior:
+    """Find the sizes of the parts, and the offsets.
+
+    Parameters
+    ----------
+    info : Information
+        Around the given target, offsets along each point's axes.
+    prior : Prior
+    sizes : dict of float by name [world unit], optional
+        To begin with.
+    flat : bool
+        Whether nothing leaves the plane.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Points that do not determine the cameras.
+    """
+    parts = _Parts(info, prior, flat)
+    now = dict(sizes) if sizes is not None else parts.start()
+    variance = info.cost / parts.spare
+    for _ in range(_PASSES):
+        solved = parts.solve(now, variance)
+        following, after = parts.renewed(now, variance, solved), solved.cost / parts.spare
+        settled = abs(after / variance - 1) < _SAME_NOISE and parts.change(now, following) < _SETTLED
+        if settled:
+            break
+        now, variance = following, after
+    return parts.posterior(now, variance, solved)
+
+
+def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Posterior:
+    """The same with sizes and a variance of the noise that are known.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Points that do not determine the cameras.
+    """
+    parts = _Parts(info, prior, flat=False)
+    return parts.posterior(dict(sizes), variance, parts.solve(dict(sizes), variance))
+
+
+class _Parts:
+    """The parts of the offsets with their sizes."""
+
+    def __init__(self, info: Information, prior: Prior, flat: bool) -> None:
+        self.system, self.prior, self.flat = _System(info, prior), prior, flat
+        self.least = _NOTHING * prior.size
+        self.spare = info.equations - self.system.f - 6 * self.system.P
+
+    def start(self) -> dict[str, float]:
+        names = (*self.prior.groups, *_SINGLE)
+        return self._allowed({name: _START[name] * self.prior.size for name in names})
+
+    def _allowed(self, sizes: dict[str, float]) -> dict[str, float]:
+        return sizes | {name: self.least for name in _OUT_OF_PLANE if name in sizes} if self.flat else sizes
+
+    def solve(self, sizes: Mapping[str, float], variance: float) -> _Solved:
+        smooth = np.empty(self.system.m)
+        for name, places in self.prior.groups.items():
+            smooth[places] = variance * (self.prior.size / sizes[name]) ** 2
+        place, height = (variance / sizes[name] ** 2 for name in _SINGLE)
+        return self.system.solve(smooth, np.array([place, place, height]))
+
+    def renewed(self, sizes: Mapping[str, float], variance: float, solved: _Solved) -> dict[str, float]:
+        """MacKay's step, longer for parts of which the data determine little, where it would be too short."""
+        after = solved.cost / self.spare
+        new = {}
+        for name, size in sizes.items():
+            if name in self.prior.groups:
+                places, unit = self.prior.groups[name], self.prior.size
+                w, var = solved.smooth[places], solved.smooth_variance[places]
+            else:
+                columns, unit = _SINGLE[name], 1.0
+                w, var = solved.single[:, columns], solved.single_variance[:, columns]
+            share = 1.0 - variance * (unit / size) ** 2 * float(var.mean())
+            ratio2 = float((w**2).mean()) * (unit / size) ** 2 / max(share, 1e-6) * (after / variance)
+            longer = 2.0 - min(max(share, 0.0), 1.0)
+            most = _MOST.get(name, 1.0) * self.prior.size
+            new[name] = float(np.clip(size * ratio2 ** (0.5 * longer), self.least, most))
+        return self._allowed(new)
+
+    def change(self, old: Mapping[str, float], new: Mapping[str, float]) -> float:
+        """Largest relative one of the sizes that are of any account."""
+        tiny = _OF_NO_ACCOUNT * self.prior.size
+        changes = [abs(np.log(new[n] / old[n])) for n in old if max(new[n], old[n]) > tiny]
+        return float(max(changes, default=0.0))
+
+    def posterior(self, sizes: dict[str, float], variance: float, solved: _Solved) -> Posterior:
+        n, f, prior = self.system.n, self.system.f, self.prior
+        after = solved.cost / self.spare
+        logprior = sum(
+            len(places) * np.log(variance * (prior.size / sizes[name]) ** 2)
+            for name, places in prior.groups.items()
+        ) + sum(n * len(columns) * np.log(variance / sizes[name] ** 2) for name, columns in _SINGLE.items())
+        determined = self.system.m + 3 * n
+        for name, places in prior.groups.items():
+            determined -= (
+                variance * (prior.size / sizes[name]) ** 2 * float(solved.smooth_variance[places].sum())
+            )
+        for name, columns in _SINGLE.items():
+            determined -= variance / sizes[name] ** 2 * float(solved.single_variance[:, columns].sum())
+        along = solved.camera_offsets.reshape(f, -1)
+        followed = np.asarray(-np.linalg.solve(solved.camera_covariance, along) if f else along)
+        return Posterior(
+            offsets=(prior.basis @ solved.smooth) + solved.single,
+            variance=after,
+            camera_step=solved.camera,
+            camera=solved.camera_covariance,
+            followed=followed.reshape(f, n, 3),
+            std=np.sqrt(after * np.maximum(solved.offset_variance, 0.0)),
+            sizes=sizes,
+            determined=determined,
+            evidence=-0.5 * self.spare * np.log(solved.cost) - 0.5 * (solved.logdet - logprior),
+        )
