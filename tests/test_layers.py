@@ -20,14 +20,21 @@ HOMES = {
     "rich": ("commands/",),
     "matplotlib": ("plots.py", "zoom_lens/plots.py"),
     "yaml": ("io/",),
-    "cv2": ("baselines/opencv.py", "detection/", "simulation/", "io/images.py", "distortion/remapping.py"),
+    "cv2": (
+        "baselines/opencv.py",
+        "detection/",
+        "simulation/",
+        "io/images.py",
+        "io/board_pictures.py",
+        "distortion/remapping.py",
+    ),
 }
 # Rooms, a folder or a module each, from the ground up: each imports from itself and from lower levels only.
 LEVELS = (
     {"errors", "geometry"},
     {"board", "camera", "least_squares", "median", "network", "points"},
     {"target"},
-    {"calibration", "training"},
+    {"calibration", "printing", "training"},
     {"bundle_adjustment"},
     {"target_shape"},
     {"verdict", "distortion", "initialisation"},

@@ -24,8 +24,9 @@ __all__ = ["neurocal"]
 # Each command is the function of this name in the module of this name; None: hidden. The summaries
 # stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
+    "board": "Draw a chessboard target to print.",
     "calibrate": "Calibrate a camera from known points and their pixels.",
-    "convert": "Convert a camera or a rig to the format of another program.",
+    "convert": "Convert cameras, rigs and points to the formats of other programs.",
     "detect": "Detect chessboards in images and measure points on them.",
     "evaluate": "Measure the error of a calibrated camera or stereo rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",

@@ -7,20 +7,22 @@ from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.options import INPUT, Argument, Command
 from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import check_one_stdin, note, warn
+from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    from neurocal_cli.board import Board
     from neurocal_cli.io.exchange.camera_set import CameraSet
+    from neurocal_cli.points import Correspondences
 
 __all__ = ["convert"]
 
 _FORMATS = ("neurocal", "opencv", "ros", "kalibr", "colmap", "mrcal", "matlab", "json", "npz")
-_BINARY = ("matlab", "npz")
 _SIZE = click.IntRange(1, 1_000_000)
 
 
@@ -32,9 +34,11 @@ _SIZE = click.IntRange(1, 1_000_000)
     metavar="FILE...",
     type=INPUT,
     cls=Argument,
-    description="A camera or rig file of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or "
-    "a JSON or .npz dictionary; - is standard input. Two files for the left and right camera of ROS or "
-    "mrcal, and for the two files of OpenCV's stereo sample.",
+    description="A camera or a rig of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or a "
+    "JSON or .npz dictionary; - is standard input. Two files are the left and the right camera of ROS or "
+    "mrcal, or the two files of OpenCV's stereo sample. Points are files of neurocal, or corners in "
+    "a dictionary of OpenCV or MATLAB, a .npy array, mrcal's corners.vnl, or text files of numbers: X Y Z, "
+    "then u v of each view.",
 )
 @click.option(
     "--to",
@@ -50,12 +54,7 @@ _SIZE = click.IntRange(1, 1_000_000)
     show_default="refuse",
     help="If the format does not have the distortion model, write the nearest camera that it has.",
 )
-@click.option(
-    "--unit",
-    metavar="UNIT",
-    show_default="as the file says",
-    help="Unit of lengths in FILE, if the file does not say.",
-)
+@board_options("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
 @click.option(
     "--image-size",
     nargs=2,
@@ -77,11 +76,15 @@ def convert(
     files: tuple[str, ...],
     target: str,
     force: bool,
+    board: str | None,
+    cols: int | None,
+    rows: int | None,
+    square: float | None,
     unit: str | None,
     image_size: tuple[int, int] | None,
     output: str,
 ) -> None:
-    """Convert a camera or a rig to the format of another program.
+    """Convert cameras, rigs and points to the formats of other programs.
 
     The format of FILE is recognised by its content, never by its name. Where programs count pixels in
     different ways the principal point is shifted, so that both projections are equal.
@@ -103,6 +106,9 @@ def convert(
     skew, so the nearest camera without skew is written for them, and a warning says how many pixels that
     makes. What the format has no place for is listed on standard error.
 
+    Points become a CSV file with --to neurocal. Corners without their places on the board need --board, or
+    --cols, --rows and --square. Points of neurocal are also written as opencv, matlab, json, npz or mrcal.
+
     \b
     Examples:
       neurocal calibrate sample_data/flat.csv --no-skew -o camera.yaml
@@ -112,11 +118,25 @@ def convert(
       neurocal convert camera.npz --to kalibr --force --unit mm \\
           --image-size 640 480 -o camchain.yaml
       neurocal convert camchain.yaml --to neurocal | neurocal convert - --to ros
+      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
+          --points vertices -o points.csv
+      neurocal convert points.csv --to mrcal -o corners.vnl
+      echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
+      neurocal convert corners.vnl --board board.yaml --to neurocal -o again.csv
+      neurocal convert corners.vnl --cols 9 --rows 6 --square 25 --to npz \\
+          -o corners.npz
     """  # noqa: D301 - as in the group
-    check_one_stdin(*files)
+    check_one_stdin(*files, board)
+    check_outputs((None if os.path.isdir(output) else output,), (*files, board))
+    target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
+    points = _points(files, target_board, unit, image_size)
+    if points is not None:
+        _write_points(points, target, output)
+        return
+    if target_board is not None:
+        raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
     if len(files) > 2:
         raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
-    check_outputs((None if os.path.isdir(output) else output,), files)
     from neurocal_cli.io.exchange.fitting_in import fitted_in
     from neurocal_cli.io.exchange.formats import FORMATS
     from neurocal_cli.io.exchange.reading import read_cameras
@@ -128,6 +148,37 @@ def convert(
     note(fitted.remarks)
     warn(fitted.losses)
     _write(contents, output, target)
+
+
+def _points(
+    files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
+) -> Correspondences | None:
+    """The points of the files, None where they hold cameras."""
+    from dataclasses import replace
+
+    from neurocal_cli.io.exchange.colmap import is_folder
+    from neurocal_cli.io.exchange.corners import read_corners
+
+    if is_folder(files[0]):
+        return None
+    notes: list[str] = []
+    points = read_corners(files, board, notes, unit)
+    note(notes)
+    if points is not None and size is not None:
+        if points.image_size not in (None, size):
+            raise InputError("the image size of the file is another; leave out --image-size")
+        points = replace(points, image_size=size)
+    return points
+
+
+def _write_points(points: Correspondences, target: str, output: str) -> None:
+    from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
+    from neurocal_cli.io.writing import write_whole
+
+    text = corner_text(points, target, os.path.splitext(output)[1].lower())
+    warn(points_lost(points, target))
+    write_whole(output, text)
+    say(f"{len(points)} points of {points.n_views} view{'s' * (points.n_views != 1)}")
 
 
 def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:

@@ -23,7 +23,7 @@ def storage_text(entries: Mapping[str, Any], ending: str = ".yaml") -> str:
     Parameters
     ----------
     entries : dict
-        Texts, numbers, lists of texts and matrices, (rows, cols) arrays.
+        Texts, numbers, lists of texts, and matrices: (rows, cols) or (rows, cols, channels) arrays.
     ending : str
         ``.xml`` or ``.json``; YAML otherwise.
     """
@@ -38,38 +38,46 @@ def storage_text(entries: Mapping[str, Any], ending: str = ".yaml") -> str:
 
 
 def _rows(matrix: Array, indent: str, separator: str) -> str:
-    numbers = [number(value) for value in np.ravel(matrix)]
-    lines = [separator.join(numbers[k : k + _PER_LINE]) for k in range(0, len(numbers), _PER_LINE)]
+    return _lines([number(value) for value in np.ravel(matrix)], indent, separator)
+
+
+def _lines(words: list[str], indent: str, separator: str) -> str:
+    lines = [separator.join(words[k : k + _PER_LINE]) for k in range(0, len(words), _PER_LINE)]
     return f"{separator.rstrip()}\n{indent}".join(lines)
+
+
+def _type(matrix: Array) -> str:
+    """Doubles, of one channel or more; in quotes, because 2d begins as a number does."""
+    return "d" if matrix.ndim == 2 else f'"{matrix.shape[2]}d"'
 
 
 def _yaml(key: str, value: Any) -> str:
     if isinstance(value, np.ndarray):
-        rows, cols = value.shape
+        rows, cols = value.shape[:2]
         data = _rows(value, "       ", ", ")
-        return f"{key}: !!opencv-matrix\n   rows: {rows}\n   cols: {cols}\n   dt: d\n   data: [ {data} ]"
+        head = f"rows: {rows}\n   cols: {cols}\n   dt: {_type(value)}"
+        return f"{key}: !!opencv-matrix\n   {head}\n   data: [ {data} ]"
     if isinstance(value, list):
-        return "\n".join([f"{key}:", *(f"   - {quoted(entry)}" for entry in value)])
+        return f"{key}: [ {_lines([quoted(entry) for entry in value], '       ', ', ')} ]"
     return f"{key}: {quoted(value) if isinstance(value, str) else value}"
 
 
 def _json(value: Any) -> str:
     if isinstance(value, np.ndarray):
-        rows, cols = value.shape
+        rows, cols = value.shape[:2]
         data = _rows(value, "            ", ", ")
-        head = f'"type_id": "opencv-matrix", "rows": {rows}, "cols": {cols}, "dt": "d"'
+        kind = '"d"' if value.ndim == 2 else _type(value)
+        head = f'"type_id": "opencv-matrix", "rows": {rows}, "cols": {cols}, "dt": {kind}'
         return f'{{ {head},\n        "data": [ {data} ] }}'
     return json.dumps(value, ensure_ascii=False)
 
 
 def _xml(key: str, value: Any) -> str:
     if isinstance(value, np.ndarray):
-        rows, cols = value.shape
+        rows, cols = value.shape[:2]
         data = _rows(value, "    ", " ")
-        return (
-            f'<{key} type_id="opencv-matrix">\n  <rows>{rows}</rows>\n  <cols>{cols}</cols>\n  <dt>d</dt>\n'
-            f"  <data>\n    {data}</data></{key}>"
-        )
+        head = f"<rows>{rows}</rows>\n  <cols>{cols}</cols>\n  <dt>{_type(value)}</dt>"
+        return f'<{key} type_id="opencv-matrix">\n  {head}\n  <data>\n    {data}</data></{key}>'
     if isinstance(value, list):
         return "\n".join([f"<{key}>", *(f"  <_>{_xml_text(entry)}</_>" for entry in value), f"</{key}>"])
     return f"<{key}>{_xml_text(value) if isinstance(value, str) else value}</{key}>"

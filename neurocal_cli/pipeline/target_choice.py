@@ -20,6 +20,7 @@ from neurocal_cli.pipeline.fit import fit_again
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
+from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 
 __all__ = ["with_target"]
 
@@ -73,7 +74,9 @@ def _found(solution: Solution, choice: str, known: Target | None) -> Found | Non
     plane = planes_of(given, point) if known is None else known.plane
     if not enough_views(label, repeated.n_poses, int(plane.max()) + 1):
         return None
-    return find_target([(problem, solution.adjusted)], choice == "flat", known)
+    # Only a lens that nobody named may change.
+    find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
+    return find([(problem, solution.adjusted)], choice == "flat", known)
 
 
 def _fitted_to(

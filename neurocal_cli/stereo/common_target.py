@@ -15,6 +15,7 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
+from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 
 __all__ = ["common_target"]
 
@@ -44,7 +45,8 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
         fits = [_fit(camera) for camera in cameras]
     except NeurocalError:
         return None
-    found = find_target(fits, choice == "flat", known)
+    chosen = known is None and all(camera.lens_choice for camera in cameras)
+    found = (find_lens_and_target if chosen else find_target)(fits, choice == "flat", known)
     if found is None or (choice == "auto" and found.target.evidence < LEAST_GAIN):
         return None
     return found.target

@@ -42,10 +42,13 @@ class Found:
     target : Target
     fits : tuple of (Problem, Adjusted)
         Each problem's points are where the target has them.
+    evidence : float
+        Its logarithm, for cameras of any lens.
     """
 
     target: Target
     fits: tuple[tuple[Problem, Adjusted], ...]
+    evidence: float
 
 
 def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -> bool:
@@ -115,7 +118,7 @@ class _Search:
                 break
         gain = found.evidence - evidence_of_given(info)
         self._align()
-        return Found(self._target(found, gain), tuple(self.fits))
+        return Found(self._target(found, gain), tuple(self.fits), found.evidence)
 
     def _information(self) -> Information:
         sights = [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]

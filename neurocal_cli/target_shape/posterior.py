@@ -15,7 +15,8 @@ The evidence, with the noise's variance marginalised too, tells whether there ar
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,7 +50,7 @@ class Posterior:
     determined : float
         How many of the offsets' unknowns the data determine.
     evidence : float
-        Its logarithm, up to a constant that is the same with and without offsets.
+        Its logarithm; a priori every value of a camera's normalised parameters is as likely as any.
     """
 
     offsets: Array
@@ -77,9 +78,9 @@ _START = {
 # stretched by a few thousandths.
 _MOST = {"stretch": 2e-3}
 _NOTHING = 1e-7  # of its size
-_OF_NO_ACCOUNT = 3e-6
 _SETTLED = 0.03  # relative change of the sizes
-_SAME_NOISE = 1e-3  # relative change of the variance
+_NO_GAIN = 0.02  # of the logarithm of the evidence
+_HALVINGS = 6
 _PASSES = 40
 
 
@@ -98,7 +99,12 @@ def evidence_of_given(info: Information) -> float:
     step = np.linalg.solve(S, g) if len(g) else g
     logdet += float(np.linalg.slogdet(S)[1]) if len(g) else 0.0
     cost = info.cost - float(flat[:, -1] @ flat[:, -1]) - float(g @ step)
-    return float(-0.5 * spare * np.log(cost) - 0.5 * logdet)
+    return _log_evidence(spare, cost, logdet)
+
+
+def _log_evidence(spare: float, cost: float, logdet: float) -> float:
+    """Of a quadratic with this minimum and determinant; a priori the noise has a variance as 1 / sigma^2."""
+    return math.lgamma(0.5 * spare) - 0.5 * spare * math.log(math.pi * cost) - 0.5 * logdet
 
 
 class _System:
@@ -261,16 +267,20 @@ def posterior(
         Points that do not determine the cameras.
     """
     parts = _Parts(info, prior, flat)
-    now = dict(sizes) if sizes is not None else parts.start()
-    variance = info.cost / parts.spare
+    noise = np.sqrt(info.cost / parts.spare)
+    start = parts.start() if sizes is None else parts.allowed(sizes)
+    now = parts.at({name: size / noise for name, size in start.items()})
     for _ in range(_PASSES):
-        solved = parts.solve(now, variance)
-        following, after = parts.renewed(now, variance, solved), solved.cost / parts.spare
-        settled = abs(after / variance - 1) < _SAME_NOISE and parts.change(now, following) < _SETTLED
-        if settled:
+        wanted = parts.renewed(now)
+        if parts.change(now.ratios, wanted) < _SETTLED:
             break
-        now, variance = following, after
-    return parts.posterior(now, variance, solved)
+        better = next(parts.better(now, wanted), None)
+        if better is None:
+            break
+        gain, now = better.evidence - now.evidence, better
+        if gain < _NO_GAIN:
+            break
+    return parts.posterior(now)
 
 
 def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Posterior:
@@ -282,7 +292,18 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
         Points that do not determine the cameras.
     """
     parts = _Parts(info, prior, flat=False)
-    return parts.posterior(dict(sizes), variance, parts.solve(dict(sizes), variance))
+    noise = np.sqrt(variance)
+    return parts.posterior(parts.at({name: size / noise for name, size in sizes.items()}))
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """The quadratic solved for one set of sizes, in units of the noise's standard deviation."""
+
+    ratios: dict[str, float]
+    solved: _Solved
+    variance: float
+    evidence: float
 
 
 class _Parts:
@@ -295,66 +316,74 @@ class _Parts:
 
     def start(self) -> dict[str, float]:
         names = (*self.prior.groups, *_SINGLE)
-        return self._allowed({name: _START[name] * self.prior.size for name in names})
+        return self.allowed({name: _START[name] * self.prior.size for name in names})
 
-    def _allowed(self, sizes: dict[str, float]) -> dict[str, float]:
-        return sizes | {name: self.least for name in _OUT_OF_PLANE if name in sizes} if self.flat else sizes
+    def allowed(self, sizes: Mapping[str, float]) -> dict[str, float]:
+        """Without those that leave the plane, where nothing may."""
+        return dict(sizes) | {name: self.least for name in _OUT_OF_PLANE if self.flat and name in sizes}
 
-    def solve(self, sizes: Mapping[str, float], variance: float) -> _Solved:
+    def at(self, ratios: dict[str, float]) -> _Solution:
         smooth = np.empty(self.system.m)
         for name, places in self.prior.groups.items():
-            smooth[places] = variance * (self.prior.size / sizes[name]) ** 2
-        place, height = (variance / sizes[name] ** 2 for name in _SINGLE)
-        return self.system.solve(smooth, np.array([place, place, height]))
+            smooth[places] = (self.prior.size / ratios[name]) ** 2
+        place, height = (ratios[name] ** -2 for name in _SINGLE)
+        solved = self.system.solve(smooth, np.array([place, place, height]))
+        logprior = float(np.log(smooth).sum()) + self.system.n * float(2 * np.log(place) + np.log(height))
+        evidence = _log_evidence(self.spare, solved.cost, solved.logdet - logprior)
+        return _Solution(ratios, solved, solved.cost / self.spare, evidence)
 
-    def renewed(self, sizes: Mapping[str, float], variance: float, solved: _Solved) -> dict[str, float]:
+    def _coefficients(self, now: _Solution, name: str) -> tuple[Array, Array, float]:
+        """A part's coefficients, their variances, and the offset for a coefficient of 1."""
+        if name in self.prior.groups:
+            places = self.prior.groups[name]
+            return now.solved.smooth[places], now.solved.smooth_variance[places], self.prior.size
+        columns = _SINGLE[name]
+        return now.solved.single[:, columns], now.solved.single_variance[:, columns], 1.0
+
+    def renewed(self, now: _Solution) -> dict[str, float]:
         """MacKay's step, longer for parts of which the data determine little, where it would be too short."""
-        after = solved.cost / self.spare
-        new = {}
-        for name, size in sizes.items():
-            if name in self.prior.groups:
-                places, unit = self.prior.groups[name], self.prior.size
-                w, var = solved.smooth[places], solved.smooth_variance[places]
-            else:
-                columns, unit = _SINGLE[name], 1.0
-                w, var = solved.single[:, columns], solved.single_variance[:, columns]
-            share = 1.0 - variance * (unit / size) ** 2 * float(var.mean())
-            ratio2 = float((w**2).mean()) * (unit / size) ** 2 / max(share, 1e-6) * (after / variance)
-            longer = 2.0 - min(max(share, 0.0), 1.0)
+        new, noise = {}, np.sqrt(now.variance)
+        for name, ratio in now.ratios.items():
+            w, var, unit = self._coefficients(now, name)
+            share = float(np.clip(1.0 - (unit / ratio) ** 2 * var.mean(), 1e-6, 1.0))
+            change = float((w**2).mean()) * (unit / ratio / noise) ** 2 / share
             most = _MOST.get(name, 1.0) * self.prior.size
-            new[name] = float(np.clip(size * ratio2 ** (0.5 * longer), self.least, most))
-        return self._allowed(new)
+            new[name] = float(
+                np.clip(ratio * change ** (1.0 - 0.5 * share), self.least / noise, most / noise)
+            )
+        allowed = self.allowed({name: ratio * noise for name, ratio in new.items()})
+        return {name: size / noise for name, size in allowed.items()}
+
+    def better(self, now: _Solution, wanted: dict[str, float]) -> Iterator[_Solution]:
+        """Sizes on the way to the wanted ones, ever nearer, that raise the evidence."""
+        for halvings in range(_HALVINGS):
+            part = 0.5**halvings
+            trial = {name: ratio * (wanted[name] / ratio) ** part for name, ratio in now.ratios.items()}
+            found = self.at(trial)
+            if found.evidence > now.evidence:
+                yield found
 
     def change(self, old: Mapping[str, float], new: Mapping[str, float]) -> float:
-        """Largest relative one of the sizes that are of any account."""
-        tiny = _OF_NO_ACCOUNT * self.prior.size
-        changes = [abs(np.log(new[n] / old[n])) for n in old if max(new[n], old[n]) > tiny]
-        return float(max(changes, default=0.0))
+        """Largest relative one of the sizes."""
+        return float(max(abs(np.log(new[name] / old[name])) for name in old))
 
-    def posterior(self, sizes: dict[str, float], variance: float, solved: _Solved) -> Posterior:
-        n, f, prior = self.system.n, self.system.f, self.prior
-        after = solved.cost / self.spare
-        logprior = sum(
-            len(places) * np.log(variance * (prior.size / sizes[name]) ** 2)
-            for name, places in prior.groups.items()
-        ) + sum(n * len(columns) * np.log(variance / sizes[name] ** 2) for name, columns in _SINGLE.items())
-        determined = self.system.m + 3 * n
-        for name, places in prior.groups.items():
-            determined -= (
-                variance * (prior.size / sizes[name]) ** 2 * float(solved.smooth_variance[places].sum())
-            )
-        for name, columns in _SINGLE.items():
-            determined -= variance / sizes[name] ** 2 * float(solved.single_variance[:, columns].sum())
+    def posterior(self, now: _Solution) -> Posterior:
+        n, f, prior, solved = self.system.n, self.system.f, self.prior, now.solved
+        determined = 0.0
+        for name, ratio in now.ratios.items():
+            w, var, unit = self._coefficients(now, name)
+            determined += w.size - (unit / ratio) ** 2 * float(var.sum())
         along = solved.camera_offsets.reshape(f, -1)
         followed = np.asarray(-np.linalg.solve(solved.camera_covariance, along) if f else along)
+        noise = np.sqrt(now.variance)
         return Posterior(
             offsets=(prior.basis @ solved.smooth) + solved.single,
-            variance=after,
+            variance=now.variance,
             camera_step=solved.camera,
             camera=solved.camera_covariance,
             followed=followed.reshape(f, n, 3),
-            std=np.sqrt(after * np.maximum(solved.offset_variance, 0.0)),
-            sizes=sizes,
+            std=noise * np.sqrt(np.maximum(solved.offset_variance, 0.0)),
+            sizes={name: float(ratio * noise) for name, ratio in now.ratios.items()},
             determined=determined,
-            evidence=-0.5 * self.spare * np.log(solved.cost) - 0.5 * (solved.logdet - logprior),
+            evidence=now.evidence,
         )

@@ -55,8 +55,8 @@ __all__ = ["assess", "gather_evidence"]
 
 _STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
 _IN_PLANE = 1e-9  # depth over the largest one that rounding leaves of 0
-_EXACT = 1e-4  # of the spread of the pixels: errors that cost nothing
 _BY_FLEXING = 0.01  # relative
+_EXACT = 1e-4  # of the spread of the pixels: errors that cost nothing
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 

@@ -27,7 +27,17 @@ from neurocal_cli.io.file_storage_text import storage_text
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.stereo.rectification import rectify
 
-__all__ = ["JSON", "NPZ", "OPENCV", "from_tree", "is_part", "read_npz"]
+__all__ = [
+    "JSON",
+    "NPZ",
+    "OPENCV",
+    "arrays_of",
+    "from_tree",
+    "is_part",
+    "json_text",
+    "npz_bytes",
+    "read_npz",
+]
 
 _SIDES = (("1", "2"), ("_left", "_right"), ("L", "R"), ("_l", "_r"))
 _ROTATIONS, _TRANSLATIONS = ("R", "R_stereo", "rotation"), ("T", "t", "T_stereo", "translation")
@@ -172,25 +182,36 @@ def _opencv(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
 
 
 def _json(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
-    tree = {
-        key: value.tolist() if isinstance(value, np.ndarray) else value
-        for key, value in entries(cameras).items()
-    }
-    lines = ",\n".join(
-        f"  {json.dumps(key)}: {json.dumps(value, allow_nan=False)}" for key, value in tree.items()
-    )
-    return {"": f"{{\n{lines}\n}}\n"}
+    return {"": json_text(entries(cameras))}
 
 
 def _npz(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
-    # Written here and not by numpy.savez, whose files differ from day to day by the time in them.
+    return {"": npz_bytes(entries(cameras))}
+
+
+def json_text(tree: Mapping[str, Any]) -> str:
+    """The dictionary as JSON, an entry a line; numbers that are not known are null."""
+    lines = ",\n".join(f"  {json.dumps(key)}: {_json_value(value)}" for key, value in tree.items())
+    return f"{{\n{lines}\n}}\n"
+
+
+def _json_value(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        known = value.astype(object)
+        known[~np.isfinite(value)] = None
+        value = known.tolist()
+    return json.dumps(value, allow_nan=False)
+
+
+def npz_bytes(tree: Mapping[str, Any]) -> bytes:
+    """The dictionary for ``numpy.load``; numpy.savez would put the time of day into it."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for key, value in entries(cameras).items():
+        for key, value in tree.items():
             member = io.BytesIO()
             np.lib.format.write_array(member, np.asanyarray(value), allow_pickle=False)
             archive.writestr(zipfile.ZipInfo(f"{key}.npy"), member.getvalue())
-    return {"": buffer.getvalue()}
+    return buffer.getvalue()
 
 
 _ALL = ("none", "plumb_bob", "rational", "fisheye")

@@ -16,14 +16,15 @@ import numpy as np
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.rotations import from_vector
+from neurocal_cli.io.mat_file import read_variables
 
-__all__ = ["FORMAT", "read_mat"]
+__all__ = ["FIRST_PIXEL", "FORMAT", "read_mat", "saved", "unit_of"]
 
-_FIRST = 1.0  # MATLAB's number of the first pixel
+FIRST_PIXEL = 1.0  # MATLAB's number of the first pixel
 _STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 
 
@@ -35,12 +36,7 @@ def read_mat(data: bytes, source: str) -> CameraSet:
     FormatError, InputError
         What is wrong with it; objects of MATLAB's classes, which no other program can read.
     """
-    from scipy.io import loadmat
-
-    try:
-        tree: dict[str, Any] = loadmat(io.BytesIO(data), simplify_cells=True)
-    except Exception as error:  # whatever a damaged file leads to
-        raise FormatError("is no .mat file that can be read; save it again with -v7", source) from error
+    tree = read_variables(data, source)
     for name in _STRUCTS:
         if isinstance(tree.get(name), dict):
             tree = tree[name]
@@ -55,13 +51,23 @@ def read_mat(data: bytes, source: str) -> CameraSet:
         pose = Pose(R, _numbers(tree, "TranslationOfCamera2", 3))
         parts = [tree[f"CameraParameters{k}"] for k in (1, 2)]
         cameras = _camera(parts[0]), _camera(parts[1])
-        return CameraSet(cameras, (pose,), _poses(parts[0]), _unit(parts[0]), program="MATLAB")
+        return CameraSet(cameras, (pose,), _poses(parts[0]), unit_of(parts[0]), program="MATLAB")
     if "IntrinsicMatrix" in tree or "K" in tree:
-        return CameraSet((_camera(tree),), (), _poses(tree), _unit(tree), program="MATLAB")
+        return CameraSet((_camera(tree),), (), _poses(tree), unit_of(tree), program="MATLAB")
     raise InputError(
         "holds no camera that can be read; in MATLAB save a struct: "
         "cameraParams = toStruct(cameraParams); save('camera.mat', 'cameraParams', '-v7')"
     )
+
+
+def saved(tree: dict[str, Any]) -> bytes:
+    """A ``.mat`` file of these variables; the same ones give the same file."""
+    from scipy.io import savemat
+
+    buffer = io.BytesIO()
+    savemat(buffer, tree, oned_as="row")
+    # The first 116 bytes are a comment with today's date.
+    return b"MATLAB 5.0 MAT-file, written by neurocal".ljust(116) + buffer.getvalue()[116:]
 
 
 def _numbers(tree: dict[str, Any], name: str, count: int = -1) -> Array:
@@ -76,7 +82,8 @@ def _numbers(tree: dict[str, Any], name: str, count: int = -1) -> Array:
     return values
 
 
-def _unit(tree: dict[str, Any]) -> str | None:
+def unit_of(tree: dict[str, Any]) -> str | None:
+    """The unit that a struct states, None where it states none."""
     unit = tree.get("WorldUnits")
     return {"millimeters": "mm", "centimeters": "cm", "meters": "m", "inches": "in"}.get(
         str(unit), unit if isinstance(unit, str) and unit else None
@@ -88,7 +95,7 @@ def _camera(tree: dict[str, Any]) -> Camera:
         K = _numbers(tree, "IntrinsicMatrix", 9).reshape(3, 3).T
     else:
         K = _numbers(tree, "K", 9).reshape(3, 3)
-    K = K - np.array([[0, 0, _FIRST], [0, 0, _FIRST], [0, 0, 0]])
+    K = K - np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
     radial = _numbers(tree, "RadialDistortion")
     tangential = _numbers(tree, "TangentialDistortion", 2) if "TangentialDistortion" in tree else np.zeros(2)
     k1, k2, k3 = [*radial, 0.0][:3] if len(radial) in (2, 3) else _wrong("RadialDistortion", "2 or 3 numbers")
@@ -113,7 +120,7 @@ def _poses(tree: dict[str, Any]) -> dict[str, Pose]:
     t = np.asarray(tree["TranslationVectors"], dtype=float).reshape(-1, 3)
     if R.shape[2] != len(t):
         _wrong("TranslationVectors", f"{R.shape[2]} rows")
-    names = [str(name).strip() for name in np.atleast_1d(tree.get("ViewNames", []))]
+    names = [str(name).strip() for name in tree.get("ViewNames", [])]
     if len(names) != len(t):
         names = [f"{k}" for k in range(1, len(t) + 1)]
     return {name: Pose(R[:, :, k].T, t[k]) for k, name in enumerate(names)}
@@ -154,7 +161,7 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
             "ViewNames": np.array(list(cameras.poses), dtype=object),
         }
     if len(structs) == 1:
-        return {"": _saved({"cameraParams": structs[0]})}
+        return {"": saved({"cameraParams": structs[0]})}
     (pose,) = cameras.relative
     tree = {
         "CameraParameters1": structs[0],
@@ -162,12 +169,12 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         "RotationOfCamera2": pose.R.T,
         "TranslationOfCamera2": pose.t[None],
     }
-    return {"": _saved({"stereoParams": tree})}
+    return {"": saved({"stereoParams": tree})}
 
 
 def _struct(camera: Camera, unit: str | None) -> dict[str, Any]:
     k1, k2, p1, p2, k3 = np.pad(camera.distortion.coefficients, (0, 5 - len(camera.distortion.coefficients)))
-    K = camera.A + np.array([[0, 0, _FIRST], [0, 0, _FIRST], [0, 0, 0]])
+    K = camera.A + np.array([[0, 0, FIRST_PIXEL], [0, 0, FIRST_PIXEL], [0, 0, 0]])
     width, height = camera.image_size or (0, 0)
     return {
         "IntrinsicMatrix": K.T,
@@ -176,16 +183,6 @@ def _struct(camera: Camera, unit: str | None) -> dict[str, Any]:
         "ImageSize": np.array([[float(height), float(width)]]),
         "WorldUnits": unit or "",
     }
-
-
-def _saved(tree: dict[str, Any]) -> bytes:
-    from scipy.io import savemat
-
-    buffer = io.BytesIO()
-    savemat(buffer, tree, oned_as="row")
-    data = buffer.getvalue()
-    # The first 116 bytes are a comment with today's date; the same camera gives the same file.
-    return b"MATLAB 5.0 MAT-file, written by neurocal".ljust(116) + data[116:]
 
 
 FORMAT = Format("MATLAB", ("none", "k1k2p1p2", "plumb_bob"), True, True, 2, False, True, _text)
