@@ -21,6 +21,7 @@ from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
+from neurocal_cli.verdict.view_groups import view_groups
 
 __all__ = ["with_target"]
 
@@ -49,7 +50,9 @@ def with_target(
     if choice == "given" or solution.refusal or options.distortion == "plumb-line":
         return solution, rejected
     found = _found(solution, choice, None)
-    if found is None or (choice == "auto" and found.target.evidence < LEAST_GAIN):
+    if found is None:
+        return solution, rejected
+    if choice == "auto" and (found.target.evidence < LEAST_GAIN or _of_several_cameras(solution)):
         return solution, rejected
     best: tuple[Solution, Rejected] = solution, rejected
     for _ in range(_ROUNDS):
@@ -67,6 +70,16 @@ def with_target(
         if new.distortion.model == lens:
             break
     return best
+
+
+def _of_several_cameras(solution: Solution) -> bool:
+    """Whether two cameras, or a zoom that moves, leave hardly more than noise: then the target is not why."""
+    problem = solution.problem
+    if not (problem.free_poses and problem.free.any()):
+        return False
+    return (
+        view_groups(problem.views, solution.state, solution.adjusted.normal, problem.free_camera) is not None
+    )
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
