@@ -25,9 +25,11 @@ __all__ = ["neurocal"]
 # stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
     "calibrate": "Calibrate a camera from known points and their pixels.",
+    "compare": "Compare calibration methods on the same points.",
     "detect": "Detect chessboards in images and measure points on them.",
     "evaluate": "Measure the error of a calibrated camera or stereo rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
+    "simulate": "Calibrate simulated cameras, and compare methods where the truth is known.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
     "triangulate": "Compute points in space from their pixels in the left and the right image.",
     "undistort": "Remove the lens distortion from images and points.",
