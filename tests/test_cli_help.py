@@ -58,8 +58,8 @@ def test_each_option_is_in_an_example(words: list[str], command: click.Command) 
 
 
 def _slow(words: list[str]) -> bool:
-    """Whether the examples take minutes: those that fit a zoom lens, and both of the longest lists."""
-    return words[:1] in ([], ["lens"], ["stereo"])
+    """Whether the examples take minutes: of zoom lenses and simulations, and both of the longest lists."""
+    return words[:1] in ([], ["lens"], ["simulate"], ["stereo"])
 
 
 @pytest.mark.parametrize(

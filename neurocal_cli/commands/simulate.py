@@ -182,10 +182,11 @@ def simulate(
 
     \b
     Examples:
-      neurocal simulate --trials 10 --sigma 0.2 1 --plot fig1.png
+      neurocal simulate --trials 10 --sigma 0.2 1 --random-starts 10 --plot fig1.png
       neurocal simulate --methods neuro,linear,opencv --random-starts 0 --json
       neurocal calibrate sample_data/flat.csv --no-skew -o camera.yaml
-      neurocal simulate --camera camera.yaml --sigma 0.1 --trials 5 --seed 1
+      neurocal simulate --camera camera.yaml --sigma 0.1 --trials 5 \\
+          --random-starts 0 --seed 1
       echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
       neurocal simulate --camera camera.yaml --board board.yaml --views 4 \\
           --sigma 0.2 --trials 2 --random-starts 2 --save simulated --images --jobs 1
