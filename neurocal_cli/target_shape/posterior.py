@@ -103,7 +103,7 @@ def evidence_of_given(info: Information) -> float:
 
 
 def _log_evidence(spare: float, cost: float, logdet: float) -> float:
-    """Of a quadratic with this minimum and determinant, the noise's variance marginalised under 1 / sigma^2."""
+    """Of a quadratic with this minimum and determinant; a priori the noise has a variance as 1 / sigma^2."""
     return math.lgamma(0.5 * spare) - 0.5 * spare * math.log(math.pi * cost) - 0.5 * logdet
 
 

@@ -37,6 +37,7 @@ from neurocal_cli.target_shape.uncertainty import target_uncertainty
 from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.findings import pixel_spread
 from neurocal_cli.verdict.given_parameters import asked_for
 from neurocal_cli.verdict.noise_shape import noise_shape
 from neurocal_cli.verdict.projection_uncertainty import (
@@ -55,6 +56,7 @@ __all__ = ["assess", "gather_evidence"]
 _STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
 _IN_PLANE = 1e-9  # depth over the largest one that rounding leaves of 0
 _BY_FLEXING = 0.01  # relative
+_EXACT = 1e-4  # of the spread of the pixels: errors that cost nothing
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
@@ -172,7 +174,8 @@ class _AtMinimum:
         return predicted - self.points.pixels
 
     def _groups(self) -> ViewGroups | None:
-        if not (self.free_poses and self.free[:5].any()):
+        exact = self.calibration.rmse_px < _EXACT * pixel_spread(self.points)
+        if exact or not (self.free_poses and self.free[:5].any()):
             return None
         return view_groups(self.views, self.state, self.normal, self.free)
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.geometry import Array
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, image_diagonal, name_some, pixel_spread, verdict_of
@@ -17,7 +17,6 @@ from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
 from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
 from neurocal_cli.verdict.units_of_views import views_of_another_scale
-from neurocal_cli.verdict.view_groups import ViewGroups
 
 __all__ = ["ERROR", "Verdict", "given_parameters", "reach_verdict"]
 
@@ -70,6 +69,8 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
+    if _oblong(calibration):  # views of a target that is too long in one direction differ as well
+        evidence = replace(evidence, groups=None)
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
@@ -91,9 +92,6 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         f"the rms reprojection error of {e.rmse_px:.3g} px is large",
         pairing,
     )
-    # A target that is too long in one direction makes views differ as well.
-    if e.groups is not None and e.rmse_px > 1e-4 * spread and not _oblong(calibration):
-        yield _of_several_cameras(e.groups)
     flexes = calibration.target is not None and _above_floor(e) < _FLEXING * image_diagonal(
         calibration.points
     )
@@ -130,39 +128,6 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 def _above_floor(e: Evidence) -> float:
     """Rms error that is not noise [px]."""
     return float(np.sqrt(max(e.rmse_px**2 - e.precision_px**2, 0.0)))
-
-
-def _of_several_cameras(groups: ViewGroups) -> Finding:
-    if groups.scale.size:
-        share = float(np.ptp(groups.scale))
-        return (
-            _ALPHA.grade(share),
-            f"the focal length changes from view to view, by {100 * share:.2g} % in all: the zoom or the "
-            "focus moved",
-            "calibrate one zoom and one focus at a time; switch autofocus off",
-        )
-    first, second = groups.cameras[:, [0, 2, 3, 4]]
-    apart = float(np.abs(first - second).max() / second[0])
-    asked = [f"alpha_u = {c[0]:.5g} px and the centre ({c[2]:.0f}, {c[3]:.0f})" for c in (first, second)]
-    return (
-        _ALPHA.grade(apart),
-        f"the images come from two cameras, or {_alternative(first, second)}: {name_some(groups.names[0])} "
-        f"ask for {asked[0]}, the others for {asked[1]}",
-        "calibrate these views and the others separately",
-    )
-
-
-def _alternative(first: Array, second: Array) -> str:
-    """What else than two cameras these are, from alpha_u, alpha_v, u0 and v0."""
-    ratio = first / second
-    near = 2 * _GIVEN.good
-    if np.abs(ratio - ratio[0]).max() < near and abs(ratio[0] - 1) > near:
-        return "are of two sizes"
-    if np.abs(first - second[[1, 0, 3, 2]]).max() < near * second[0]:
-        return "u and v are exchanged in one part"
-    if np.abs(ratio[:2] - 1).max() < near:
-        return "one part is cropped or turned"
-    return "from two zooms"
 
 
 def given_parameters(
