@@ -32,6 +32,7 @@ _SUMMARIES = {
     "evaluate": "Measure the error of a calibrated camera or stereo rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
     "simulate": "Calibrate simulated cameras, and compare methods where the truth is known.",
+    "rectify": "Rectify pairs of images and points of two cameras.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
     "target": "Write the board as it was found.",
     "triangulate": "Compute points in space from their pixels in the left and the right image.",
