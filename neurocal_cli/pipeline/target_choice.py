@@ -26,6 +26,7 @@ from neurocal_cli.verdict.view_groups import view_groups
 __all__ = ["with_target"]
 
 _ROUNDS = 3
+_WORTH = 0.8  # of the views' number, where some repeat a pose
 
 
 def with_target(
@@ -48,6 +49,9 @@ def with_target(
         The ones given where the target stays as it is.
     """
     if choice == "given" or solution.refusal or options.distortion == "plumb-line":
+        return solution, rejected
+    if choice == "auto" and problem.type != 1:
+        # What is given may be wrong, and a target would take the blame.
         return solution, rejected
     found = _found(solution, choice, None)
     if found is None:
@@ -89,6 +93,8 @@ def _found(solution: Solution, choice: str, known: Target | None) -> Found | Non
     plane = planes_of(given, point) if known is None else known.plane
     if not enough_views(label, repeated.n_poses, int(plane.max()) + 1):
         return None
+    if choice == "auto" and repeated.worth < _WORTH:
+        return None  # errors that copies of a view share look like the target's
     # Only a lens that nobody named may change.
     find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
     return find([(problem, solution.adjusted)], choice == "flat", known)
