@@ -21,11 +21,13 @@ from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
+from neurocal_cli.verdict.given_parameters import asked_for
 from neurocal_cli.verdict.view_groups import view_groups
 
 __all__ = ["with_target"]
 
 _ROUNDS = 3
+_TOLD_APART = 5.0  # standard deviations, as for the verdict
 
 
 def with_target(
@@ -52,7 +54,7 @@ def with_target(
     found = _found(solution, choice, None)
     if found is None:
         return solution, rejected
-    if choice == "auto" and (found.target.evidence < LEAST_GAIN or _of_several_cameras(solution)):
+    if choice == "auto" and (found.target.evidence < LEAST_GAIN or _other_reason(solution)):
         return solution, rejected
     best: tuple[Solution, Rejected] = solution, rejected
     for _ in range(_ROUNDS):
@@ -70,13 +72,20 @@ def with_target(
     return best
 
 
-def _of_several_cameras(solution: Solution) -> bool:
-    """Whether two cameras, or a zoom that moves, leave hardly more than noise: then the target is not why."""
+def _other_reason(solution: Solution) -> bool:
+    """Whether the target is not why: given parameters that the points contradict, or two cameras.
+
+    Two cameras, or a zoom that moves, that leave hardly more than noise.
+    """
     problem = solution.problem
-    if not (problem.free_poses and problem.free.any()):
+    if not problem.free_poses:
         return False
-    return (
-        view_groups(problem.views, solution.state, solution.adjusted.normal, problem.free_camera) is not None
+    asked = asked_for(problem.views, solution.state, problem.fixed, problem.free_poses)
+    if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
+        return True
+    free = problem.free_camera
+    return bool(problem.free.any()) and (
+        view_groups(problem.views, solution.state, solution.adjusted.normal, free) is not None
     )
 
 

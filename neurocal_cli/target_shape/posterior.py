@@ -373,7 +373,8 @@ class _Parts:
         for name, ratio in now.ratios.items():
             w, var, unit = self._coefficients(now, name)
             determined += w.size - (unit / ratio) ** 2 * float(var.sum())
-        along = solved.camera_offsets.reshape(f, -1)
+        offsets = solved.camera_offsets
+        along = offsets.reshape(f, offsets.size // max(f, 1))
         followed = np.asarray(-np.linalg.solve(solved.camera_covariance, along) if f else along)
         noise = np.sqrt(now.variance)
         return Posterior(
