@@ -9,8 +9,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
+from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Rejected
@@ -22,6 +25,7 @@ from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 from neurocal_cli.verdict.given_parameters import asked_for
+from neurocal_cli.verdict.stated_noise import stated_noise
 from neurocal_cli.verdict.view_groups import view_groups
 
 __all__ = ["with_target"]
@@ -73,11 +77,15 @@ def with_target(
 
 
 def _other_reason(solution: Solution) -> bool:
-    """Whether the target is not why: given parameters that the points contradict, or two cameras.
+    """Whether the target is not why, but sigmas or parameters that the points contradict, or two cameras.
 
     Two cameras, or a zoom that moves, that leave hardly more than noise.
     """
-    problem = solution.problem
+    problem, points = solution.problem, solution.problem.points
+    place = np.array([problem.views.names.index(name) for name in points.view_names])
+    predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
+    if any(grade for grade, *_ in stated_noise(points, predicted - points.pixels)):
+        return True
     if not problem.free_poses:
         return False
     asked = asked_for(problem.views, solution.state, problem.fixed, problem.free_poses)
