@@ -62,16 +62,18 @@ def with_target(
         return solution, rejected
     best: tuple[Solution, Rejected] = solution, rejected
     for _ in range(_ROUNDS):
-        before = best[0].problem.distortion.model
-        again = _fitted_to(problem, found.target, best, options)
+        (new, adjusted), *_ = found.fits
+        start = replace(solution, problem=new, adjusted=adjusted)
+        again = _fitted_to(problem, found.target, (start, best[1]), options)
         if again is None:
             break
+        lens = new.distortion.model
         found = _found(again[0], choice, found.target)
         if found is None:
             break
         (new, adjusted), *_ = found.fits
         best = replace(again[0], problem=new, adjusted=adjusted, target=found.target), again[1]
-        if new.distortion.model == before:
+        if new.distortion.model == lens:
             break
     return best
 
@@ -118,7 +120,8 @@ def _fitted_to(
         if len(rejected) or rejected.views:
             again, rejected = fit_robustly(problem.with_points(target.applied(problem.points)), options)
         else:
-            again = fit_again(solution, target.applied(problem.points), options)
+            points = target.applied(problem.points)
+            again = fit_again(solution, points, options, only_from_here=True)
     except DegenerateGeometryError:
         return None
     return None if again.refusal else (again, rejected)

@@ -123,6 +123,7 @@ class _System:
         self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
         pose_basis = info.pose_point.reshape(self.P * 6, 3 * self.n) @ basis.reshape(3 * self.n, self.m)
         self.pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, 6, self.m)], axis=2)
+        self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
         self.points_first = 3 * self.n >= 6 * self.P
         if not self.points_first:
             self._eliminate_poses()
@@ -167,7 +168,9 @@ class _System:
         cost = float(self.dense[-1, -1] - self.dense[:dim, -1] @ x)
         var_single = np.diagonal(inverse)[s:].reshape(self.n, 3)
         with_offsets = self._with_offsets(inverse[:f, f:s], inverse[:f, s:].reshape(f, self.n, 3))
-        var = self._variance(inverse[f:s, f:s], inverse[f:s, s:].reshape(self.m, self.n, 3), var_single)
+        cross = inverse[f:s, s:].reshape(self.m, self.n, 3)
+        along_gauge = (inverse[s:, s:] @ self.gauge).reshape(self.n, 3, -1)
+        var = self._variance(inverse[f:s, f:s], cross, var_single, along_gauge)
         return _Solved(
             x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
             np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], with_offsets, var,
@@ -206,7 +209,9 @@ class _System:
         )
         logdet -= 2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
         cross = -spread.T.reshape(dim, n, 3)
-        var = self._variance(inverse[f:s, f:s], cross[f:s], var_single)
+        own = ((back @ root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
+        along_gauge = own + spread @ (follow.reshape(3 * n, dim).T @ self.gauge)
+        var = self._variance(inverse[f:s, f:s], cross[f:s], var_single, along_gauge.reshape(n, 3, -1))
         return _Solved(
             x[:f], x[f:s], e, cost, logdet, np.diagonal(inverse)[f:s], var_single,
             inverse[:f, :f], self._with_offsets(inverse[:f, f:s], cross[:f]), var,
@@ -216,12 +221,20 @@ class _System:
         """(f, n, 3) covariance between the cameras and the whole offsets."""
         return np.asarray(np.einsum("fm,nim->fni", smooth, self.prior.basis) + single)
 
-    def _variance(self, smooth: Array, cross: Array, single: Array) -> Array:
-        """(n, 3) variance of the whole offsets."""
-        basis = self.prior.basis
-        return np.asarray(
+    def _variance(self, smooth: Array, cross: Array, single: Array, single_gauge: Array) -> Array:
+        """(n, 3) variance of the whole offsets, without turns, shifts and a scale of all points together.
+
+        With G the orthonormal directions of these, it is the diagonal of (I - G G^T) C (I - G G^T).
+        """
+        basis, G = self.prior.basis, self.gauge.reshape(self.n, 3, -1)
+        diagonal = (
             ((basis @ smooth) * basis).sum(axis=2) + 2 * np.einsum("nim,mni->ni", basis, cross) + single
         )
+        by_smooth = np.einsum("nim,nig->mg", basis, G)
+        C_G = basis @ (smooth @ by_smooth + np.einsum("mni,nig->mg", cross, G))
+        C_G += np.einsum("mni,mg->nig", cross, by_smooth) + single_gauge
+        inner = np.einsum("nig,nih->gh", G, C_G)
+        return np.asarray(diagonal - 2 * (G * C_G).sum(axis=2) + ((G @ inner) * G).sum(axis=2))
 
 
 @dataclass(frozen=True, eq=False)
