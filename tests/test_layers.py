@@ -46,6 +46,7 @@ LEVELS = (
     {"stereo"},
     {"plots"},
     {"zoom_lens"},
+    {"html_report"},
     {"simulation"},
     {"io"},
     {"detection"},

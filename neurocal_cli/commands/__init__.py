@@ -31,6 +31,7 @@ _SUMMARIES = {
     "evaluate": "Measure the error of a calibrated camera or stereo rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
     "rectify": "Rectify pairs of images and points of two cameras.",
+    "report": "Show a calibration, a rig or a zoom lens as one HTML page.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
     "target": "Write the board as it was found.",
     "triangulate": "Compute points in space from their pixels in the left and the right image.",
