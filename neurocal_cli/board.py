@@ -20,6 +20,7 @@ __all__ = ["Board", "Plane"]
 Triple = tuple[float, float, float]
 
 _AXIS_TOLERANCE = 1e-6
+_FEWEST_MEASURED = 4  # places that tell a plane's bend
 _MOST_VERTICES = 1000  # along one side; no printer makes more, and a typing error asks for gigabytes
 
 
@@ -39,6 +40,9 @@ class Plane:
         Vertex (0, 0).
     x_axis, y_axis : 3 floats
         Unit vectors, perpendicular to each other.
+    measured : tuple of 5 floats each
+        Places (c, r) in squares, and X, Y, Z where the point there really is; none: all are where they
+        should be.
 
     Raises
     ------
@@ -53,6 +57,7 @@ class Plane:
     origin: Triple = (0.0, 0.0, 0.0)
     x_axis: Triple = (1.0, 0.0, 0.0)
     y_axis: Triple = (0.0, 1.0, 0.0)
+    measured: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
         _check_name(self.name)
@@ -66,6 +71,12 @@ class Plane:
             value = _numbers(vector, getattr(self, vector), (3,))
             object.__setattr__(self, vector, tuple(value.tolist()))
         self._check_axes()
+        rows = tuple(tuple(_numbers("points", row, (5,)).tolist()) for row in self.measured)
+        if rows and len({row[:2] for row in rows}) < max(len(rows), _FEWEST_MEASURED):
+            raise InputError(
+                f"points must name {_FEWEST_MEASURED} or more different places (c, r); correct them"
+            )
+        object.__setattr__(self, "measured", rows)
 
     @property
     def prefix(self) -> str:
@@ -91,6 +102,28 @@ class Plane:
         """
         lengths = self.square * np.asarray(grid, dtype=float)
         return lengths @ np.array([self.x_axis, self.y_axis]) + np.array(self.origin)
+
+    def truly_at(self, grid: ArrayLike) -> Array:
+        """World coordinates where points really are: as measured, and smoothly in between.
+
+        A thin-plate spline through what was measured of the plane's points.
+
+        Parameters
+        ----------
+        grid : (N, 2) array
+            Along x_axis and y_axis, in squares.
+
+        Returns
+        -------
+        world : (N, 3) array [world unit]
+        """
+        world = self.at(grid)
+        if not self.measured:
+            return world
+        from scipy.interpolate import RBFInterpolator
+
+        known = np.array(self.measured)
+        return np.asarray(world + RBFInterpolator(known[:, :2], known[:, 2:] - self.at(known[:, :2]))(grid))
 
     def vertices(self) -> Array:
         """World coordinates of the vertices, ``[r, c]``; (rows, cols, 3) array [world unit]."""

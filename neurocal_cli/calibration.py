@@ -15,6 +15,7 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
+from neurocal_cli.target import Target
 
 __all__ = [
     "Calibration",
@@ -180,8 +181,11 @@ class Calibration:
         Names of the intrinsic parameters that were given.
     views : dict of ViewResult by view name
     points : Correspondences
-        What it was calibrated from, without what was rejected.
+        What it was calibrated from, without what was rejected. Where the target was found with the camera,
+        their world coordinates are those that were found.
     rejected : Rejected
+    target : Target or None
+        The target as it was found; None where it was taken as given.
     judgement : Verdict or callable, optional
         The verdict as a file has it, or what reaches it from this calibration; see `verdict`.
     lens_choice : dict of float by lens model [px]
@@ -215,6 +219,7 @@ class Calibration:
     camera_name: str = "camera"
     warnings: tuple[str, ...] = ()
     rejected: Rejected = field(default_factory=Rejected)
+    target: Target | None = None
     lens_choice: Mapping[str, float] = field(default_factory=dict)
     judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None
 

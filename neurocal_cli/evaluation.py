@@ -114,7 +114,8 @@ def evaluate_camera(
     calibration : Calibration, Camera or Intrinsics
         Of a camera without poses, the pose of every view is fitted.
     points : Correspondences, optional
-        Default: the points that the camera was calibrated from.
+        Default: the points that the camera was calibrated from. Points of the target that was found with the
+        camera are taken where they were found.
 
     Returns
     -------
@@ -139,6 +140,8 @@ def evaluate_camera(
         _refuse_another_size(calibration, points)
         seed = calibration.seed
         poses = {name: view.pose for name, view in calibration.views.items()}
+        if given is not None and calibration.target is not None:
+            points = calibration.target.applied(points)
         if given is not None:
             renamed = _other_images(calibration, points)
             poses = {name: pose for name, pose in poses.items() if name not in renamed}

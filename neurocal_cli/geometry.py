@@ -25,6 +25,7 @@ __all__ = [
     "euler_jacobian",
     "euler_to_rotation",
     "nearest_rotation",
+    "nearest_similarity",
     "orthonormalised",
     "rotation_step",
     "rotation_to_euler",
@@ -165,6 +166,18 @@ def nearest_rotation(M: Array) -> Array:
     flip = np.ones((*np.shape(M)[:-2], 3))
     flip[..., 2] = np.sign(np.linalg.det(U @ Vt))
     return (U * flip[..., None, :]) @ Vt
+
+
+def nearest_similarity(points: Array, to: Array) -> tuple[float, Array, Array]:
+    """Scale s, rotation R (3, 3) and shift t (3,) that bring ``s R x + t`` nearest to other points.
+
+    Umeyama, Least-squares estimation of transformation parameters, IEEE PAMI 13 (1991).
+    """
+    centre, other = points.mean(axis=0), to.mean(axis=0)
+    x, y = points - centre, to - other
+    R = nearest_rotation(y.T @ x)
+    s = float(((x @ R.T) * y).sum() / (x * x).sum())
+    return s, R, other - s * R @ centre
 
 
 def rq(M: Array) -> tuple[Array, Array]:

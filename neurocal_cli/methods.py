@@ -19,7 +19,9 @@ from neurocal_cli.initialisation.options import Progress, options_for
 from neurocal_cli.pipeline.fit import fit
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.pipeline.result import calibration_of
+from neurocal_cli.pipeline.target_choice import with_target
 from neurocal_cli.points import Correspondences
+from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.verdict.assessment import assess
 from neurocal_cli.verdict.repeated_views import repeated_views
 
@@ -51,6 +53,7 @@ def calibrate(
     outliers: str = "reject",
     seed: int = 0,
     *,
+    target: str | Target = "auto",
     starts: int = _STARTS,
     backprop: BackpropOptions | None = None,
     camera_name: str = "camera",
@@ -86,6 +89,10 @@ def calibrate(
         Whether points, and whole views, that contradict the others are set aside (`outlier_rejection`).
     seed : int
         Of the random weights; the same seed gives the same result.
+    target : {"auto", "given", "flat", "free"} or Target
+        Where the points of the target are: given, as they are given; free, found with the camera; flat,
+        found, but each left in its plane; auto: found where the data ask for it (`target_shape`). A target
+        that was found already: there.
     starts : int
         Most random starts for each network, at least 2.
     backprop : BackpropOptions, optional
@@ -106,7 +113,11 @@ def calibrate(
     InputError, DegenerateGeometryError
         Points that cannot give an answer, with the reason.
     """
-    _check_options(method, trainer, distortion, outliers, starts, seed)
+    known_target = target if isinstance(target, Target) else None
+    choice = "given" if isinstance(target, Target) else target
+    _check_options(method, trainer, distortion, outliers, choice, starts, seed)
+    if known_target is not None:
+        points = known_target.applied(points)
     given = None if intrinsics is None else camera_of(intrinsics)
     known, model = (given.intrinsics, given.distortion) if given else (None, Distortion())
     type_3 = isinstance(type, (int, np.integer)) and type == 3
@@ -132,6 +143,9 @@ def calibrate(
             solution, rejected = fit_robustly(problem, options)
         else:
             solution, rejected = fit(problem, options), Rejected()
+        solution, rejected = with_target(problem, solution, rejected, options, choice)
+        if known_target is not None:
+            solution = replace(solution, target=known_target)
         if solution.refusal:
             raise DegenerateGeometryError(solution.refusal)
         found = calibration_of(
@@ -186,12 +200,15 @@ def _refuse_misfit(calibration: Calibration) -> None:
     )
 
 
-def _check_options(method: str, trainer: str, distortion: str, outliers: str, starts: int, seed: int) -> None:
+def _check_options(
+    method: str, trainer: str, distortion: str, outliers: str, target: str, starts: int, seed: int
+) -> None:
     for name, value, choices in (
         ("method", method, METHODS),
         ("trainer", trainer, TRAINERS),
         ("distortion", distortion, DISTORTIONS),
         ("outliers", outliers, OUTLIERS),
+        ("target", target, TARGETS),
     ):
         if value not in choices:
             raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")

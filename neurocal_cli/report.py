@@ -10,10 +10,13 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import numpy as np
+
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, Verdict, ViewResult
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.evaluation import CameraEvaluation
+from neurocal_cli.target import Target
 from neurocal_cli.verdict.report import verdict_json, verdict_lines
 
 __all__ = [
@@ -26,6 +29,7 @@ __all__ = [
     "plural",
     "printable",
     "rounded",
+    "target_lines",
 ]
 
 _MOST_VIEWS = 20  # rows of a table that still fit on a screen
@@ -79,10 +83,23 @@ def calibration_report(calibration: Calibration) -> str:
         [_headline(calibration)],
         align(_parameter_rows(calibration)),
         _view_lines(calibration.views),
-        _training_lines(calibration),
+        [*_training_lines(calibration), *target_lines(calibration.target, calibration.unit)],
         [] if calibration.verdict is None else verdict_lines(calibration.verdict),
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def target_lines(target: Target | None, unit: str) -> list[str]:
+    """The target that was found, in a line; none where it was taken as given."""
+    if target is None:
+        return []
+    parts = [f"bent by {target.bend():.2g} {printable(unit)}"] if not target.flat else []
+    parts.append(f"stretched by {100 * target.stretch():.2g} %")
+    found = np.sqrt((target.offsets**2).sum(axis=1).mean())
+    return [
+        f"target: {' and '.join(parts)}; its points lie {found:.2g} {printable(unit)} rms from where they "
+        "were given"
+    ]
 
 
 def evaluation_report(evaluation: CameraEvaluation, verdict: Verdict | None = None) -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
+from support.slow_cases import slow_but
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
@@ -107,8 +110,10 @@ def blocks_by_differences(problem: Problem, state: CameraState) -> Array:
     return np.array(blocks)
 
 
-@pytest.mark.parametrize("whitened", [False, True])
-@pytest.mark.parametrize("skew", [0.0, 0.05])
+@pytest.mark.parametrize(
+    ("skew", "whitened"),
+    slow_but({(0.0, False), (0.05, True)}, itertools.product((0.0, 0.05), (False, True))),
+)
 @pytest.mark.parametrize("counts", [(30,), EVEN, RAGGED], ids=["one view", "even", "ragged"])
 def test_normal_blocks_by_central_differences(counts: tuple[int, ...], skew: float, whitened: bool) -> None:
     problem = Problem(counts, skew, whitened)
@@ -196,8 +201,9 @@ def assert_same_minimum(problem: Problem, mask: Array, poses: bool = True) -> No
     )
 
 
-@pytest.mark.parametrize("whitened", [False, True])
-@pytest.mark.parametrize("flat", [False, True], ids=["solid", "flat"])
+@pytest.mark.parametrize(
+    ("flat", "whitened"), slow_but({(False, False), (True, True)}, itertools.product((False, True), repeat=2))
+)
 @pytest.mark.parametrize("free", FREE.values(), ids=FREE)
 def test_refine_ends_where_scipy_does(free: list[int], flat: bool, whitened: bool) -> None:
     mask = np.array(free, dtype=bool)

@@ -170,7 +170,7 @@ def calibrations(draw):
     )
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(cal=calibrations())
 def test_a_calibration_comes_back_to_the_last_bit(tmp_path_factory, cal):
     path = tmp_path_factory.getbasetemp() / "cal.yaml"
@@ -181,7 +181,7 @@ def test_a_calibration_comes_back_to_the_last_bit(tmp_path_factory, cal):
     assert format_calibration(back) == format_calibration(cal)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(cal=calibrations(), style=st.sampled_from([None, True, False]), slow=st.booleans())
 def test_a_file_written_anew_by_another_program_reads_the_same(tmp_path_factory, cal, style, slow):
     path = tmp_path_factory.getbasetemp() / "cal.yaml"
@@ -403,7 +403,7 @@ TREES = st.recursive(
 )
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 10**6), junk=TREES)
 def test_a_value_of_another_type_anywhere_is_refused_in_one_line(tmp_path_factory, seed, junk):
     chance = random.Random(seed)

@@ -13,6 +13,7 @@ from click.testing import Result
 from support.command_line import run
 from support.real_data import RealFiles
 from support.rigs import RigScene, random_rig
+from support.slow_cases import slow_but
 
 from neurocal_cli import Board, Correspondences, calibrate, read_rig, write_calibration, write_points
 from neurocal_cli.board import Plane
@@ -177,7 +178,9 @@ def test_a_flipped_pair_is_named_and_left_out_or_refused(files: tuple[Path, Path
     assert not (tmp_path / "rig").exists()
 
 
-@pytest.mark.parametrize(("kind", "least"), [("vertices", 120), ("midpoints", 190)])
+@pytest.mark.parametrize(
+    ("kind", "least"), slow_but([("midpoints", 190)], [("vertices", 120), ("midpoints", 190)])
+)
 def test_the_corner_rig_from_its_photographs(
     kind: str, least: int, tmp_path: Path, real_files: RealFiles
 ) -> None:

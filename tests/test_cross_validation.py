@@ -8,6 +8,7 @@ from support.scenes import Scene, pinhole, random_flat_set, random_solid
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted, adjust
 from neurocal_cli.bundle_adjustment.cross_validation import (
+    Minimum,
     disagreement,
     held_out,
     held_out_points,
@@ -36,7 +37,7 @@ def flat(seed: int, n_views: int) -> tuple[Scene, Correspondences]:
 def test_the_error_on_views_left_out_is_that_of_calibrating_without_them(seed: int) -> None:
     scene, points = flat(seed, 10)
     views, adjusted = solved(scene, points)
-    lost = held_out(views, adjusted.state, adjusted.normal, FREE, True)
+    lost = held_out(Minimum(views, adjusted.state, adjusted.normal, FREE, True))
     fold = np.arange(10) % 5
     squared = 0.0
     for k in range(5):
@@ -80,7 +81,7 @@ def test_halves_disagree_by_what_their_noise_explains() -> None:
     for trial in range(150):
         points = scene.points(0.3, np.random.default_rng(trial))
         views, adjusted = solved(scene, points)
-        difference, covariance = disagreement(views, adjusted.state, adjusted.normal, FREE, True)
+        difference, covariance = disagreement(Minimum(views, adjusted.state, adjusted.normal, FREE, True))
         variance = adjusted.cost.sum() / (2 * len(points) - 4 - 48)
         values.append(difference @ np.linalg.inv(covariance) @ difference / variance)
     assert np.mean(values) == pytest.approx(4.0, abs=4 * np.sqrt(8 / 150))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from support.real_data import RealFiles
 from support.rendered import condition, picture
+from support.slow_cases import slow_but
 
 from neurocal_cli.detection import Grid
 from neurocal_cli.detection.finding import levels as find_levels
@@ -133,7 +134,7 @@ def open_around(truth: PlaneTruth, size: tuple[int, int]) -> np.ndarray:
     return seen
 
 
-@pytest.mark.parametrize("name", WHOLE)
+@pytest.mark.parametrize("name", slow_but(WHOLE[::3], WHOLE))
 def test_a_whole_board_is_found_completely(name: str) -> None:
     assert missed(name, [FIRST]) == []
 
@@ -155,9 +156,7 @@ def test_boards_in_large_pictures_are_found(name: str) -> None:
     assert missed(name, range(FIRST, FIRST + 2)) == []
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(one, marks=[pytest.mark.slow] * (k % 2)) for k, one in enumerate(FOLDED)]
-)
+@pytest.mark.parametrize("name", slow_but(("two planes across",), FOLDED))
 def test_planes_at_a_fold_are_separate_grids(name: str) -> None:
     assert missed(name, range(FIRST, FIRST + 2)) == []
 
@@ -168,7 +167,7 @@ def test_planes_at_a_fold_are_separate_grids_in_many_poses(name: str) -> None:
     assert len(missed(name, range(FIRST, FIRST + 25))) <= 1
 
 
-@pytest.mark.parametrize("name", ["base", "k1 -0.3", "psf 3"])
+@pytest.mark.parametrize("name", slow_but(("base", "psf 3"), ("base", "k1 -0.3", "psf 3")))
 def test_vertices_are_good_to_a_few_tenths_of_a_pixel(name: str) -> None:
     assert missed(name, range(FIRST, FIRST + 2), within=0.3) == []
 
@@ -212,7 +211,7 @@ def test_what_is_nearly_as_near_is_looked_for_all_the_same() -> None:
     assert len(find_grids(image, [shape])) == 2
 
 
-@pytest.mark.parametrize("name", ["occluded", "board cut", "two boards"])
+@pytest.mark.parametrize("name", slow_but(("occluded",), ("occluded", "board cut", "two boards")))
 @pytest.mark.parametrize("count", [2, pytest.param(16, marks=pytest.mark.slow)])
 def test_visible_vertices_of_partly_hidden_boards_are_found(name: str, count: int) -> None:
     found = total = wrong = 0
@@ -301,7 +300,7 @@ def test_separate_squares_are_no_board(real_files: RealFiles) -> None:
     assert [path.name for path in real_files("zhang_planar/*.png") if shapes(path)] == []
 
 
-@pytest.mark.parametrize("seed", [FIRST, FIRST + 1])
+@pytest.mark.parametrize("seed", slow_but((FIRST,), (FIRST, FIRST + 1)))
 def test_a_board_in_two_halves_is_one_grid(seed: int) -> None:
     scene = condition("base", seed)
     truth = render(scene, np.random.default_rng(0)).truth.planes[0].vertices
@@ -333,7 +332,7 @@ def linked_first(level: Level) -> Lattice | None:
     return lattice_from_links(level, saddles, links, int(seeds[0, 1, 1]), np.zeros(len(saddles), dtype=bool))
 
 
-@pytest.mark.parametrize("name", ["base", "noise 12", "k1 -0.3"])
+@pytest.mark.parametrize("name", slow_but(("noise 12",), ("base", "noise 12", "k1 -0.3")))
 def test_links_put_a_plain_board_together(name: str) -> None:
     shot = picture(name, FIRST)
     lattice = linked_first(levels_of(shot.image)[-1])
@@ -344,7 +343,7 @@ def test_links_put_a_plain_board_together(name: str) -> None:
     assert hit.mean() > 0.9
 
 
-@pytest.mark.parametrize("seed", [FIRST, FIRST + 6])
+@pytest.mark.parametrize("seed", slow_but((FIRST + 6,), (FIRST, FIRST + 6)))
 def test_links_do_not_lead_over_a_fold(seed: int) -> None:
     """On the smallest level of the second one, holes hide the fold from what looks for it."""
     shot = picture("three planes across", seed)

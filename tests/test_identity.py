@@ -12,6 +12,7 @@ import pytest
 from support.rendered import Recipe, board_pose, condition, folded, single
 from support.rendered import picture as rendered_picture
 from support.seen_grids import labelled_vertices, seen_grid, seen_grids, true_vertices, turned_by
+from support.slow_cases import slow_but
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import Grid
@@ -66,7 +67,7 @@ def test_the_first_vertex_is_where_opencv_begins() -> None:
             assert np.hypot(*(found[name] - corner.ravel())) < 1
 
 
-@pytest.mark.parametrize("name", ["board cut", "occluded"])
+@pytest.mark.parametrize("name", slow_but(("board cut",), ("board cut", "occluded")))
 def test_a_part_of_the_board_is_placed_by_the_ends_that_are_seen_or_refused(name: str) -> None:
     placed = 0
     for seed in range(5):
@@ -185,7 +186,7 @@ def test_no_grid_is_no_board() -> None:
         identify(Board.single(9, 6, 25), [], EMPTY)
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", slow_but((1,), range(2)))
 @pytest.mark.parametrize(
     "name",
     ["two planes", "two planes distorted", "two planes across", "three planes", "three planes across"],

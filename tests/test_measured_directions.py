@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from support.edge_points import as_measured, edge_set, edges
 from support.rigs import random_rig
 from support.scenes import pinhole
+from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences, calibrate
 from neurocal_cli.bundle_adjustment.common_noise import Noise, noise_of
@@ -44,10 +45,11 @@ def rms(values: object) -> float:
     return float(np.sqrt(np.mean(np.square(np.asarray(values)))))
 
 
-def test_standard_deviations_of_midpoints_hold() -> None:
+@pytest.mark.parametrize("sets", slow_but((30,), (30, 60)))
+def test_standard_deviations_of_midpoints_hold(sets: int) -> None:
     """And they hold, counting views, where places along the edges are taken for measurements of their own."""
     one_way, both_ways, disagreement = [], [], []
-    for seed in range(60):
+    for seed in range(sets):
         camera, points = edge_set(seed)
         found = pinhole(points, skew=False)
         one_way.append(sigmas(found, camera))
@@ -58,10 +60,12 @@ def test_standard_deviations_of_midpoints_hold() -> None:
     assert np.mean(disagreement) == pytest.approx(1.0, abs=0.25)
 
 
-@pytest.mark.parametrize("distortion", ["k1k2", pytest.param("plumb-line", marks=pytest.mark.slow)])
-def test_standard_deviations_of_a_lens_hold(distortion: str) -> None:
+@pytest.mark.parametrize(
+    ("distortion", "sets"), slow_but([("k1k2", 25)], [("k1k2", 25), ("k1k2", 50), ("plumb-line", 50)])
+)
+def test_standard_deviations_of_a_lens_hold(distortion: str, sets: int) -> None:
     errors = []
-    for seed in range(50):
+    for seed in range(sets):
         camera, points = edge_set(seed, 12, 0.05, (-0.2, 0.05))
         found = calibrate(points, skew=False, distortion=distortion, outliers="keep")
         k1, k2 = found.distortion[:2]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.measured import errors, found, places, take
 from support.real_data import RealFiles
+from support.slow_cases import slow_but
 
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Grid
 from neurocal_cli.detection.measuring import measure
@@ -60,7 +61,7 @@ GOOD = (
 )
 
 
-@pytest.mark.parametrize("name", ["base", "tilt 65", pytest.param("k1 -0.3", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", slow_but(("base",), ("base", "tilt 65", "k1 -0.3")))
 def test_midpoints_reach_the_bound(name: str) -> None:
     found_errors = errors(name, range(2))
     assert found_errors.ratio < 1.2
@@ -69,7 +70,7 @@ def test_midpoints_reach_the_bound(name: str) -> None:
     assert found_errors.rms < 0.0036
 
 
-@pytest.mark.parametrize("points", ["midpoints", pytest.param("vertices", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("points", slow_but(("midpoints",), ("midpoints", "vertices")))
 def test_edges_sharper_than_a_pixel_reach_the_bound(points: Literal["midpoints", "vertices"]) -> None:
     found_errors = errors("straight, psf 0.15", range(1), points)
     assert found_errors.ratio < 1.3  # five times as much if the pixel's box is taken for a Gaussian
@@ -92,8 +93,9 @@ def test_gamma_is_found_from_the_edges_and_taken_off() -> None:
     assert abs(known.polarity[0]) < 0.02
 
 
-def test_hidden_edges_are_left_out() -> None:
-    found_errors = errors("occluded", range(2), hidden=True)
+@pytest.mark.parametrize("seed", slow_but((1,), range(2)))
+def test_hidden_edges_are_left_out(seed: int) -> None:
+    found_errors = errors("occluded", [seed], hidden=True)
     assert found_errors.kept >= 0.99
     assert found_errors.rms < 0.004
     assert found_errors.hidden_kept <= 3  # the occluder only just touches the strip around them

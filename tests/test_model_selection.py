@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.distorted import BENT, SIGMA, bent_set, new_views, within_reach
 from support.scenes import Scene, random_solid, table_1
+from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.camera.distortion import MODELS
@@ -39,13 +40,7 @@ def judged(model: str, seed: int) -> tuple[bool, bool, bool, bool]:
     return found.distortion_model == model, told <= len(MODELS[model]) + 2, well, everywhere
 
 
-@pytest.mark.parametrize(
-    "model",
-    [
-        pytest.param(one, marks=[pytest.mark.slow] * (one in ("k1", "k1k2", "k1k2p1p2", "plumb_bob")))
-        for one in BENT
-    ],
-)
+@pytest.mark.parametrize("model", slow_but(("none", "k1k2"), BENT))
 def test_the_choice_predicts_new_views_as_well_as_any_model(model: str) -> None:
     results = [judged(model, 7000 + seed) for seed in range(2)]
     assert any(right for right, *_ in results)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.distorted import SIGMA, bent_set, new_views, through
 from support.plain_projection import project
+from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
@@ -65,7 +66,7 @@ def test_a_lens_with_all_the_slope_that_is_asked_for_is_free() -> None:
     assert (by_camera[missing > 0, 5] > 0).all()  # more k1, more slope
 
 
-@pytest.mark.parametrize(("model", "seed"), FOLDING)
+@pytest.mark.parametrize(("model", "seed"), slow_but(FOLDING[:1], FOLDING))
 @pytest.mark.parametrize("asked", ["auto", "the model"])
 def test_a_fold_where_no_point_is_goes_and_new_views_are_predicted_better(
     model: str, seed: int, asked: str

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from support.made_calibration import made_calibration
+from support.slow_cases import slow_but
 
 from neurocal_cli import NeurocalError
 from neurocal_cli.calibration import Calibration
@@ -17,7 +18,7 @@ from neurocal_cli.plots import draw_calibration
 BEGINNINGS = {"png": b"\x89PNG\r\n", "pdf": b"%PDF", "svg": b"<?xml"}
 
 
-@pytest.mark.parametrize("kind", BEGINNINGS)
+@pytest.mark.parametrize("kind", slow_but(("svg",), BEGINNINGS))
 def test_the_same_calibration_gives_the_same_picture(kind: str) -> None:
     picture = draw_calibration(made_calibration(2), kind)
     assert picture.startswith(BEGINNINGS[kind])

@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from support.slow_cases import slow_but
 
 from neurocal_cli import read_points
 
@@ -94,7 +95,7 @@ def zoom_reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return run_commands(tmp_path_factory.mktemp("processors") / "zoom", ZOOM)
 
 
-@pytest.fixture(params=PROCESSORS)
+@pytest.fixture(params=slow_but(("Prescott",), PROCESSORS))
 def processor(request: pytest.FixtureRequest) -> str:
     needed = PROCESSORS[request.param][2]
     if platform.machine().lower() not in ("x86_64", "amd64"):

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.rigs import RigScene, corner, random_rig
+from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate
 from neurocal_cli.errors import DegenerateGeometryError, InputError
@@ -67,7 +68,7 @@ def test_the_errors_are_those_of_the_contract_written_out() -> None:
     assert found.rmse**2 == pytest.approx(found.rmse_x**2 + found.rmse_y**2 + found.rmse_z**2)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", slow_but(("optimal",), METHODS))
 def test_without_noise_there_is_no_error(method: str) -> None:
     for scene in (folded(), flat(3)):
         found = evaluate_stereo(*calibrated(scene, 0.0), method=method)

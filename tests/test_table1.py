@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support.scenes import table_1
+from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, calibrate
 
@@ -17,7 +18,7 @@ def intrinsic_error(calibration: Calibration) -> float:
 
 
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("seed", slow_but(SEEDS[:3], SEEDS))
 def test_lm_recovers_the_noise_free_camera(type: int, seed: int) -> None:
     scene = table_1()
     calibration = calibrate(scene.points(), seed=seed, **scene.given(type))
@@ -30,7 +31,7 @@ def test_lm_recovers_the_noise_free_camera(type: int, seed: int) -> None:
 
 
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
-@pytest.mark.parametrize("seed", [*SEEDS[:4], *(pytest.param(k, marks=pytest.mark.slow) for k in SEEDS[4:])])
+@pytest.mark.parametrize("seed", slow_but(SEEDS[:2], SEEDS))
 def test_backprop_beats_the_papers_own_errors(type: int, seed: int) -> None:
     pytest.importorskip("numba")
     scene = table_1()
@@ -42,7 +43,7 @@ def test_backprop_beats_the_papers_own_errors(type: int, seed: int) -> None:
     assert calibration.network.rmse_before < 1e-4
 
 
-@pytest.mark.parametrize("type", [1, 2, 3, 4])
+@pytest.mark.parametrize("type", slow_but((2, 3, 4), (1, 2, 3, 4)))
 def test_both_trainers_end_at_the_same_minimum_with_noise(type: int) -> None:
     pytest.importorskip("numba")
     scene = table_1()

@@ -9,6 +9,7 @@ import pytest
 from support.noise import noisy, whitener
 from support.plain_projection import project
 from support.scenes import pinhole, random_flat_set, random_solid
+from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences
 from neurocal_cli.bundle_adjustment.covariance import covariance
@@ -151,7 +152,7 @@ def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
     assert covariance(normal, np.ones(5, dtype=bool), True, 180).smallest < 1e-13
 
 
-@pytest.mark.parametrize("trials", [80, pytest.param(400, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("trials", slow_but((40,), (40, 80, 400)))
 def test_the_std_is_the_spread_over_many_noises(trials: int) -> None:
     rng = np.random.default_rng(0)
     scene = random_flat_set(np.random.default_rng(3), 5, True, cols=9, rows=6)

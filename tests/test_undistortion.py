@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import cv2
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from support.distorted import LENSES, through
 from support.real_data import RealFiles
 from support.scenes import random_flat_set
+from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences, calibrate, undistort_image, undistort_points
 from neurocal_cli.camera.camera import Camera
@@ -171,7 +173,7 @@ def test_the_new_camera_is_opencv_s_nearly(model: str, alpha: float) -> None:
 
 
 @pytest.mark.parametrize("model", BENDING)
-@pytest.mark.parametrize("skew", [True, False])
+@pytest.mark.parametrize("skew", slow_but((True,), (True, False)))
 def test_alpha_0_shows_only_seen_pixels_and_alpha_1_all_of_them(model: str, skew: bool) -> None:
     cam = camera(model, skew)
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
@@ -231,8 +233,10 @@ def test_images_are_those_of_opencv(model: str) -> None:
     assert np.abs(ours - theirs).mean() < 0.3
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-@pytest.mark.parametrize("channels", [0, 3])
+@pytest.mark.parametrize(
+    ("dtype", "channels"),
+    slow_but([(np.uint8, 0), (np.uint16, 3)], itertools.product((np.uint8, np.uint16), (0, 3))),
+)
 @pytest.mark.parametrize("interpolation", ["nearest", "linear", "cubic", "lanczos"])
 def test_depth_and_colours_stay(dtype: type, channels: int, interpolation: str) -> None:
     image = smooth(dtype, channels)

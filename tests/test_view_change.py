@@ -6,10 +6,11 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from support.grouped_views import ALPHA, photographed, poses, rescaled
+from support.grouped_views import ALPHA, board, photographed, poses, rescaled
 from support.real_data import RealFiles
+from support.slow_cases import slow_but
 
-from neurocal_cli import Calibration, Correspondences, calibrate, read_points
+from neurocal_cli import Calibration, Correspondences, Pose, calibrate, read_points
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
@@ -22,6 +23,23 @@ Make = Callable[[int, np.random.Generator], Correspondences]
 
 def drift(share: float) -> Make:
     return lambda n, rng: photographed(poses(n, rng), rng, focal=1.0 + share * np.linspace(0, 1, n))
+
+
+def by_pose(share: float, of_pose: Callable[[Pose], float]) -> Make:
+    def make(n: int, rng: np.random.Generator) -> Correspondences:
+        views = poses(n, rng)
+        values = np.array([of_pose(pose) for pose in views])
+        return photographed(views, rng, focal=1.0 + share * (values - values.min()) / np.ptp(values))
+
+    return make
+
+
+def near_and_far(share: float) -> Make:
+    return by_pose(share, lambda pose: 1.0 / float(np.linalg.norm(pose.t + pose.R @ board().mean(axis=0))))
+
+
+def left_and_right(share: float) -> Make:
+    return by_pose(share, lambda pose: -np.sign(pose.R[2, 2]) * float(pose.R[0, 2]))
 
 
 def every_other(share: float) -> Make:
@@ -61,14 +79,16 @@ def told(make: Make, share: float, words: str, seeds: range) -> int:
 
 CHANGES = {
     "drift": (drift, "along the sequence of the views"),
+    "focus that follows": (near_and_far, "from the farthest to the nearest view"),
+    "turned left and right": (left_and_right, "turned to the left to those to the right"),
     "every other image scaled": (every_other, "these views are scaled by"),
     "second half scaled": (second_half, "from view img0"),
     "any half scaled": (any_half, "these views are scaled by"),
 }
 
 
-@pytest.mark.parametrize("share", [0.01, 0.02])
-@pytest.mark.parametrize("change", ["drift", "every other image scaled"])
+@pytest.mark.parametrize("share", slow_but((0.01,), (0.01, 0.02)))
+@pytest.mark.parametrize("change", ["drift", "every other image scaled", "focus that follows"])
 def test_a_camera_that_changes_is_told_with_the_cause(change: str, share: float) -> None:
     make, words = CHANGES[change]
     assert told(make(share), share, words, range(3)) >= 2

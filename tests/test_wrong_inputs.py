@@ -10,6 +10,15 @@ from neurocal_cli import calibrate
 from neurocal_cli.verdict.assessment import assess
 
 ROWS = words()
+# What is said of views that differ: one of these, or none.
+DIFFERENT = (
+    "the images come from two cameras",
+    "the focal length changes from view to view",
+    "so zoom or focus",
+    "so the focus moves",
+    "so the target changes its shape",
+    "these views are scaled",
+)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -29,6 +38,7 @@ def test_no_wrong_input_ends_as_good_and_its_cause_is_named(name: str) -> None:
     assert found.reasons
     assert ROWS[name] == found.word
     assert bool(found.named) == (name not in UNNAMED), found.reasons
+    assert sum(words in reason for reason in found.reasons for words in DIFFERENT) <= 1, found.reasons
 
 
 def test_the_table_has_every_wrong_input() -> None:

@@ -33,12 +33,12 @@ from neurocal_cli.zoom_lens.judgement import judge_lens
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-FEW = ((0, 1), (0, 2))  # topologies that a smooth lens needs no more than
+FEW = ((0, 2),)  # a topology that a smooth lens needs no more than
 
 
 @cache
 def smooth() -> ZoomLens:
-    return fit_lens(seen("c", grid(5, 3), seed=1), distortion="none", topologies=FEW)
+    return fit_lens(seen("c", grid(5, 3), seed=1), distortion="none", topologies=((0, 1), *FEW))
 
 
 def columns(lens: LensPoints) -> dict[str, np.ndarray]:

@@ -9,7 +9,7 @@ instead.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
 from neurocal_cli.least_squares.schur_complement import eliminate
 
-__all__ = ["FOLDS", "disagreement", "held_out", "held_out_points", "held_out_views", "reduced"]
+__all__ = ["FOLDS", "Minimum", "disagreement", "held_out", "held_out_points", "held_out_views", "reduced"]
 
 FOLDS = 5
 _RIDGE = 1e-13  # on the scaled diagonal: one view's pose that nothing holds must not spoil the others
@@ -62,21 +62,11 @@ def _shared(free: NDArray[np.bool_]) -> NDArray[np.intp]:
     return camera_columns(len(free) - 5)[np.flatnonzero(free)]
 
 
-@_quietly
-def held_out(
-    views: Views,
-    state: CameraState,
-    normal: Array,
-    free: NDArray[np.bool_],
-    free_poses: bool,
-    repeated: RepeatedPoses | None = None,
-) -> Array:
-    """Squared error of parts of the data when they are left out, of a calibration at its minimum.
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """A calibration at its minimum.
 
-    The parts are views, left out in five folds as long as the others can do without them, else folds
-    of each view's points.
-
-    Parameters
+    Attributes
     ----------
     views : Views
     state : CameraState
@@ -86,17 +76,29 @@ def held_out(
         Of A's entries and the distortion coefficients.
     free_poses : bool
     repeated : RepeatedPoses, optional
-        Views of one pose are left out together.
-
-    Returns
-    -------
-    (parts,) array
+        Views of one pose, which are not taken apart.
     """
-    if views.n_views > 1 and free.any():
-        lost = held_out_views(normal, free, free_poses, repeated=repeated)
+
+    views: Views
+    state: CameraState
+    normal: Array
+    free: NDArray[np.bool_]
+    free_poses: bool
+    repeated: RepeatedPoses | None = None
+
+
+@_quietly
+def held_out(m: Minimum) -> Array:
+    """Squared error of parts of the data when they are left out; (parts,).
+
+    The parts are views, left out in five folds as long as the others can do without them, else folds
+    of each view's points.
+    """
+    if m.views.n_views > 1 and m.free.any():
+        lost = held_out_views(m.normal, m.free, m.free_poses, repeated=m.repeated)
         if np.isfinite(lost).all():
             return lost
-    return held_out_points(views, state, free, free_poses)
+    return held_out_points(m.views, m.state, m.free, m.free_poses)
 
 
 @_quietly
@@ -192,14 +194,7 @@ def _whole_steps(
 
 
 @_quietly
-def disagreement(
-    views: Views,
-    state: CameraState,
-    normal: Array,
-    free: NDArray[np.bool_],
-    free_poses: bool,
-    repeated: RepeatedPoses | None = None,
-) -> tuple[Array, Array]:
+def disagreement(m: Minimum) -> tuple[Array, Array]:
     """How far the shared parameters from two halves of the data lie apart.
 
     The halves are every other view, or every other pose, and the rest; or of points where half of the views
@@ -211,9 +206,10 @@ def disagreement(
     covariance : (f, f) array
         Of the difference, for residuals of unit variance; nan where a half cannot do.
     """
-    pose = np.arange(views.n_views) if repeated is None else repeated.group
+    repeated = m.repeated
+    pose = np.arange(m.views.n_views) if repeated is None else repeated.group
     if pose.max() >= 3:
-        q = reduced(normal, free, free_poses)
+        q = reduced(m.normal, m.free, m.free_poses)
         half = (pose % 2 == np.arange(2)[:, None]).astype(float)
         S, g = q.summed(half)
         step = solve_or_nan(S, g)
@@ -222,9 +218,9 @@ def disagreement(
             if repeated is not None and not repeated.none:
                 cov = cov @ q.summed(half * repeated.variance[pose])[0] @ cov
             return step[0] - step[1], cov.sum(axis=0)
-    by_fold = _by_fold(views, state, _dealt(views))
+    by_fold = _by_fold(m.views, m.state, _dealt(m.views))
     two = np.stack([by_fold[:, :2].sum(axis=1), by_fold[:, 2:4].sum(axis=1)], axis=1)
-    q = reduced(two, free, free_poses)
+    q = reduced(two, m.free, m.free_poses)
     S, g = q.S.sum(axis=0), q.g.sum(axis=0)
     step = solve_or_nan(S, g)
     if not np.isfinite(step).all():

@@ -14,6 +14,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels
 from neurocal_cli.calibration import StraightLines
 from neurocal_cli.geometry import Array
+from neurocal_cli.target import Target
 
 __all__ = ["Solution", "TrainingRecord"]
 
@@ -84,6 +85,8 @@ class Solution:
         What ``distortion="plumb-line"`` found the distortion from.
     refusal : str
         Why this is no answer, if so.
+    target : Target, optional
+        The target, where it was found with the camera; the problem's points are where it has them.
     """
 
     problem: Problem
@@ -94,6 +97,7 @@ class Solution:
     model_errors: Mapping[str, float] | None = None
     straight_lines: StraightLines | None = None
     refusal: str = ""
+    target: Target | None = None
 
     @property
     def state(self) -> CameraState:

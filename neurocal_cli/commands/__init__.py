@@ -24,13 +24,17 @@ __all__ = ["neurocal"]
 # Each command is the function of this name in the module of this name; None: hidden. The summaries
 # stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
+    "board": "Draw a chessboard target to print.",
     "calibrate": "Calibrate a camera from known points and their pixels.",
     "compare": "Compare calibration methods on the same points.",
+    "convert": "Convert cameras, rigs and points to the formats of other programs.",
     "detect": "Detect chessboards in images and measure points on them.",
     "evaluate": "Measure the error of a calibrated camera or stereo rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
     "simulate": "Calibrate simulated cameras, and compare methods where the truth is known.",
+    "rectify": "Rectify pairs of images and points of two cameras.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
+    "target": "Write the board as it was found.",
     "triangulate": "Compute points in space from their pixels in the left and the right image.",
     "undistort": "Remove the lens distortion from images and points.",
     "man": None,

@@ -12,6 +12,7 @@ from neurocal_cli.commands.options import Command, check_plot, output_option, pl
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -65,6 +66,7 @@ def calibrate(
       neurocal calibrate sample_data/flat.csv --distortion k1 --no-skew \\
           --plot errors.png -o camera.yaml
       neurocal calibrate sample_data/flat.csv --outliers keep --image-size 640 480
+      neurocal calibrate sample_data/flat.csv --target free -o camera.yaml
       neurocal calibrate sample_data/points.csv --type 2 --image-center 172 121
       neurocal calibrate sample_data/stereo_left.csv --type 3 \\
           --intrinsics camera.yaml -o poses.yaml
@@ -75,6 +77,7 @@ def calibrate(
           --epochs 20000 --rate 0.05 --rate-gamma 0.4
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
+    compute_in_one_thread()
     estimation.check()
     check_one_stdin(*points, *estimation.stdin_candidates)
     _check_outputs(output, plot, camera_name)

@@ -42,6 +42,7 @@ class Estimation:
     distortion: str
     no_skew: bool
     outliers: str
+    target: str
 
     @property
     def stdin_candidates(self) -> tuple[str | None, ...]:
@@ -105,6 +106,7 @@ class Estimation:
             "distortion": self.distortion,
             "skew": not self.no_skew,
             "outliers": self.outliers,
+            "target": self.target,
             "seed": self.seed,
             "starts": self.starts,
             "backprop": self._backprop(),
@@ -309,5 +311,13 @@ _OPTIONS = [
         default="reject",
         help="Treatment of outliers, which are points or whole views that contradict the others: reject "
         "leaves them out and lists them, keep uses all points.",
+    ),
+    click.option(
+        "--target",
+        type=click.Choice(["auto", "given", "flat", "free"]),
+        default="auto",
+        help="Where the points of the target are: given takes X, Y, Z as they are; free finds with the "
+        "camera how the target is bent and printed, which takes 3 views or more; flat does so within its "
+        "plane; auto finds it where the points ask for it.",
     ),
 ]

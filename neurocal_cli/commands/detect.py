@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
 
 __all__ = ["detect"]
 
-_VERTICES = click.IntRange(2, 1000)
-
 
 @click.command(cls=Command)
 @click.argument(
@@ -36,36 +35,7 @@ _VERTICES = click.IntRange(2, 1000)
     description="Images of one camera (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits), folders of "
     "images, or file name patterns; - is standard input.",
 )
-@click.option(
-    "--board",
-    metavar="BOARD.yaml",
-    type=INPUT,
-    show_default="none",
-    help="Board file; a board may have several planes.",
-)
-@click.option(
-    "--cols",
-    metavar="C",
-    type=_VERTICES,
-    show_default="none",
-    help="Number of inner vertices in a row of the board.",
-)
-@click.option(
-    "--rows", metavar="R", type=_VERTICES, show_default="none", help="Number of rows of inner vertices."
-)
-@click.option(
-    "--square",
-    metavar="S",
-    type=FiniteNumber(positive=True),
-    show_default="none",
-    help="Side length of a square.",
-)
-@click.option(
-    "--unit",
-    metavar="UNIT",
-    show_default="mm",
-    help="Unit of --square. A board file names its own unit.",
-)
+@board_options("Unit of --square. A board file names its own unit.")
 @click.option(
     "--points",
     type=click.Choice(["midpoints", "vertices"]),
@@ -134,31 +104,14 @@ def detect(
     """  # noqa: D301 - as in the group
     check_one_stdin(*images, board)
     compute_in_one_thread()
-    target = _board(board, cols, rows, square, unit)
-    outcomes = _examined(images, target, board, output, points, gamma, overlay, jobs)
-    _report(outcomes)
-    _write(outcomes, target, overlay, output)
-
-
-def _board(
-    path: str | None, cols: int | None, rows: int | None, square: float | None, unit: str | None
-) -> Board:
-    from neurocal_cli.board import Board
-
-    numbers = (cols, rows, square)
-    if path is not None:
-        if numbers != (None, None, None) or unit is not None:
-            raise UsageError(
-                "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
-            )
-        from neurocal_cli.io.board_yaml import read_board
-
-        return read_board(path)
-    if cols is None or rows is None or square is None:
+    target = given_board(board, cols, rows, square, unit)
+    if target is None:
         raise UsageError(
             "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
         )
-    return Board.single(cols, rows, square, "mm" if unit is None else unit)
+    outcomes = _examined(images, target, board, output, points, gamma, overlay, jobs)
+    _report(outcomes)
+    _write(outcomes, target, overlay, output)
 
 
 def _examined(

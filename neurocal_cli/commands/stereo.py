@@ -13,6 +13,7 @@ from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, 
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -117,6 +118,7 @@ def stereo(
           --trainer backprop --epochs 20000 --rate 0.05 --rate-gamma 0.4 \\
           -o rig.yaml
     """  # noqa: D301 - as in the group
+    compute_in_one_thread()
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()

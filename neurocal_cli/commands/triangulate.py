@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["triangulate"]
 
+_USUAL_SIGMA = 0.5  # of a rig without points [px]
 _LARGEST_SIGMA = 1e6  # px; no image is that large
 _MANY_OFF = 0.5  # share of the points that no bad luck explains
 
@@ -94,7 +95,7 @@ def triangulate(
     from neurocal_cli.io.writing import write_chunks
     from neurocal_cli.stereo.triangulation import epipolar_limit as usual_limit
 
-    sigma = rig.sigma if sigma is None else sigma
+    sigma = _sigma(rig) if sigma is None else sigma
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
     notes: list[str] = []
     tally = _Tally(rig, limit)
@@ -106,6 +107,14 @@ def triangulate(
         output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
     )
     tally.tell()
+
+
+def _sigma(rig: Rig) -> float:
+    """The noise of the rig's own points; a usual one where it has none."""
+    if rig.sigma == rig.sigma:
+        return rig.sigma
+    note([f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma"])
+    return _USUAL_SIGMA
 
 
 def _rig(names: tuple[str, ...]) -> Rig:

@@ -61,7 +61,7 @@ class Labels:
     @property
     def world(self) -> Array:
         """(N, 3) array [the board's unit]."""
-        return self.plane.at(self.place + 0.5 * _STEPS[self.kind])
+        return self.plane.truly_at(self.place + 0.5 * _STEPS[self.kind])
 
     @property
     def order(self) -> NDArray[np.intp]:

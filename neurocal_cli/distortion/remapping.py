@@ -13,6 +13,7 @@ from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.distortion.undistortion import sources, undistorted_camera
 from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
 
 __all__ = ["INTERPOLATIONS", "Remapping", "undistort_image"]
 
@@ -41,6 +42,8 @@ class Remapping:
     size : (width, height) [px]
     interpolation : str
         One of `INTERPOLATIONS`.
+    R : (3, 3) array, optional
+        From the camera's frame to that of the new one, where it is turned as well.
 
     Raises
     ------
@@ -49,7 +52,12 @@ class Remapping:
     """
 
     def __init__(
-        self, camera: Camera, new: Camera, size: tuple[int, int], interpolation: str = "cubic"
+        self,
+        camera: Camera,
+        new: Camera,
+        size: tuple[int, int],
+        interpolation: str = "cubic",
+        R: Array | None = None,
     ) -> None:
         if max(size) > _LONGEST:
             raise InputError(
@@ -58,6 +66,7 @@ class Remapping:
                 "cut them into parts"
             )
         self.camera, self.new, self.size = camera, new, size
+        self.R = R
         self._how = INTERPOLATIONS[interpolation]
         self._kept: list[Sources] = []
 
@@ -88,6 +97,11 @@ class Remapping:
             undistorted[rows] = part.reshape(undistorted[rows].shape)
         return undistorted
 
+    def tables(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Source pixel u and v of each pixel, (height, width), as ``cv2.remap`` takes them."""
+        blocks = list(self._sources())
+        return np.concatenate([block[1] for block in blocks]), np.concatenate([block[2] for block in blocks])
+
     def _sources(self) -> Iterator[Sources]:
         """Source pixels in the distorted image, for one block of rows after the other."""
         if self._kept:
@@ -102,7 +116,7 @@ class Remapping:
             u, v = np.meshgrid(np.arange(width, dtype=float), np.arange(part.start, part.stop, dtype=float))
             places = [
                 np.nan_to_num(s, nan=_NOWHERE).clip(_NOWHERE, -_NOWHERE)
-                for s in sources(self.camera, self.new, u, v)
+                for s in sources(self.camera, self.new, u, v, self.R)
             ]
             block = (part, places[0].astype(np.float32), places[1].astype(np.float32))
             if keep:

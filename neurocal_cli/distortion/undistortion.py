@@ -24,7 +24,14 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["new_matrix", "sources", "undistort_pixels", "undistort_points", "undistorted_camera"]
+__all__ = [
+    "map_points",
+    "new_matrix",
+    "sources",
+    "undistort_pixels",
+    "undistort_points",
+    "undistorted_camera",
+]
 
 # With these, no pixel at alpha 0 comes from more than 0.02 px outside; tests/test_undistortion.py repeats it.
 _BORDER = 401  # samples along each side of the image
@@ -63,12 +70,25 @@ def undistorted_camera(
     return Camera(intrinsics, Distortion(), size, camera.name)
 
 
-def undistort_pixels(camera: Camera, new: Camera, pixels: Array) -> Array:
-    """Undistorted pixels, (N, 2); ``nan`` where the distortion does not reach a pixel."""
-    return np.column_stack(new.image_points(*camera.normalised_points(*pixels.T)))
+def undistort_pixels(camera: Camera, new: Camera, pixels: Array, R: Array | None = None) -> Array:
+    """Undistorted pixels, (N, 2); ``nan`` where the distortion does not reach a pixel.
+
+    R (3, 3) is from the camera's frame to that of the new one, where it is turned as well.
+    """
+    x, y = camera.normalised_points(*pixels.T)
+    return np.column_stack(new.image_points(*_turned(R, x, y)))
 
 
-def sources(camera: Camera, new: Camera, u: Array, v: Array) -> tuple[Array, Array]:
+def _turned(R: Array | None, x: Array, y: Array) -> tuple[Array, Array]:
+    """Normalised points of a camera that is turned by R; ``nan`` behind it."""
+    if R is None:
+        return x, y
+    X, Y, Z = np.tensordot(R, np.stack([x, y, np.ones_like(x)]), axes=1)
+    with np.errstate(all="ignore"):
+        return np.where(Z > 0, X / Z, np.nan), np.where(Z > 0, Y / Z, np.nan)
+
+
+def sources(camera: Camera, new: Camera, u: Array, v: Array, R: Array | None = None) -> tuple[Array, Array]:
     """Source pixels of pixels (u, v) of an undistorted image; ``nan`` where there are none.
 
     Parameters
@@ -76,9 +96,12 @@ def sources(camera: Camera, new: Camera, u: Array, v: Array) -> tuple[Array, Arr
     camera, new : Camera
         With and without distortion.
     u, v : arrays of one shape [px]
+    R : (3, 3) array, optional
+        From the camera's frame to that of the new one, where it is turned as well.
     """
     x, y = new.normalised_points(u, v)
     with np.errstate(all="ignore"):
+        x, y = _turned(None if R is None else R.T, x, y)
         u, v, _, _, (ux, uy, vx, vy), _ = image_points_with_jacobian(
             camera.entries, camera.model, camera.distortion.coefficients, x, y
         )
@@ -86,10 +109,17 @@ def sources(camera: Camera, new: Camera, u: Array, v: Array) -> tuple[Array, Arr
     return np.where(valid, u, np.nan), np.where(valid, v, np.nan)
 
 
-def _distorted_by_undistorted(camera: Camera, new: Camera, pixels: Array) -> Array:
+def _distorted_by_undistorted(camera: Camera, new: Camera, pixels: Array, R: Array | None) -> Array:
     """(N, 2, 2) derivative of the distorted pixels by the undistorted ones (N, 2)."""
     x, y = new.normalised_points(*pixels.T)
-    return np.asarray(camera.image_jacobian(x, y) @ np.linalg.inv(new.A[:2, :2]))
+    inner = np.linalg.inv(new.A[:2, :2])
+    if R is not None:
+        Z = R[0, 2] * x + R[1, 2] * y + R[2, 2]
+        x, y = _turned(R.T, x, y)
+        # Of the point (X, Y) / Z, of which X, Y, Z are R^T (x, y, 1).
+        ahead = R.T[:2, :2] - np.stack([x, y], axis=-1)[:, :, None] * R.T[2, :2]
+        inner = ahead / Z[:, None, None] @ inner
+    return np.asarray(camera.image_jacobian(x, y) @ inner)
 
 
 def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsics:
@@ -194,8 +224,29 @@ def undistort_points(
         A pixel that the distortion does not reach, named by its file and line.
     """
     camera = camera_of(camera)
-    new = undistorted_camera(camera, alpha, points.image_size)
-    pixels = undistort_pixels(camera, new, points.pixels)
+    return map_points(points, camera, undistorted_camera(camera, alpha, points.image_size))
+
+
+def map_points(
+    points: Correspondences, camera: Camera, new: Camera, R: Array | None = None
+) -> Correspondences:
+    """Move points to where another camera at the same place sees them.
+
+    Parameters
+    ----------
+    points : Correspondences
+        Their covariances and the image centre, where given, are transformed as well.
+    camera, new : Camera
+        With and without distortion.
+    R : (3, 3) array, optional
+        From the camera's frame to that of the new one, where it is turned as well.
+
+    Raises
+    ------
+    InputError
+        A pixel that the distortion does not reach, named by its file and line.
+    """
+    pixels = undistort_pixels(camera, new, points.pixels, R)
     lost = ~np.isfinite(pixels[:, 0])
     if lost.any():
         row = int(np.argmax(lost))
@@ -207,15 +258,15 @@ def undistort_points(
     undistorted = replace(points, pixels=pixels)
     if points.covariance is not None:
         # To first order C' = M C M^T, with M the derivative of the undistorted pixel by the distorted one.
-        M = np.linalg.inv(_distorted_by_undistorted(camera, new, pixels))
+        M = np.linalg.inv(_distorted_by_undistorted(camera, new, pixels, R))
         C = points.covariance[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
         C = (M @ C @ np.swapaxes(M, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
         undistorted = replace(undistorted, covariance=C)
     if points.across is not None:
         # Only n . m is measured of a pixel m, so n^T M^-1 m' of the undistorted one.
-        n = (points.across[:, None, :] @ _distorted_by_undistorted(camera, new, pixels))[:, 0]
+        n = (points.across[:, None, :] @ _distorted_by_undistorted(camera, new, pixels, R))[:, 0]
         undistorted = replace(undistorted, across=unit(n))
     if points.image_center is not None:
-        u0, v0 = undistort_pixels(camera, new, np.array([points.image_center]))[0].tolist()
+        u0, v0 = undistort_pixels(camera, new, np.array([points.image_center]), R)[0].tolist()
         undistorted = replace(undistorted, image_center=(u0, v0) if np.isfinite(u0 + v0) else None)
     return undistorted

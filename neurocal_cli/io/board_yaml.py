@@ -18,7 +18,7 @@ __all__ = ["format_board", "parse_board", "read_board", "write_board"]
 
 _COUNTS = ("cols", "rows")
 _VECTORS = ("origin", "x_axis", "y_axis")
-_PLANE_KEYS = ("name", *_COUNTS, "square", *_VECTORS)
+_PLANE_KEYS = ("name", *_COUNTS, "square", *_VECTORS, "points")
 
 
 def read_board(path: str | Path) -> Board:
@@ -55,7 +55,13 @@ def format_board(board: Board) -> str:
         entries |= {key: str(getattr(plane, key)) for key in _COUNTS}
         entries["square"] = number(plane.square)
         entries |= {key: flow(np.array(getattr(plane, key))) for key in _VECTORS}
-        lines.append(f"  - {mapping(**entries)}")
+        if not plane.measured:
+            lines.append(f"  - {mapping(**entries)}")
+            continue
+        first, *others = [f"{key}: {value}" for key, value in entries.items()]
+        rows = flow(np.array(plane.measured))[2:-2].split("], [")
+        lines += [f"  - {first}", *(f"    {entry}" for entry in others)]
+        lines += ["    points:  # column, row, X, Y, Z", *(f"      - [{row}]" for row in rows)]
     return "\n".join([*lines, ""])
 
 
@@ -80,6 +86,8 @@ def _plane(field: Field, *, alone: bool) -> Plane:
     place: dict[str, Any] = {
         key: tuple(field[key].array(3).tolist()) for key in _VECTORS if not alone or key in field
     }
+    if "points" in field:
+        place["measured"] = tuple(map(tuple, field["points"].array(-1, 5).tolist()))
     name = field["name"].text() if not alone or "name" in field else ""
     try:
         return Plane(name, cols, rows, square, **place)

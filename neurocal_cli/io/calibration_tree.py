@@ -13,6 +13,7 @@ from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_yaml import FORMAT
 from neurocal_cli.io.distortion_names import own_length
 from neurocal_cli.io.rejected_yaml import read_rejected
+from neurocal_cli.io.target_yaml import read_target
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.verdict_yaml import read_verdict
 from neurocal_cli.points import Correspondences
@@ -85,6 +86,7 @@ def calibration_from_field(root: Field) -> Calibration:
         camera_name=root["camera_name"].text() if "camera_name" in root else "camera",
         warnings=tuple(entry.text() for entry in block["warnings"].items()) if "warnings" in block else (),
         rejected=rejected,
+        target=read_target(block.get("target")),
         judgement=read_verdict(block.get("verdict")),
         lens_choice=_lens_choice(block.get("lens_choice")),
     )

@@ -20,6 +20,7 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
 from neurocal_cli.io.camera_info import camera_info_lines
 from neurocal_cli.io.rejected_yaml import rejected_lines
+from neurocal_cli.io.target_yaml import target_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, flows, mapping, number, quoted, text
@@ -88,6 +89,7 @@ def calibration_lines(cal: Calibration, rectified: tuple[Array, Array] | None = 
         _network_lines(cal.network),
         verdict_lines(cal.verdict),
         rejected_lines(cal.rejected),
+        target_lines(cal.target),
     ):
         yield from (f"  {line}" for line in lines)
     if cal.straight_lines is not None:

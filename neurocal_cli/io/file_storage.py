@@ -12,7 +12,7 @@ from neurocal_cli.io.files import read_text
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_tree import parse_yaml, plain_value
 
-__all__ = ["read_tree"]
+__all__ = ["parse_tree", "read_tree"]
 
 _DEEPEST = 40
 
@@ -25,7 +25,11 @@ def read_tree(path: str | Path) -> Field:
     FormatError
         The file cannot be read or has a syntax error.
     """
-    text, source = read_text(path, "a camera file")
+    return parse_tree(*read_text(path, "a camera file"))
+
+
+def parse_tree(text: str, source: str) -> Field:
+    """Read the text of a YAML, JSON or XML file; see `read_tree`."""
     start = text.lstrip()[:1]
     if start == "<":
         return Field(_parse_xml(text, source), source)
@@ -75,13 +79,18 @@ def _element_value(element: ElementTree.Element, source: str, depth: int) -> Any
     if depth == 0:
         raise FormatError("is nested too deeply to be a camera file; give another", source)
     if len(element) == 0:
-        words = (element.text or "").split()
+        text = (element.text or "").strip()
+        if len(text) > 1 and text[0] == text[-1] == '"' and '"' not in text[1:-1]:
+            return text[1:-1]  # so that a number is a name
+        words = text.split()
         if element.tag == "data" or len(words) > 1:
             return [plain_value(word) for word in words]
         return plain_value(words[0]) if words else None
+    if all(child.tag == "_" for child in element):
+        return [_element_value(child, source, depth - 1) for child in element]
     tree: dict[str, Any] = {}
     for child in element:
-        if child.tag != "_" and child.tag in tree:
+        if child.tag in tree:
             raise FormatError(f"the element <{child.tag[:40]}> appears twice; remove one", source)
         tree[child.tag] = _element_value(child, source, depth - 1)
     return tree

@@ -102,7 +102,7 @@ def _rig_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
         yield "  rectification:"
         for key in ("R1", "R2", "P1", "P2", "Q"):
             yield f"    {key}: {flow(getattr(rectified, key))}"
-    yield "  pairs:"
+    yield "  pairs:" if rig.pairs else "  pairs: []"
     for left, right in rig.pairs:
         yield f"    - [{quoted(left)}, {quoted(right)}]"
     yield "  left_out:" if rig.left_out else "  left_out: []"

@@ -1,7 +1,7 @@
 """Why a view of a flat target contradicts the camera of the others: the first explanation that fits it.
 
 Each explanation changes the view's pixels, its world points or its camera. The pose that is then best is
-found from the homography of the plane and adjusted; an explanation holds when its error is that of the other
+found as in a problem of type 3 and adjusted; an explanation holds when its error is that of the other
 views. What none explains keeps the reason that it was left out for.
 """
 
@@ -13,17 +13,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.problem import problem_for
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
-from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.errors import NeurocalError
 from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products
+from neurocal_cli.initialisation.options import options_for
+from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
 
 __all__ = ["why_odd"]
 
 _HOLDS = 2.0  # times the rms error of the other views
 _STEPS = 40
+_STARTS = 20
 _ALIKE = 0.01  # relative difference of the focal lengths along u and v that one zoom has
 _BLURRED = 0.08  # of the spread of a view's pixels: errors of measuring, not of pairing
 _CHANGED = 0.005  # relative
@@ -53,22 +59,23 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
         return otherwise
     limit = _HOLDS * rmse_px
     for reason, changed in _other_points(points):
-        fitted = _fit(changed, camera)
+        fitted = _fit(changed, _pose(changed, camera))
         if fitted is not None and fitted.rmse < limit:
             return reason
-    plain = _fit(points, camera)
+    start = _pose(points, camera)
+    plain = _fit(points, start)
     if plain is None:
         return otherwise
-    zoomed = _fit(points, camera, _FOCAL)
+    zoomed = _fit(points, start, _FOCAL)
     if zoomed is not None and zoomed.rmse < limit:
         scale = zoomed.entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
         if abs(scale[0] / scale[1] - 1) < _ALIKE and abs(scale[0] - 1) > _CHANGED:
             return f"it asks for another zoom or focus: a focal length of {zoomed.entries[0]:.5g} px"
-    moved = _fit(points, camera, _CENTRE)
+    moved = _fit(points, start, _CENTRE)
     if moved is not None and moved.rmse < limit:
         u0, v0 = moved.entries[[3, 4]]
         return f"it asks for another camera or crop: the centre ({u0:.0f}, {v0:.0f})"
-    free = _fit(points, camera, (*_FOCAL, *_CENTRE))
+    free = _fit(points, start, (*_FOCAL, *_CENTRE))
     spread = float(np.sqrt(points.pixels.var(axis=0).sum()))
     if free is None or free.rmse > _BLURRED * spread:
         return otherwise
@@ -102,53 +109,29 @@ class _Fit:
     entries: Array  # (5,) px
 
 
-def _fit(points: Correspondences, camera: Camera, free: tuple[int, ...] = ()) -> _Fit | None:
-    """The pose of a view, and what is free of its camera; None where no pose is found."""
-    pose = _pose_from_homography(points, camera)
-    if pose is None:
-        return None
-    k = camera.distortion.coefficients
-    views = arrange(points)
-    state = CameraState(np.array([camera.entries]), pose[0][None], pose[1][None], camera.distortion.model, k)
-    moving = np.isin(np.arange(5 + len(k)), free)
+def _pose(points: Correspondences, camera: Camera) -> CameraState | None:
+    """The camera and the pose of a view [px]; None where the points tell no pose."""
     try:
-        adjusted = adjust(views.batches, normalised(state, views), moving, True, _STEPS)
+        problem = problem_for(points, 3, intrinsics=camera.intrinsics, distortion=camera.distortion)
+        groups, _ = train_networks(
+            problem, options_for("lm", _STARTS, 0), np.random.default_rng(0), np.ones(1, dtype=bool)
+        )
+        state = cameras_from_products(problem, groups, problem.normalised_entries[None])
+    except NeurocalError:  # a camera that cannot have seen these pixels is no explanation
+        return None
+    return in_pixels(problem, state)
+
+
+def _fit(points: Correspondences, start: CameraState | None, free: tuple[int, ...] = ()) -> _Fit | None:
+    """A view's pose, and what is free of its camera; None where there is none."""
+    if start is None:
+        return None
+    views = arrange(points)
+    moving = np.isin(np.arange(5 + start.k.shape[-1]), free)
+    try:
+        adjusted = adjust(views.batches, normalised(start, views), moving, True, _STEPS)
     except (np.linalg.LinAlgError, FloatingPointError):
         return None
     rmse = float(np.sqrt(adjusted.cost.sum() / len(points))) * views.pixel_scale
     entries = views.pixel_scale * adjusted.state.entries[0] + np.array([0, 0, 0, *views.pixel_centre])
     return _Fit(rmse, entries) if np.isfinite(rmse) else None
-
-
-def _pose_from_homography(points: Correspondences, camera: Camera) -> tuple[Array, Array] | None:
-    """R (3, 3) and t (3,) of a plane from its homography to the rays (Zhang 2000, section 3.1)."""
-    rays = camera.unproject(points.pixels)
-    good = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0)
-    if np.count_nonzero(good) < 6:
-        return None
-    rays, world = rays[good], points.world[good]
-    centre = world.mean(axis=0)
-    axes = np.linalg.svd(world - centre, full_matrices=False)[2]
-    axes[2] = np.cross(axes[0], axes[1])
-    local = (world - centre) @ axes[:2].T
-    scale = float(np.sqrt((local**2).sum(axis=1).mean()))
-    plane = np.column_stack([local / scale, np.ones(len(local))])
-    x = rays / rays[:, 2:]
-    rows = np.concatenate(
-        [
-            np.column_stack([plane, np.zeros_like(plane), -x[:, :1] * plane]),
-            np.column_stack([np.zeros_like(plane), plane, -x[:, 1:2] * plane]),
-        ]
-    )
-    H = np.linalg.svd(rows, full_matrices=False)[2][-1].reshape(3, 3)
-    H *= np.sign(H[2, 2])
-    H[:, :2] /= scale
-    length = np.sqrt(np.linalg.norm(H[:, 0]) * np.linalg.norm(H[:, 1]))
-    if not length > 0:
-        return None
-    H /= length
-    U, _, Vt = np.linalg.svd(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])]))
-    R = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt @ axes
-    t = H[:, 2] - R @ centre
-    depth = world @ R[2] + t[2]
-    return (R, t) if (depth > 0).all() else None

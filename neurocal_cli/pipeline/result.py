@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
@@ -18,9 +19,11 @@ from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
+from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
+from neurocal_cli.target_shape.uncertainty import target_uncertainty
 
 __all__ = ["calibration_of"]
 
@@ -41,11 +44,18 @@ def calibration_of(
     views, state = problem.views, adjusted.state
     errors = point_residuals(views, state)  # (N, 2), by view
     repeated = repeated_poses(views, state, errors)
-    normal = adjusted.normal, problem.free_camera, problem.free_poses, views.n_equations
-    cov = covariance(*normal, solution.shared)
+    asked, n_equations = (problem.free_camera, problem.free_poses), views.n_equations
+    normal, shared = adjusted.normal, solution.shared
+    if solution.target is not None:
+        uncertain = target_uncertainty(
+            solution.target, views, state, *asked, problem.points.world[_order(views)]
+        )
+        normal, shared = uncertain.normal, uncertain.entries
+        n_equations -= uncertain.determined
+    cov = covariance(normal, *asked, n_equations, shared)
     refuse_undetermined(problem, state, cov)
     if solution.shared is None:
-        cov = counting_views(cov, *normal, repeated)
+        cov = counting_views(cov, normal, *asked, n_equations, repeated)
     A = problem.matrix(state.entries[0])
     intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     if problem.type != 3 and not problem.free[1]:
@@ -82,6 +92,7 @@ def calibration_of(
         straight_lines=solution.straight_lines,
         camera_name=name,
         rejected=rejected,
+        target=solution.target,
         lens_choice=solution.model_errors or {},
         warnings=(
             *parameter_warnings(intrinsics, state.distortion, std, chosen),
@@ -91,6 +102,10 @@ def calibration_of(
             *_rejection_warnings(rejected, len(problem.points)),
         ),
     )
+
+
+def _order(views: Views) -> slice | NDArray[np.intp]:
+    return slice(None) if views.order is None else views.order
 
 
 def _camera_covariance(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,15 +10,18 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import UsageError
 from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
+from neurocal_cli.stereo.common_target import common_target
 from neurocal_cli.stereo.fit_rig import fit_rig
 from neurocal_cli.stereo.pairing import pair_points, pair_views
 from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.target import Target
 
 __all__ = ["calibrate_stereo"]
 
 Progress = Callable[[str, float], None]
 
 _SIDES = ("left", "right")
+_ROUNDS = 2  # of choosing lenses and target in turn
 _OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
 
 
@@ -69,10 +72,7 @@ def calibrate_stereo(
         )
     # Errors of pairing are reported before the training.
     pair_points(left, right, pair_views(left.view_names, right.view_names))
-    cameras: list[Calibration] = []
-    for name, points, side in zip(_SIDES, (left, right), sides, strict=True):
-        side = {"camera_name": name} | side
-        cameras.append(calibrate(points, **side, progress=_named(progress, name)))
+    cameras = _on_one_target(left, right, sides, progress)
     best = all(camera.method in _OF_LEAST_SQUARES for camera in cameras)
     rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, outliers=options.get("outliers", "reject"))
     warnings = [
@@ -81,6 +81,35 @@ def calibrate_stereo(
         for text in camera.warnings
     ]
     return replace(rig, warnings=(*rig.warnings, *warnings))
+
+
+def _on_one_target(
+    left: Correspondences,
+    right: Correspondences,
+    sides: Sequence[Mapping[str, Any]],
+    progress: Progress | None,
+) -> list[Calibration]:
+    """Both cameras, and the target found with both of them where the points ask for it."""
+    choice = sides[0].get("target", "auto")
+
+    def calibrated(target: str | Target) -> list[Calibration]:
+        return [
+            calibrate(
+                points, **{"camera_name": name, **side, "target": target}, progress=_named(progress, name)
+            )
+            for name, points, side in zip(_SIDES, (left, right), sides, strict=True)
+        ]
+
+    cameras = calibrated("given")
+    for _ in range(_ROUNDS):
+        target = common_target(cameras, choice)
+        if target is None:
+            break
+        before = [camera.distortion_model for camera in cameras]
+        cameras = calibrated(target)
+        if [camera.distortion_model for camera in cameras] == before:
+            break
+    return cameras
 
 
 def _named(progress: Progress | None, name: str) -> Progress | None:

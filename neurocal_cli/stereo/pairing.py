@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.findings import name_some
 
 __all__ = ["Pairs", "ViewPairs", "pair_points", "pair_views"]
 
@@ -27,7 +28,6 @@ _SIDES = (
     re.compile(r"(?<![a-z])(?:left|l(?![a-z])|cam(?:era)?[ _-]?0(?![0-9]))(?![a-z])", re.IGNORECASE),
     re.compile(r"(?<![a-z])(?:right|r(?![a-z])|cam(?:era)?[ _-]?1(?![0-9]))(?![a-z])", re.IGNORECASE),
 )
-_SHOWN = 5  # names in a message
 _LEAST_COMMON = 0.1  # share of the points; fewer common X, Y, Z are a coincidence
 _SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z in two files, as a share of the target's size
 
@@ -120,8 +120,7 @@ def _refuse_swapped(left: Sequence[str], right: Sequence[str]) -> None:
 
 
 def _listed(names: Sequence[str]) -> str:
-    shown = ", ".join(repr(name[:60]) for name in names[:_SHOWN])
-    return shown + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    return name_some(repr(name[:60]) for name in names)
 
 
 def pair_points(left: Correspondences, right: Correspondences, views: ViewPairs) -> Pairs:

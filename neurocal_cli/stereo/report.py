@@ -22,6 +22,7 @@ __all__ = [
     "views_alone",
 ]
 
+_MUCH_WORSE = 1.3  # rms of the common fit over that of both cameras alone, of which the summary tells
 _NAMED = 10  # views named in a remark
 _MOST_VIEWS = 20  # rows of a table that still fit on a screen
 _ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
@@ -169,7 +170,11 @@ def _camera_rows(rig: Rig) -> list[list[str]]:
 
 
 def _estimate(value: float, name: str, camera: Calibration) -> list[str]:
-    return [f"{value:.7g}", "given"] if name in camera.fixed else [*rounded(value, camera.std[name])]
+    return (
+        [f"{value:.7g}", "given"]
+        if name in camera.fixed
+        else [*rounded(value, camera.std.get(name, math.nan))]
+    )
 
 
 def _rig_rows(rig: Rig) -> list[list[str]]:
@@ -214,4 +219,16 @@ def _fit_lines(rig: Rig) -> list[str]:
             )
     lines.append(f"bundle adjustment: rms {_figure(rig.rmse_px)} px, maximum {_figure(rig.max_px)} px, after "
                  f"{plural(rig.iterations, 'iteration')}")  # fmt: skip
-    return [*lines, rig.stop_reason]
+    return [*lines, *_beside_alone(rig), rig.stop_reason]
+
+
+def _beside_alone(rig: Rig) -> list[str]:
+    """How much worse one rig for all pairs is than poses of their own, where that is much."""
+    measures = {} if rig.verdict is None else rig.verdict.measures
+    growth, alone = measures.get("growth", math.nan), measures.get("alone_px", math.nan)
+    if not growth > _MUCH_WORSE:
+        return []
+    return [
+        f"with the poses of each camera alone the rms is {_figure(alone)} px; with one rig for all pairs "
+        f"it is {growth:.2g} times as much"
+    ]

@@ -18,12 +18,12 @@ from neurocal_cli.stereo.contradiction import contradiction, is_significant
 from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, rig_problem
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
+from neurocal_cli.verdict.findings import name_some
 
 __all__ = ["MOVED", "SoundPairs", "pair_name", "sound_pairs", "span", "told_of_faults", "told_of_move"]
 
 MOVED = "taken"  # the reason of a pair that shows the rig before or after it moved begins so
 _OTHER_SIZE = 1.2  # times; targets of one series are alike, and units differ by far more
-_SHOWN = 5  # names in a message
 _AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and pairs, that agree by more than chance once shifted
 
 Pair = tuple[str, str]
@@ -68,10 +68,7 @@ def told_of_faults(left_out: Mapping[Pair, str], n_pairs: int) -> str:
     by_reason: dict[str, list[str]] = {}
     for pair, reason in left_out.items():
         by_reason.setdefault(reason, []).append(pair_name(pair))
-    parts = []
-    for reason, names in by_reason.items():
-        more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-        parts.append(f"{', '.join(names[:_SHOWN])}{more}: {reason}")
+    parts = [f"{name_some(names)}: {reason}" for reason, names in by_reason.items()]
     return f"{len(left_out)} of {n_pairs} pairs of views contradict the rig ({'; '.join(parts)})"
 
 

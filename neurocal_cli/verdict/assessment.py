@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.bundle_adjustment.cross_validation import disagreement, held_out
+from neurocal_cli.bundle_adjustment.cross_validation import Minimum, disagreement, held_out
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
@@ -33,9 +33,11 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
+from neurocal_cli.target_shape.uncertainty import target_uncertainty
 from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
+from neurocal_cli.verdict.findings import pixel_spread
 from neurocal_cli.verdict.given_parameters import asked_for
 from neurocal_cli.verdict.noise_shape import noise_shape
 from neurocal_cli.verdict.projection_uncertainty import (
@@ -53,6 +55,8 @@ __all__ = ["assess", "gather_evidence"]
 
 _STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
 _IN_PLANE = 1e-9  # depth over the largest one that rounding leaves of 0
+_BY_FLEXING = 0.01  # relative
+_EXACT = 1e-4  # of the spread of the pixels: errors that cost nothing
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
@@ -116,13 +120,19 @@ class _AtMinimum:
         self.state, self.normal = adjusted.state, adjusted.normal
         self.cost = float(self.normal[:, -1, -1].sum())
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
-        self.spare = max(self.views.n_equations - self.unknowns, 1)
+        n_equations, shared = self.views.n_equations, None
+        if (target := calibration.target) is not None:
+            world = self.points.world if self.views.order is None else self.points.world[self.views.order]
+            known = target_uncertainty(target, self.views, self.state, self.free, self.free_poses, world)
+            self.normal, shared = known.normal, known.entries
+            n_equations -= known.determined
+        self.spare = max(n_equations - self.unknowns, 1)
         self.errors = point_residuals(self.views, self.state)
         self.repeated = repeated_poses(self.views, self.state, self.errors)
-        cov = covariance(self.normal, self.free, self.free_poses, self.views.n_equations)
+        cov = covariance(self.normal, self.free, self.free_poses, n_equations, shared)
         self.condition = 1.0 / cov.smallest if cov.smallest > 0 else np.inf
         self.covariance = counting_views(
-            cov, self.normal, self.free, self.free_poses, self.views.n_equations, self.repeated
+            cov, self.normal, self.free, self.free_poses, n_equations, self.repeated
         ).entries
 
     def _arranged(self) -> Views:
@@ -133,6 +143,9 @@ class _AtMinimum:
     def evidence(self) -> Evidence:
         views = self.views
         precision, contradiction = self._precision()
+        # Where a target was found, what it does not explain differs from view to view: it bends anew.
+        found = self.calibration.target is not None
+        noise = self.cost / self.spare * (max(contradiction, 1.0) ** 2 if found else 1.0)
         alike, residuals = correlation(views, self.errors), self._residuals()
         stated = tuple(stated_noise(self.points, residuals))
         return Evidence(
@@ -147,7 +160,7 @@ class _AtMinimum:
             projection=self._projection(),
             repeated=repeated_views(self.points),
             poses=self.repeated.n_poses,
-            change=self._change(),
+            change=self._change(noise),
             board=self._board(),
             mirrored=tuple(seen_from_behind(views, self.state)),
             asked_for=asked_for(views, self.state, self.calibration.fixed, self.free_poses),
@@ -161,12 +174,16 @@ class _AtMinimum:
         return predicted - self.points.pixels
 
     def _groups(self) -> ViewGroups | None:
-        if not (self.free_poses and self.free[:5].any()):
+        exact = self.calibration.rmse_px < _EXACT * pixel_spread(self.points)
+        if exact or not (self.free_poses and self.free[:5].any()):
             return None
         return view_groups(self.views, self.state, self.normal, self.free)
 
+    def _minimum(self) -> Minimum:
+        return Minimum(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
+
     def _held_out(self) -> float:
-        lost = held_out(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
+        lost = held_out(self._minimum())
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
 
     def _precision(self) -> tuple[float, float]:
@@ -181,16 +198,19 @@ class _AtMinimum:
         of_point = self.views.n_equations / len(self.points)
         return float(np.sqrt(of_point * own)) * px, float(ratio)
 
-    def _change(self) -> ViewChange | None:
+    def _change(self, variance: float) -> ViewChange | None:
         if not self.free.any() or self.repeated.n_poses < 2:
             return None
         scores = scores_of_poses(self.normal, self.free, self.free_poses, self.repeated)
-        return view_change(
-            self.views, self.state, self.free, scores, self.repeated.group, self.cost / self.spare, self.spare
+        change = view_change(
+            self.views, self.state, self.free, scores, self.repeated.group, variance, self.spare
         )
+        # A board that bends anew in each view makes two small groups of almost any views.
+        flexes = self.calibration.target is not None and change is not None and change.pattern == "groups"
+        return None if flexes and change is not None and abs(change.amount) < _BY_FLEXING else change
 
     def _board(self) -> BoardShape | None:
-        if not self.free[0] or not self.free_poses:
+        if not self.free[0] or not self.free_poses or self.calibration.target is not None:
             return None
         std = float(np.sqrt(self.covariance[0, 0]))
         times = float(self.repeated.variance.mean())
@@ -199,9 +219,7 @@ class _AtMinimum:
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:
             return np.nan
-        difference, cov = disagreement(
-            self.views, self.state, self.normal, self.free, self.free_poses, self.repeated
-        )
+        difference, cov = disagreement(self._minimum())
         if not np.isfinite(cov).all():
             return np.nan
         scale = np.sqrt(np.diagonal(cov))

@@ -1,4 +1,4 @@
-"""What views say together that none says alone: a camera that changes, and a board that is bent."""
+"""What views say together that none says alone: two cameras, one that changes, a board that is bent."""
 
 from __future__ import annotations
 
@@ -6,16 +6,24 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from neurocal_cli.geometry import Array
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, name_some
+from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.verdict.view_change import ViewChange
+from neurocal_cli.verdict.view_groups import ViewGroups
 
 __all__ = ["common_errors"]
 
 # Repeated by tests/test_view_change.py and tests/test_board_shape.py, with changes from 0.2 % and boards
 # bent by 0.2 mm and more. A result is off by half of a change; careful calibrations state 0.05 %.
 _CHANGED, _MUCH_CHANGED = 0.001, 0.05  # of the focal length
+_APART = Limit(0.01, 0.05)  # of the focal length
+# Small differences of one parameter that explain what two cameras would are those of one camera.
+_LARGE = 0.03  # of the focal length: beyond what score tests know
+_NEARLY = 0.7
+_NEAR = 0.02  # of the focal length
 # Real boards of good calibrations are bent, too; they cost up to 0.4 % and 1.3 sigmas.
 _OFF, _MUCH_OFF = 0.005, 0.05  # of the focal length
 _SIGMAS = 2.0
@@ -33,21 +41,63 @@ def common_errors(evidence: Evidence, unit: str) -> Iterator[Finding]:
     unit : str
         Of the world.
     """
-    change, board = evidence.change, evidence.board
-    if change is not None and not _explains(change.explained, evidence):
-        change = None
+    change, board, groups = _explanation(evidence), evidence.board, evidence.groups
+    differ = groups if change is None else change
     if board is not None and not _explains(board.explained, evidence):
         board = None
-    if board is not None:
+    if board is not None and (differ is None or board.explained > _NEARLY * differ.explained):
         yield _bent(board, unit)
+    if change is None and groups is not None:
+        yield _of_several_cameras(groups)
     # Views of a bent board differ, and not by chance; rows given twice know less than they seem to.
     if change is not None and not evidence.repeated and (board is None or change.explained > board.explained):
         yield _changed(change)
 
 
+def _explanation(evidence: Evidence) -> ViewChange | None:
+    """The pattern of views that is the reason; None where there is none, or two cameras are."""
+    change, groups = evidence.change, evidence.groups
+    if change is None or not _explains(change.explained, evidence):
+        return None
+    if groups is None:
+        return change
+    large = groups.apart > _LARGE and not groups.scale.size
+    return None if large or change.explained < _NEARLY * groups.explained else change
+
+
 def _explains(share: float, evidence: Evidence) -> bool:
     """Whether hardly more than noise is left of the error without a share of its square."""
     return not evidence.contradiction * np.sqrt(max(1.0 - share, 0.0)) > _LEFT
+
+
+def _of_several_cameras(groups: ViewGroups) -> Finding:
+    if groups.scale.size:
+        return (
+            _APART.grade(groups.apart),
+            f"the focal length changes from view to view, by {100 * groups.apart:.2g} % in all: the zoom "
+            "or the focus moved",
+            "calibrate one zoom and one focus at a time; switch autofocus off",
+        )
+    first, second = groups.cameras[:, [0, 2, 3, 4]]
+    asked = [f"alpha_u = {c[0]:.5g} px and the centre ({c[2]:.0f}, {c[3]:.0f})" for c in (first, second)]
+    return (
+        _APART.grade(groups.apart),
+        f"the images come from two cameras, or {_alternative(first, second)}: {name_some(groups.names[0])} "
+        f"ask for {asked[0]}, the others for {asked[1]}",
+        "calibrate these views and the others separately",
+    )
+
+
+def _alternative(first: Array, second: Array) -> str:
+    """What else than two cameras these are, from alpha_u, alpha_v, u0 and v0."""
+    ratio = first / second
+    if np.abs(ratio - ratio[0]).max() < _NEAR and abs(ratio[0] - 1) > _NEAR:
+        return "are of two sizes"
+    if np.abs(first - second[[1, 0, 3, 2]]).max() < _NEAR * second[0]:
+        return "u and v are exchanged in one part"
+    if np.abs(ratio[:2] - 1).max() < _NEAR:
+        return "one part is cropped or turned"
+    return "from two zooms"
 
 
 def _changed(change: ViewChange) -> Finding:
@@ -56,6 +106,14 @@ def _changed(change: ViewChange) -> Finding:
     what = "the focal length" if change.what == "focal length" else "the size of the image"
     if change.pattern == "line":
         reason = f"{what} {grows} by {percent} along the sequence of the views, so zoom or focus moves"
+    elif change.pattern == "distance":
+        reason = f"{what} {grows} by {percent} from the farthest to the nearest view, so the focus moves"
+    elif change.pattern.startswith("tilt"):
+        ends = "to the left to those to the right" if change.pattern.endswith("u") else "upwards to downwards"
+        reason = (
+            f"{what} {grows} by {percent} from views of the target turned {ends}, so the target changes its "
+            "shape as it is turned, or the lens gives way"
+        )
     elif change.pattern == "step":
         reason = f"{what} {grows} by {percent} from view {change.views[0]} on, so zoom or focus has moved"
     else:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.geometry import Array
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, image_diagonal, name_some, pixel_spread, verdict_of
@@ -17,7 +17,6 @@ from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
 from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
 from neurocal_cli.verdict.units_of_views import views_of_another_scale
-from neurocal_cli.verdict.view_groups import ViewGroups
 
 __all__ = ["ERROR", "Verdict", "given_parameters", "reach_verdict"]
 
@@ -25,6 +24,9 @@ __all__ = ["ERROR", "Verdict", "given_parameters", "reach_verdict"]
 # which real and simulated good data are; the errors, angles and shares are what a user would call large.
 ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
 _CONTRADICTION = Limit(1.6, 2.3)
+# Rms of what is above the noise floor over the image's diagonal, 0.16 px of 640 x 480: what hands and easels
+# bend a board from view to view leaves. Where the target was found it is in the standard deviations.
+_FLEXING = 0.0002
 _HELD_OUT = Limit(1.3, 2.0)  # over the rms error
 _DISAGREEMENT = Limit(6.0, 40.0)
 _CORRELATION = Limit(0.5, 0.85)
@@ -38,6 +40,7 @@ _TOLD_APART = 5.0  # standard deviations
 _SHALLOW = 0.1  # depth over distance: the focal length of 200 points is known to about 1 %
 _FEW_POSES = 10  # where views repeat them
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
+_STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, however uncertain it is
 _NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
 _TOLD = 3.0  # standard deviations
 
@@ -66,6 +69,8 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
+    if _oblong(calibration):  # views of a target that is too long in one direction differ as well
+        evidence = replace(evidence, groups=None)
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
@@ -87,10 +92,10 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         f"the rms reprojection error of {e.rmse_px:.3g} px is large",
         pairing,
     )
-    # A target that is too long in one direction makes views differ as well.
-    if e.groups is not None and e.rmse_px > 1e-4 * spread and not _oblong(calibration):
-        yield _of_several_cameras(e.groups)
-    if e.rmse_px > 1e-4 * spread:
+    flexes = calibration.target is not None and _above_floor(e) < _FLEXING * image_diagonal(
+        calibration.points
+    )
+    if e.rmse_px > 1e-4 * spread and not flexes:
         yield (
             _CONTRADICTION.grade(e.contradiction),
             f"the error is {e.contradiction:.2g} times the noise floor, which is {e.precision_px:.3g} px "
@@ -106,51 +111,23 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
             "add points and views",
         )
         yield (
-            _DISAGREEMENT.grade(e.disagreement),
+            0 if flexes else _DISAGREEMENT.grade(e.disagreement),
             f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} standard "
             f"deviations{'' if e.groups is not None else _NO_SINGLE_CAMERA}",
             "expect errors larger than the standard deviations; look for a wrong view or a board that is not "
             "flat",
         )
         yield (
-            _CORRELATION.grade(e.correlation) if e.rmse_px > 1e-4 * spread else 0,
+            _CORRELATION.grade(e.correlation) if e.rmse_px > 1e-4 * spread and not flexes else 0,
             f"the residuals of neighbouring points are correlated ({e.correlation:.2f}), so the distortion "
             "model or the target does not fit",
             "try another --distortion, or measure the target",
         )
 
 
-def _of_several_cameras(groups: ViewGroups) -> Finding:
-    if groups.scale.size:
-        share = float(np.ptp(groups.scale))
-        return (
-            _ALPHA.grade(share),
-            f"the focal length changes from view to view, by {100 * share:.2g} % in all: the zoom or the "
-            "focus moved",
-            "calibrate one zoom and one focus at a time; switch autofocus off",
-        )
-    first, second = groups.cameras[:, [0, 2, 3, 4]]
-    apart = float(np.abs(first - second).max() / second[0])
-    asked = [f"alpha_u = {c[0]:.5g} px and the centre ({c[2]:.0f}, {c[3]:.0f})" for c in (first, second)]
-    return (
-        _ALPHA.grade(apart),
-        f"the images come from two cameras, or {_alternative(first, second)}: {name_some(groups.names[0])} "
-        f"ask for {asked[0]}, the others for {asked[1]}",
-        "calibrate these views and the others separately",
-    )
-
-
-def _alternative(first: Array, second: Array) -> str:
-    """What else than two cameras these are, from alpha_u, alpha_v, u0 and v0."""
-    ratio = first / second
-    near = 2 * _GIVEN.good
-    if np.abs(ratio - ratio[0]).max() < near and abs(ratio[0] - 1) > near:
-        return "are of two sizes"
-    if np.abs(first - second[[1, 0, 3, 2]]).max() < near * second[0]:
-        return "u and v are exchanged in one part"
-    if np.abs(ratio[:2] - 1).max() < near:
-        return "one part is cropped or turned"
-    return "from two zooms"
+def _above_floor(e: Evidence) -> float:
+    """Rms error that is not noise [px]."""
+    return float(np.sqrt(max(e.rmse_px**2 - e.precision_px**2, 0.0)))
 
 
 def given_parameters(
@@ -256,10 +233,11 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 
 def _oblong(calibration: Calibration) -> bool:
-    """Whether the pixels are certainly not square."""
+    """Whether the pixels are not square: beyond doubt, or by far."""
     A, std = calibration.intrinsics, calibration.std
+    ratio = A.alpha_u / A.alpha_v
     told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v
-    return abs(A.alpha_u / A.alpha_v - 1) > _OBLONG + told
+    return abs(ratio - 1) > _OBLONG + told or max(ratio, 1 / ratio) > _STRETCHED
 
 
 def _off_centre(calibration: Calibration) -> Iterator[Finding]:

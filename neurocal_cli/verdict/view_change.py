@@ -7,8 +7,9 @@ parameters that delta = 1 makes, its score is s_v = a.g_v, and the covariance of
     M = diag(a.S_v a) - B S^-1 B^T,   B_v = S_v a,
 
 in units of the noise's variance. A pattern c of views, delta_v = b c_v, has b = c.s / c.M c, known to
-1 / sqrt(c.M c). The patterns are a line along the sequence of the views, a step at each place of it, every
-other view, and the two groups that differ most.
+1 / sqrt(c.M c). The patterns are a line along the sequence of the views, over the inverse of their distance
+and over the tilt of the target, a step at each place of the sequence, every other view, and the two groups
+that differ most. Differences are small here: `view_groups` knows larger ones.
 """
 
 from __future__ import annotations
@@ -30,7 +31,11 @@ __all__ = ["ViewChange", "in_sequence", "view_change"]
 
 # Repeated by tests/test_view_change.py: on clean scenes less than one in a hundred is told, and on real
 # boards, whose views differ by more than noise, none is.
-_LINE = 3.5  # sigmas: one in 2000 for each of four
+_LINE = 3.5  # sigmas: one in 2000 for each
+_BY_POSE = 4.0  # sigmas: poses differ in six ways, and what a lens leaves differs with them
+_MOST_BY_POSE = 0.1  # of the focal length: no focus changes it by more
+_NEARER = 0.1  # of the farthest distance: less tells nothing of the focus
+_TURNED = 0.2  # rad
 _STEP = 4.5  # sigmas, of the largest of all steps
 _SCATTER = 1.645  # sigmas: the other views differ by more than noise in one case of 20
 _FEWEST = 5  # views
@@ -48,15 +53,17 @@ class ViewChange:
     what : str
         "focal length" or "image size".
     pattern : str
-        "line", "step" or "groups".
+        "line", "distance", "tilt along u", "tilt along v", "step" or "groups".
     amount : float
-        From the first view to the last, or of the second group against the first, as a share of it.
+        From the first view to the last, from the farthest to the nearest, from the one turned to the left or
+        upwards to the one turned to the right or downwards, or of the second group against the first, as a
+        share of it.
     sigmas : float
         In its standard deviations.
     explained : float
         Share of the squared error that it explains.
     views : tuple of str
-        The second group; for a line all views, in their sequence.
+        The second group; for a line of any kind all views, in their sequence.
     """
 
     what: str
@@ -109,13 +116,30 @@ def view_change(
     place = np.bincount(group, place) / np.bincount(group)  # of each pose
     if len(place) < _FEWEST or not variance > 0:
         return None
+    lines = {"line": place} | {
+        name: np.bincount(group, values) / np.bincount(group) for name, values in _of_poses(views, state)
+    }
     found: list[ViewChange] = []
     for what, step in _directions(views, state, free):
         test = _ScoreTest.of(scores, step[free], variance)
-        for pattern, members, amount, sigmas in _patterns(test, place):
+        for pattern, members, amount, sigmas in _patterns(test, lines):
             names = tuple(views.names[k] for k in order if members[group[k]])
             found.append(ViewChange(what, pattern, amount, sigmas, sigmas**2 / spare, names))
     return max(found, key=lambda change: abs(change.sigmas), default=None)
+
+
+def _of_poses(views: Views, state: CameraState) -> Iterator[tuple[str, Array]]:
+    """What the poses differ by, (V,) each, where they do."""
+    distance = np.linalg.norm(state.t, axis=1) * views.scale
+    if np.ptp(distance) > _NEARER * distance.max():
+        yield "distance", 1.0 / distance
+    if not views.nearly_flat.all():
+        return
+    normal = (state.R @ views.basis)[:, :, 2]
+    normal *= -np.sign((normal * state.t).sum(axis=1, keepdims=True))
+    for axis, name in enumerate("uv"):
+        if np.ptp(normal[:, axis]) > _TURNED:
+            yield f"tilt along {name}", normal[:, axis]
 
 
 def _directions(views: Views, state: CameraState, free: NDArray[np.bool_]) -> Iterator[tuple[str, Array]]:
@@ -183,8 +207,11 @@ class _ScoreTest:
         return float(chi[usable].sum()), max(float((1.0 - shared[usable]).sum()), 1.0)
 
 
-def _patterns(test: _ScoreTest, place: Array) -> Iterator[tuple[str, NDArray[np.bool_], float, float]]:
+def _patterns(
+    test: _ScoreTest, lines: dict[str, Array]
+) -> Iterator[tuple[str, NDArray[np.bool_], float, float]]:
     """Patterns that chance does not make: what, its second group, its amount and sigmas."""
+    place = lines["line"]
     P = len(place)
     order = np.argsort(place, kind="stable")
     everywhere = np.ones(P, dtype=bool)
@@ -196,10 +223,13 @@ def _patterns(test: _ScoreTest, place: Array) -> Iterator[tuple[str, NDArray[np.
         usual = float(exceeded_by_chance(max(freedom - 1, 1.0), _SCATTER))
         return sigmas / float(np.sqrt(max(rest / usual, 1.0)))
 
-    line = (place - place.mean()) / max(float(np.ptp(place)), 1e-300)
-    amount, sigmas = test.pattern(line)
-    if abs(sigmas := beyond_scatter(sigmas)) > _LINE:
-        yield "line", everywhere, amount, sigmas
+    for name, values in lines.items():
+        amount, sigmas = test.pattern((values - values.mean()) / max(float(np.ptp(values)), 1e-300))
+        by_pose = name != "line"
+        if by_pose and abs(amount) > _MOST_BY_POSE:
+            continue
+        if abs(sigmas := beyond_scatter(sigmas)) > (_BY_POSE if by_pose else _LINE):
+            yield name, everywhere, amount, sigmas
     amounts, all_sigmas = test.cumulative(order)
     k = int(np.argmax(np.abs(all_sigmas[1:-1]))) + 1
     sigmas = beyond_scatter(float(all_sigmas[k]))

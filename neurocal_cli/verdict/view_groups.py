@@ -50,11 +50,22 @@ class ViewGroups:
         alpha_u, theta's entry, alpha_v, u0 and v0 of both; nan where only the focal length changes.
     scale : (V,) array
         Focal length of each view over the common one; empty where there are two cameras.
+    explained : float
+        Share of the squared error that this explains.
     """
 
     names: tuple[tuple[str, ...], tuple[str, ...]]
     cameras: Array
     scale: Array
+    explained: float
+
+    @property
+    def apart(self) -> float:
+        """Difference of the cameras, or of the focal lengths, over the focal length."""
+        if self.scale.size:
+            return float(np.ptp(self.scale))
+        first, second = self.cameras[:, [0, 2, 3, 4]]
+        return float(np.abs(first - second).max() / second[0])
 
 
 def view_groups(
@@ -84,7 +95,8 @@ def view_groups(
     noise = _NOISE * own / freedom
     quadratics = reduced(normal, free, True)
     scale = _scales(quadratics, state, free)
-    one_each = (cost - _gain_of_scales(quadratics, state, free) - own) / max(spare - views.n_views + 1, 1)
+    gain = _gain_of_scales(quadratics, state, free)
+    one_each = (cost - gain - own) / max(spare - views.n_views + 1, 1)
     if (
         spare - views.n_views < _SPARE - 1
         or np.ptp(scale) < _DIFFERENT
@@ -98,13 +110,18 @@ def view_groups(
     if min(one_each, two) > noise:
         return None
     if found is None or two > one_each + noise / _NOISE:
-        return ViewGroups(((), ()), np.full((2, 5), np.nan), scale)
+        return ViewGroups(((), ()), np.full((2, 5), np.nan), scale, gain / cost)
     member, cameras = found.member, found.cameras
     if np.count_nonzero(member) > np.count_nonzero(~member):
         member, cameras = ~member, cameras[::-1]
     names = np.array(views.names)
     px = views.pixel_scale * cameras + np.array([0, 0, 0, *views.pixel_centre])
-    return ViewGroups((tuple(names[member].tolist()), tuple(names[~member].tolist())), px, np.zeros(0))
+    return ViewGroups(
+        (tuple(names[member].tolist()), tuple(names[~member].tolist())),
+        px,
+        np.zeros(0),
+        1.0 - found.cost / cost,
+    )
 
 
 def _differ(cameras: Array) -> bool:

@@ -45,17 +45,22 @@ class Truth:
     sigma: float
 
 
-def scene(seed: int) -> tuple[Correspondences, Truth]:
-    """The points of one scene, and its truth."""
+def scene(seed: int, midpoints: bool = False) -> tuple[Correspondences, Truth]:
+    """The points of one scene, and its truth; or clean mid-points of a chessboard's edges."""
     rng = np.random.default_rng([77, seed])
     while True:
-        made = _attempt(seed, rng)
-        if made is not None:
+        made = _attempt(seed, rng, midpoints)
+        if made is not None and not (midpoints and _from_both_sides(made[1])):
             return made
 
 
-def _attempt(seed: int, rng: np.random.Generator) -> tuple[Correspondences, Truth] | None:
-    condition = CONDITIONS[seed % len(CONDITIONS)]
+def _from_both_sides(truth: Truth) -> bool:
+    """Whether a board is seen through, as only glass is: tilted and far off the axis at once."""
+    return len(set(np.sign((truth.R[:, :, 2] * truth.t).sum(axis=1)))) > 1
+
+
+def _attempt(seed: int, rng: np.random.Generator, midpoints: bool) -> tuple[Correspondences, Truth] | None:
+    condition = "clean" if midpoints else CONDITIONS[seed % len(CONDITIONS)]
     width, height = SIZES[rng.integers(len(SIZES))]
     longer = max(width, height)
     low, high = (1.5, 4.0) if condition == "narrow" else (0.45, 1.6)
@@ -74,7 +79,7 @@ def _attempt(seed: int, rng: np.random.Generator) -> tuple[Correspondences, Trut
     k = _lens(model, corner, rng)
     if not _one_to_one(model, k, corner):
         return None
-    target = _folded(rng) if rng.random() < 0.2 else _board(rng)
+    target = _midpoints(rng) if midpoints else _folded(rng) if rng.random() < 0.2 else _board(rng)
     flat = not target[:, 2].any()
     n_views = int(rng.integers(3, 31)) if flat else int(rng.integers(1, 7))
     sigma = float(np.exp(rng.uniform(np.log(0.03), np.log(0.8)))) * longer / 1600
@@ -162,6 +167,14 @@ def _board(rng: np.random.Generator) -> Array:
     columns, rows, square = int(rng.integers(4, 13)), int(rng.integers(3, 10)), float(rng.uniform(5, 60))
     grid = np.array([[c, r, 0] for r in range(rows) for c in range(columns)], dtype=float)
     return grid * square
+
+
+def _midpoints(rng: np.random.Generator) -> Array:
+    """Middles of the edges between a board's vertices."""
+    columns, rows, square = int(rng.integers(5, 12)), int(rng.integers(4, 9)), float(rng.uniform(5, 60))
+    along = [[c + 0.5, r, 0] for r in range(rows) for c in range(columns - 1)]
+    across = [[c, r + 0.5, 0] for r in range(rows - 1) for c in range(columns)]
+    return np.array(along + across, dtype=float) * square
 
 
 def _folded(rng: np.random.Generator) -> Array:

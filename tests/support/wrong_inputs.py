@@ -425,7 +425,7 @@ CAUSES: dict[str, str] = {
     "image size turned": "width and height",
     "half of the points shifted by a square": "outliers",
     "half of the points of one view shifted by a square": "in view06",
-    "board bent by 4 mm": "target",
+    "board bent by 4 mm": "it seems bent by",
     "Z full of noise": "X,Y,Z",
     "half of the pixels anywhere": "of the points are outliers",
     "a fifth of the pixels anywhere": "of 930 points are outliers",
@@ -499,25 +499,31 @@ CAUSES: dict[str, str] = {
 # Those of which no reason names the cause yet.
 UNNAMED = frozenset(
     {
-        "X in mm, Y in cm",
         "noise of 6 px",
         "four points of the board out of its plane",
         "folded target: one plane a square off",
         "folded target: squares of one plane 10 % larger",
     }
 )
-# Those that take a second and more, as all explanations are tried.
+# Those that take a second and more, as all explanations are tried, and what others show as well.
 SLOW = frozenset(
     {
         "X in mm, Y in cm",
+        "Z full of noise",
         "a fifth of the pixels anywhere",
         "all views alike",
         "board bent by 4 mm",
+        "boards all parallel",
         "boards in a corner of the image only",
         "columns and rows swapped in reading",
+        "folded target: X and Y swapped",
+        "folded target: mirrored",
         "folded target: one plane a square off",
         "folded target: squares of one plane 10 % larger",
+        "folded target: the fold at 84 degrees",
+        "four points of the board out of its plane",
         "half of the images at half size",
+        "half of the images cropped",
         "half of the pixels anywhere",
         "half of the points of one view shifted by a square",
         "half of the points shifted by a square",
@@ -529,6 +535,10 @@ SLOW = frozenset(
         "one image cropped",
         "one image interlaced",
         "one image of another zoom",
+        "one image without its lens",
+        "one point far outside the image",
+        "one point of the board mistyped",
+        "one view blurred",
         "one view copied ten times",
         "pairs shuffled in every view",
         "pairs shuffled in four views of ten",
@@ -539,7 +549,11 @@ SLOW = frozenset(
         "pixels rounded to 8 px",
         "points of one view given twice",
         "rows read to and fro",
+        "sigma of one view ten times too small",
         "two images under one name",
+        "two tilts of three degrees",
+        "type 2 with a wrong centre",
+        "type 2 with u0 and v0 exchanged",
         "type 3 with a centre 15 px off",
         "type 3 with the camera of another zoom",
         "type 3 with the camera of half the size",

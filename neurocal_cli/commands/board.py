@@ -1,0 +1,126 @@
+"""``neurocal board``: a target to print, and the file that describes it."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import click
+
+from neurocal_cli.commands.board_options import board_options, given_board
+from neurocal_cli.commands.options import Command, FiniteNumber
+from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.streams import say, warn
+from neurocal_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from neurocal_cli.board import Board
+    from neurocal_cli.printing.sheet import Sheet
+
+__all__ = ["board"]
+
+_ENDINGS = (".svg", ".pdf", ".png")
+
+
+@click.command(cls=Command)
+@board_options("Unit of --square. A board file names its own unit.")
+@click.option(
+    "--paper",
+    metavar="NAME|WxH",
+    default="A4",
+    help="Paper: A0 to A5, letter, legal, tabloid, or its width and height in mm, such as 420x297.",
+)
+@click.option(
+    "--dpi",
+    metavar="N",
+    type=FiniteNumber(positive=True),
+    default=300,
+    show_default="300",
+    help="Resolution of a PNG in pixels per inch.",
+)
+@click.option(
+    "-o",
+    "--output",
+    metavar="BOARD.pdf",
+    required=True,
+    type=click.Path(writable=False, readable=False),
+    show_default="required",
+    help="Write the target to this .pdf, .svg or .png file, and the board file beside it.",
+)
+def board(
+    board: str | None,
+    cols: int | None,
+    rows: int | None,
+    square: float | None,
+    unit: str | None,
+    paper: str,
+    dpi: float,
+    output: str,
+) -> None:
+    """Draw a chessboard target to print.
+
+    Without a size, the board has 9 x 6 inner vertices and the largest squares, in whole mm, that fit on the
+    paper. One of these numbers is odd and one is even, so the board looks different after a turn of 180
+    degrees. A board of several planes that meet in a corner, from a board file, is unfolded; dashes show
+    where to fold it.
+
+    Squares have their exact size. Print at 100 %, without fitting to the page, and measure the two rulers:
+    if 100 mm on them are not 100 mm, correct `square` in the board file.
+
+    The board file is written beside the target, with the ending .yaml, unless the board came from one. Give
+    it to neurocal detect --board.
+
+    \b
+    Examples:
+      neurocal board -o target.pdf
+      neurocal board --cols 11 --rows 8 --square 28 --paper A3 -o large.svg
+      neurocal board --cols 8 --rows 5 --square 1 --unit inch --paper letter \\
+          --dpi 150 -o letter.png
+      neurocal board --board target.yaml -o again.pdf
+    """  # noqa: D301 - as in the group
+    ending = os.path.splitext(output)[1].lower()
+    if ending not in _ENDINGS:
+        raise UsageError(f"-o {output}: give a name that ends in {', '.join(_ENDINGS)}")
+    beside = None if board is not None else os.path.splitext(output)[0] + ".yaml"
+    check_outputs((output, beside), (board,))
+    from neurocal_cli.printing.sheet import default_board, on_paper, paper_size
+
+    size = paper_size(paper)
+    target = given_board(board, cols, rows, square, unit)
+    if target is None:
+        target = default_board(size)
+    sheet = on_paper(target, size)
+    _write(sheet, output, ending, dpi)
+    if beside is not None:
+        from neurocal_cli.io.board_yaml import write_board
+
+        write_board(target, beside)
+    _report(target, sheet, beside)
+
+
+def _write(sheet: Sheet, output: str, ending: str, dpi: float) -> None:
+    from neurocal_cli.io.board_pictures import board_pdf, board_png, board_svg
+    from neurocal_cli.io.writing import write_whole
+
+    if ending == ".svg":
+        write_whole(output, board_svg(sheet))
+    else:
+        write_whole(output, board_pdf(sheet) if ending == ".pdf" else board_png(sheet, dpi))
+
+
+def _report(target: Board, sheet: Sheet, beside: str | None) -> None:
+    alike = [p for p in target.planes if (p.cols - p.rows) % 2 == 0]
+    if alike and len(target.planes) == 1:
+        cols, rows = alike[0].cols, alike[0].rows
+        warn(
+            [
+                f"a board of {cols} x {rows} inner vertices looks the same after a turn of 180 degrees; "
+                f"{cols} x {max(2, rows - 1)} would not"
+            ]
+        )
+    for plane in target.planes:
+        name = f"{plane.name}: " if plane.name else ""
+        say(f"{name}{plane.cols} x {plane.rows} inner vertices, square {plane.square:g} {target.unit}")
+    say(f"paper {sheet.width:g} x {sheet.height:g} mm; print at 100 % and measure the rulers")
+    if beside is not None:
+        say(f"board file: {beside}")

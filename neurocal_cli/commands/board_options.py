@@ -1,0 +1,101 @@
+"""The options that describe a board: a file, or three numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from neurocal_cli.commands.options import INPUT, FiniteNumber
+from neurocal_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from neurocal_cli.board import Board
+
+__all__ = ["board_options", "given_board"]
+
+_VERTICES = click.IntRange(2, 1000)
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def board_options(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
+    """Add ``--board``, ``--cols``, ``--rows``, ``--square`` and ``--unit``; see `given_board`.
+
+    Parameters
+    ----------
+    unit_help, unit_default : str
+        What is said of ``--unit``.
+    """
+
+    def add(f: F) -> F:
+        for option in reversed(
+            (
+                click.option(
+                    "--board",
+                    metavar="BOARD.yaml",
+                    type=INPUT,
+                    show_default="none",
+                    help="Board file; a board may have several planes.",
+                ),
+                click.option(
+                    "--cols",
+                    metavar="C",
+                    type=_VERTICES,
+                    show_default="none",
+                    help="Number of inner vertices in a row of the board.",
+                ),
+                click.option(
+                    "--rows",
+                    metavar="R",
+                    type=_VERTICES,
+                    show_default="none",
+                    help="Number of rows of inner vertices.",
+                ),
+                click.option(
+                    "--square",
+                    metavar="S",
+                    type=FiniteNumber(positive=True),
+                    show_default="none",
+                    help="Side length of a square.",
+                ),
+                click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
+            )
+        ):
+            f = option(f)
+        return f
+
+    return add
+
+
+def given_board(
+    path: str | None, cols: int | None, rows: int | None, square: float | None, unit: str | None
+) -> Board | None:
+    """Read the board, None where no option describes one.
+
+    Raises
+    ------
+    UsageError
+        A file and numbers, or a part of the numbers.
+    FormatError
+        A file that is no board.
+    """
+    from neurocal_cli.board import Board
+
+    numbers = (cols, rows, square)
+    if path is not None:
+        if numbers != (None, None, None) or unit is not None:
+            raise UsageError(
+                "--board gives the size and the unit; leave out --cols, --rows, --square and --unit"
+            )
+        from neurocal_cli.io.board_yaml import read_board
+
+        return read_board(path)
+    if numbers == (None, None, None):
+        return None
+    if cols is None or rows is None or square is None:
+        raise UsageError(
+            "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
+        )
+    return Board.single(cols, rows, square, "mm" if unit is None else unit)

@@ -1,0 +1,221 @@
+"""``neurocal convert``: cameras, rigs and points between the files of programs."""
+
+from __future__ import annotations
+
+import os
+from typing import TYPE_CHECKING
+
+import click
+
+from neurocal_cli.commands.board_options import board_options, given_board
+from neurocal_cli.commands.options import INPUT, Argument, Command
+from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.errors import InputError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from neurocal_cli.board import Board
+    from neurocal_cli.io.exchange.camera_set import CameraSet
+    from neurocal_cli.points import Correspondences
+
+__all__ = ["convert"]
+
+_FORMATS = ("neurocal", "opencv", "ros", "kalibr", "colmap", "mrcal", "matlab", "json", "npz")
+_SIZE = click.IntRange(1, 1_000_000)
+
+
+@click.command(cls=Command)
+@click.argument(
+    "files",
+    nargs=-1,
+    required=True,
+    metavar="FILE...",
+    type=INPUT,
+    cls=Argument,
+    description="A camera or a rig of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or a "
+    "JSON or .npz dictionary; - is standard input. Two files are the left and the right camera of ROS or "
+    "mrcal, or the two files of OpenCV's stereo sample. Points are files of neurocal, or corners in "
+    "a dictionary of OpenCV or MATLAB, a .npy array, mrcal's corners.vnl, or text files of numbers: X Y Z, "
+    "then u v of each view.",
+)
+@click.option(
+    "--to",
+    "target",
+    required=True,
+    type=click.Choice(_FORMATS),
+    show_default="required",
+    help="Format to write.",
+)
+@click.option(
+    "--force",
+    is_flag=True,
+    show_default="refuse",
+    help="If the format does not have the distortion model, write the nearest camera that it has.",
+)
+@board_options("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
+@click.option(
+    "--image-size",
+    nargs=2,
+    type=_SIZE,
+    metavar="W H",
+    show_default="as the file says",
+    help="Size of the images in pixels, if the file does not say.",
+)
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE|DIR",
+    type=click.Path(writable=False, readable=False, allow_dash=True),
+    default="-",
+    show_default="standard output",
+    help="Write to this file; to this folder if the format needs several files.",
+)
+def convert(
+    files: tuple[str, ...],
+    target: str,
+    force: bool,
+    board: str | None,
+    cols: int | None,
+    rows: int | None,
+    square: float | None,
+    unit: str | None,
+    image_size: tuple[int, int] | None,
+    output: str,
+) -> None:
+    """Convert cameras, rigs and points to the formats of other programs.
+
+    The format of FILE is recognised by its content, never by its name. Where programs count pixels in
+    different ways the principal point is shifted, so that both projections are equal.
+
+    \b
+      --to      the output
+      neurocal  calibration or rig, which all commands of neurocal read
+      opencv    cv2.FileStorage: YAML, or XML or JSON if the name ends so
+      ros       camera_info; of a rig the folder with left.yaml and right.yaml
+      kalibr    camchain, lengths in metres
+      colmap    cameras.txt; of a rig, or with poses, a model's folder
+      mrcal     cameramodel; of a rig the folder with two
+      matlab    .mat file with a struct for cameraParameters
+      json      dictionary with OpenCV's names
+      npz       the same for NumPy
+
+    A distortion model that the format does not have is an error, which says how many pixels the nearest
+    camera is off. --force writes that camera. Programs of OpenCV, ROS, Kalibr, COLMAP and mrcal ignore
+    skew, so the nearest camera without skew is written for them, and a warning says how many pixels that
+    makes. What the format has no place for is listed on standard error.
+
+    Points become a CSV file with --to neurocal. Corners without their places on the board need --board, or
+    --cols, --rows and --square. Points of neurocal are also written as opencv, matlab, json, npz or mrcal.
+
+    \b
+    Examples:
+      neurocal calibrate sample_data/flat.csv --no-skew -o camera.yaml
+      neurocal convert camera.yaml --to opencv -o camera.xml
+      neurocal convert camera.xml --to mrcal -o camera.cameramodel
+      neurocal convert camera.cameramodel --to npz -o camera.npz
+      neurocal convert camera.npz --to kalibr --force --unit mm \\
+          --image-size 640 480 -o camchain.yaml
+      neurocal convert camchain.yaml --to neurocal | neurocal convert - --to ros
+      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
+          --points vertices -o points.csv
+      neurocal convert points.csv --to mrcal -o corners.vnl
+      echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
+      neurocal convert corners.vnl --board board.yaml --to neurocal -o again.csv
+      neurocal convert corners.vnl --cols 9 --rows 6 --square 25 --to npz \\
+          -o corners.npz
+    """  # noqa: D301 - as in the group
+    check_one_stdin(*files, board)
+    check_outputs((None if os.path.isdir(output) else output,), (*files, board))
+    target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
+    points = _points(files, target_board, unit, image_size)
+    if points is not None:
+        _write_points(points, target, output)
+        return
+    if target_board is not None:
+        raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
+    if len(files) > 2:
+        raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
+    from neurocal_cli.io.exchange.fitting_in import fitted_in
+    from neurocal_cli.io.exchange.formats import FORMATS
+    from neurocal_cli.io.exchange.reading import read_cameras
+
+    cameras = _completed(read_cameras(files), unit, image_size)
+    wanted = FORMATS[target]
+    fitted = fitted_in(cameras, wanted, force)
+    contents = wanted.text(fitted.cameras, os.path.splitext(output)[1].lower())
+    note(fitted.remarks)
+    warn(fitted.losses)
+    _write(contents, output, target)
+
+
+def _points(
+    files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
+) -> Correspondences | None:
+    """The points of the files, None where they hold cameras."""
+    from dataclasses import replace
+
+    from neurocal_cli.io.exchange.colmap import is_folder
+    from neurocal_cli.io.exchange.corners import read_corners
+
+    if is_folder(files[0]):
+        return None
+    notes: list[str] = []
+    points = read_corners(files, board, notes, unit)
+    note(notes)
+    if points is not None and size is not None:
+        if points.image_size not in (None, size):
+            raise InputError("the image size of the file is another; leave out --image-size")
+        points = replace(points, image_size=size)
+    return points
+
+
+def _write_points(points: Correspondences, target: str, output: str) -> None:
+    from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
+    from neurocal_cli.io.writing import write_whole
+
+    text = corner_text(points, target, os.path.splitext(output)[1].lower())
+    warn(points_lost(points, target))
+    write_whole(output, text)
+    say(f"{len(points)} points of {points.n_views} view{'s' * (points.n_views != 1)}")
+
+
+def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:
+    """Add what the file does not say.
+
+    Raises
+    ------
+    InputError
+        What it says, and differently.
+    """
+    from dataclasses import replace
+
+    if unit is not None:
+        if cameras.unit not in (None, unit) and cameras.has_lengths:
+            raise InputError(f"the unit of the file is {cameras.unit}, not {unit}; leave out --unit")
+        cameras = replace(cameras, unit=unit)
+    if size is not None:
+        for camera in cameras.cameras:
+            if camera.image_size not in (None, size):
+                stated = f"{camera.image_size[0]} {camera.image_size[1]}" if camera.image_size else ""
+                raise InputError(f"the image size of the file is {stated}; leave out --image-size")
+        sized = tuple(replace(camera, image_size=size) for camera in cameras.cameras)
+        if any(camera.image_size is None for camera in cameras.cameras):
+            cameras = replace(cameras, cameras=sized, origin=None)
+    return cameras
+
+
+def _write(contents: Mapping[str, str | bytes], output: str, target: str) -> None:
+    from neurocal_cli.io.writing import check_places, write_whole
+
+    if set(contents) == {""}:
+        write_whole(output, contents[""])
+        return
+    if output == "-" or (os.path.exists(output) and not os.path.isdir(output)):
+        raise UsageError(f"--to {target} writes {len(contents)} files here; give a folder, -o DIR")
+    os.makedirs(output, exist_ok=True)
+    places = {os.path.join(output, name): text for name, text in contents.items()}
+    check_places(*places)
+    for place, text in places.items():
+        write_whole(place, text)

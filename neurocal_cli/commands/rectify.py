@@ -1,0 +1,304 @@
+"""``neurocal rectify``: pairs of images and points in, the same in corresponding rows out."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import click
+
+from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber
+from neurocal_cli.commands.progress import ProgressBar
+from neurocal_cli.commands.streams import check_one_stdin, note, one_line, say, warn
+from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from neurocal_cli.distortion.remapping import Remapping
+    from neurocal_cli.stereo.rectified_pair import RectifiedPair
+    from neurocal_cli.stereo.rig import Rig
+
+__all__ = ["rectify"]
+
+_SIDES = ("left", "right")
+
+
+@click.command(cls=Command)
+@click.argument(
+    "rig",
+    metavar="RIG.yaml",
+    type=INPUT,
+    cls=Argument,
+    description="A rig of neurocal, or of another program that neurocal convert reads; - is standard input.",
+)
+@click.argument(
+    "files",
+    nargs=-1,
+    metavar="LEFT... RIGHT...",
+    type=INPUT,
+    cls=Argument,
+    description="Images of the left camera and as many of the right one, in the same order: files, file name "
+    "patterns or one folder each. Or CSV files of points.",
+)
+@click.option(
+    "--alpha",
+    metavar="ALPHA",
+    type=FiniteNumber(),
+    show_default="not scaled",
+    help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
+)
+@click.option(
+    "--interpolation",
+    type=click.Choice(["nearest", "linear", "cubic", "lanczos"]),
+    default="cubic",
+    help="Interpolation between the pixels of an image.",
+)
+@click.option(
+    "--side-by-side",
+    is_flag=True,
+    show_default="no",
+    help="Also write each pair as one picture with lines along the rows, to DIR/pairs.",
+)
+@click.option(
+    "--maps",
+    is_flag=True,
+    show_default="no",
+    help="Also write DIR/maps.npz: tables for cv2.remap, and R1, R2, P1, P2, Q.",
+)
+@click.option(
+    "-o",
+    "--output",
+    metavar="DIR",
+    required=True,
+    type=click.Path(writable=False, readable=False),
+    show_default="required",
+    help="Write to the folders left and right in this folder.",
+)
+def rectify(
+    rig: str,
+    files: tuple[str, ...],
+    alpha: float | None,
+    interpolation: str,
+    side_by_side: bool,
+    maps: bool,
+    output: str,
+) -> None:
+    """Rectify pairs of images and points of two cameras.
+
+    The results are what two cameras without distortion would have seen whose rows correspond: a point is in
+    the same row of both images. For cameras above each other it is in the same column. R1, R2, P1, P2 and Q
+    are those of OpenCV's stereoRectify.
+
+    The left images come first, then the right ones. Images become PNG files under the names of the inputs,
+    CSV files of points stay CSV files. The command prints by how many pixels the rows of the rig's own
+    points differ, and those of the points given. A pair with an image that cannot be used is reported and
+    left out.
+
+    \b
+    Examples:
+      neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
+          -o rig.yaml
+      neurocal rectify rig.yaml sample_data/stereo_left.csv \\
+          sample_data/stereo_right.csv --maps -o rectified
+      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
+          -o points.csv
+      neurocal calibrate points.csv -o left.yaml
+      neurocal convert left.yaml --to kalibr -o cam0.yaml
+      (echo cam0:; sed "1d" cam0.yaml; echo cam1:; sed "1d" cam0.yaml; \\
+          echo "  T_cn_cnm1: [[1,0,0,-0.1],[0,1,0,0],[0,0,1,0],[0,0,0,1]]") \\
+          > camchain.yaml
+      neurocal rectify camchain.yaml "sample_data/board0[123].png" \\
+          "sample_data/board0[456].png" --alpha 0 --interpolation linear \\
+          --side-by-side -o pairs
+    """  # noqa: D301 - as in the group
+    check_one_stdin(rig, *files)
+    if alpha is not None and not 0 <= alpha <= 1:
+        raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
+    if not files and not maps:
+        raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
+    if os.path.exists(output) and not os.path.isdir(output):
+        raise UsageError(f"-o {output} is a file; give a folder")
+    sides = _sides(files)
+    _check_outputs(sides, output)
+    found = _read_rig(rig)
+    work = _Work(found, alpha, interpolation, output, side_by_side)
+    work.tell_rows_of_rig()
+    if maps:
+        work.write_maps()
+    if files and work.is_points(sides[0][0]):
+        work.rectify_points(sides)
+    elif files:
+        work.rectify_images(sides)
+
+
+def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The files of the left and of the right camera: the first half of the words, and the second."""
+    from neurocal_cli.io.image_paths import find_images, view_names
+
+    if len(files) % 2:
+        raise UsageError(
+            f"there are {len(files)} files or patterns; give as many for the right camera as for the left one"
+        )
+    half = len(files) // 2
+    left, right = find_images(files[:half]), find_images(files[half:])
+    if len(left) != len(right):
+        raise UsageError(
+            f"there are {len(left)} left and {len(right)} right images; give the same number, in pairs"
+        )
+    for paths in (left, right):
+        view_names(paths)  # no name twice
+    return left, right
+
+
+def _check_outputs(sides: tuple[tuple[str, ...], tuple[str, ...]], output: str) -> None:
+    """Refuse to write over inputs."""
+    from neurocal_cli.io.outputs import held_back
+
+    held = held_back()
+    if held is not None:
+        held.protect(*sides[0], *sides[1])
+    for side, paths in zip(_SIDES, sides, strict=True):
+        folder = os.path.realpath(os.path.join(output, side))
+        if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
+            raise UsageError(f"{folder} is the folder of the inputs; give another output")
+
+
+def _read_rig(name: str) -> Rig:
+    from neurocal_cli.io.exchange.neurocal import as_rig
+    from neurocal_cli.io.exchange.reading import read_cameras
+
+    cameras = read_cameras([name])
+    if len(cameras.cameras) != 2:
+        raise FormatError(
+            f"holds {len(cameras.cameras)} camera{'s' * (len(cameras.cameras) != 1)}; give the file of a rig "
+            "of two",
+            name,
+        )
+    return as_rig(cameras)
+
+
+@dataclass
+class _Work:
+    """A rig, its rectified cameras, and where the results go."""
+
+    rig: Rig
+    alpha: float | None
+    interpolation: str
+    output: str
+    side_by_side: bool
+    pair: RectifiedPair = field(init=False)
+    remappings: list[Remapping] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        from neurocal_cli.stereo.rectified_pair import rectified_pair
+
+        self.pair = rectified_pair(self.rig, self.alpha)
+
+    @staticmethod
+    def is_points(path: str) -> bool:
+        """Whether a file is a table of points."""
+        from neurocal_cli.io.image_paths import IMAGE_ENDINGS
+
+        return not path.lower().endswith(IMAGE_ENDINGS)
+
+    def tell_rows_of_rig(self) -> None:
+        """Say how well the rows of the points agree from which the rig was found."""
+        from neurocal_cli.stereo.rectified_pair import row_error_of_rig
+
+        error = row_error_of_rig(self.rig, self.pair)
+        if error is not None:
+            rows = "rows" if self.pair.axis == 0 else "columns"
+            say(f"{rows} of the rig's own {error.n_points} points differ by {error.rms_px:.3g} px rms")
+        verdict = self.rig.verdict
+        if verdict is not None and verdict.word == "poor":
+            warn([f"the rig is poor: {'; '.join(verdict.reasons[:1])}"])
+
+    def rectify_points(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
+        """Move the points of both cameras and write them."""
+        from neurocal_cli.io.points_csv import format_points, read_points
+        from neurocal_cli.stereo.rectified_pair import rectify_points, row_error
+
+        if len(sides[0]) > 1:
+            raise UsageError("give one CSV file of points for each camera")
+        moved = []
+        for side, (path,) in enumerate(sides):
+            notes: list[str] = []
+            moved.append(rectify_points(self.pair, side, read_points(path, notes=notes)))
+            note(notes)
+        for name, (path,), points in zip(_SIDES, sides, moved, strict=True):
+            self._write(os.path.join(name, os.path.basename(path)), format_points(points))
+        error = row_error(self.pair, moved[0], moved[1])
+        rows = "rows" if self.pair.axis == 0 else "columns"
+        say(
+            f"{rows} of the {error.n_points} points given differ by {error.rms_px:.3g} px rms, "
+            f"{error.max_px:.3g} px at most"
+        )
+
+    def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
+        """Rectify all pairs; those that fail are named and left out."""
+        pairs = list(zip(*sides, strict=True))
+        done = 0
+        with ProgressBar() as progress:
+            for number, pair in enumerate(pairs, start=1):
+                try:
+                    self._rectify_pair(pair)
+                    done += 1
+                except (InputError, FormatError) as error:
+                    if len(pairs) == 1:
+                        raise
+                    say(one_line(str(error)))
+                progress(f"{number} of {len(pairs)} pairs", number / len(pairs))
+        if not done:
+            raise NeurocalError(f"none of the {len(pairs)} pairs could be rectified; see the reasons above")
+        say(f"rectified {done} of {len(pairs)} pair{'s' * (len(pairs) != 1)}")
+
+    def _rectify_pair(self, pair: tuple[str, str]) -> None:
+        from neurocal_cli.io.images import encode_image, encode_png, read_picture
+        from neurocal_cli.stereo.pair_picture import pair_picture
+
+        pictures = []
+        for remapping, path in zip(self._remappings(), pair, strict=True):
+            picture = read_picture(path)
+            note(f"{picture.source}: {text}" for text in picture.notes)
+            try:
+                pictures.append(remapping(picture.pixels))
+            except InputError as error:
+                raise InputError(f"{picture.source}: {error}") from error
+        names = [os.path.splitext(os.path.basename(path))[0] for path in pair]
+        for side, name, pixels in zip(_SIDES, names, pictures, strict=True):
+            self._write(os.path.join(side, f"{name}.png"), encode_image(pixels, ".png"))
+        if self.side_by_side:
+            drawn = pair_picture(pictures[0], pictures[1], self.pair.axis)
+            shown = names[0] if names[0] == names[1] else "-".join(names)
+            self._write(os.path.join("pairs", f"{shown}.png"), encode_png(drawn))
+
+    def _remappings(self) -> list[Remapping]:
+        from neurocal_cli.distortion.remapping import Remapping
+
+        if not self.remappings:
+            for original, new, R in zip(
+                self.pair.originals, self.pair.cameras, self.pair.rotations, strict=True
+            ):
+                assert new.image_size is not None
+                self.remappings.append(Remapping(original, new, new.image_size, self.interpolation, R))
+        return self.remappings
+
+    def write_maps(self) -> None:
+        """Write the tables and matrices."""
+        from neurocal_cli.io.exchange.dictionary import npz_bytes
+
+        tree = {}
+        for side, remapping in zip(_SIDES, self._remappings(), strict=True):
+            tree[f"{side}_u"], tree[f"{side}_v"] = remapping.tables()
+        matrices = self.pair.matrices
+        tree |= {key: getattr(matrices, key) for key in ("R1", "R2", "P1", "P2", "Q")}
+        self._write("maps.npz", npz_bytes(tree))
+
+    def _write(self, name: str, content: str | bytes) -> None:
+        from neurocal_cli.io.writing import write_whole
+
+        place = os.path.join(self.output, name)
+        os.makedirs(os.path.dirname(place), exist_ok=True)
+        write_whole(place, content)

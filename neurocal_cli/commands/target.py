@@ -1,0 +1,70 @@
+"""``neurocal target``: the board as a calibration found it."""
+
+from __future__ import annotations
+
+import os
+
+import click
+
+from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option
+from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.streams import say
+from neurocal_cli.errors import InputError
+
+__all__ = ["target"]
+
+
+@click.command(cls=Command)
+@click.argument(
+    "camera",
+    metavar="CAMERA.yaml",
+    type=INPUT,
+    cls=Argument,
+    description="A calibration that `neurocal calibrate` wrote; - is standard input.",
+)
+@click.option(
+    "--plot",
+    metavar="FILE.png",
+    type=click.Path(writable=False, readable=False),
+    show_default="none",
+    help="Plot the heights of the board's points and their shifts to this .png, .pdf or .svg file.",
+)
+@output_option("BOARD.yaml", "the board")
+def target(camera: str, plot: str | None, output: str) -> None:
+    """Write the board as it was found.
+
+    No board is exactly as its file says: paper curls, and printers stretch. `neurocal calibrate --target
+    auto` finds where the points of the board really are, together with the camera. This command writes
+    them as a board file. `neurocal detect --board` takes it, and gives the points of other images of the
+    same board their measured places. So the next calibration, and every other camera, profits.
+
+    Photographs do not tell the size of a board as a whole. It is kept as it was given.
+
+    \b
+    Examples:
+      neurocal calibrate sample_data/bent.csv -o camera.yaml
+      neurocal target camera.yaml -o board.yaml --plot board.png
+      neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
+    """  # noqa: D301 - as in the group
+    check_plot(plot, output)
+    check_outputs((output, plot), (camera,))
+
+    from neurocal_cli.io.board_yaml import write_board
+    from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.report import target_lines
+    from neurocal_cli.target import board_of
+
+    calibration = read_calibration(camera)
+    if calibration.target is None:
+        raise InputError(
+            f"{camera}: the target was taken as it was given, so there is nothing to write; calibrate with "
+            "--target free to find it"
+        )
+    if plot is not None:
+        from neurocal_cli.io.writing import write_whole
+        from neurocal_cli.target_plot import draw_target
+
+        kind = os.path.splitext(plot)[1][1:].lower()
+        write_whole(plot, draw_target(calibration.target, calibration.unit, kind))
+    write_board(board_of(calibration.target, calibration.unit), output)
+    say("\n".join(target_lines(calibration.target, calibration.unit)))

@@ -1,0 +1,217 @@
+"""A camera from the tree of a file, by the names that its keys have in use.
+
+Keys of ROS, of OpenCV's samples and of the many programs that store what ``calibrateCamera`` returned. A key
+that may be the distortion and is none of those is refused: a camera without its distortion looks right and
+is wrong.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.distortion_names import from_ros
+from neurocal_cli.io.tree_fields import Field
+
+__all__ = ["boofcv_camera", "camera_from_tree", "has_matrix", "image_size", "matrix_data"]
+
+# Ours and ROS's first; a stereo file of OpenCV's sample has M1, D1 for the left camera.
+_MATRIX_KEYS = (
+    "camera_matrix",
+    "cameraMatrix",
+    "camera_Matrix",
+    "CameraMatrix",
+    "K",
+    "k",
+    "mtx",
+    "M",
+    "M1",
+    "intrinsic_matrix",
+    "intrinsics_matrix",
+)
+_DISTORTION_KEYS = (
+    "distortion_coefficients",
+    "distCoeffs",
+    "dist_coeffs",
+    "dist_coeff",
+    "dist_coefs",
+    "distortion_coeffs",
+    "DistCoeffs",
+    "distortion",
+    "dist",
+    "D",
+    "d",
+    "D1",
+)
+_WIDTH_KEYS = ("image_width", "width")
+_HEIGHT_KEYS = ("image_height", "height")
+_SIZE_KEYS = ("imageSize", "image_size", "img_size", "resolution")
+# Speak of distortion and are not its coefficients.
+_OTHERS = ("distortion_model", "dist_model", "distortion_type")
+
+
+def camera_from_tree(root: Field, side: str = "", whole: bool = True) -> Camera:
+    """Read a camera.
+
+    Parameters
+    ----------
+    root : Field
+        The whole file.
+    side : str
+        What the keys of one camera of several end in, such as ``1`` of M1 and D1.
+    whole : bool
+        Whether the file is of this camera alone, so that all its keys are looked at.
+
+    Raises
+    ------
+    InputError, FormatError
+        No camera matrix, or one that is none; a distortion that cannot be read.
+    """
+    intrinsics = _intrinsics(root, side)
+    model, coefficients = _distortion(root, side, whole)
+    name = next((root[key].text() for key in _ended(("camera_name",), side) if key in root), "camera")
+    return Camera(intrinsics, Distortion(model, coefficients), image_size(root, side), name)
+
+
+def has_matrix(root: Field, side: str = "") -> bool:
+    """Whether the tree has a camera matrix under one of the usual names."""
+    return _first(root, _ended(_MATRIX_KEYS, side)) is not None
+
+
+def boofcv_camera(root: Field) -> Camera:
+    """Read a camera of BoofCV.
+
+    Raises
+    ------
+    InputError, FormatError
+        A lens model that is not known.
+    """
+    pinhole = root["pinhole"]
+    model = root["model"].text() if "model" in root else ""
+    if "mirror_offset" in root or model not in ("", "pinhole", "pinhole_radial_tangential"):
+        raise InputError(
+            f"BoofCV's model {model[:40] or 'with a mirror_offset'!r} is not known; calibrate with "
+            "pinhole_radial_tangential, or from the points"
+        )
+    fx, fy, cx, cy, skew = (pinhole[name].number() for name in ("fx", "fy", "cx", "cy", "skew"))
+    lens = root.get("radial_tangential")
+    coefficients = np.zeros(5)
+    if lens is not None:
+        radial = lens["radial"].array(-1) if "radial" in lens else np.zeros(0)
+        if len(radial) > 3:
+            lens["radial"].fail("3 numbers at most")
+        k1, k2, k3 = [*radial, 0.0, 0.0, 0.0][:3]
+        coefficients[:] = k1, k2, lens["t1"].number(), lens["t2"].number(), k3
+    K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    distortion = Distortion(*from_ros("plumb_bob", coefficients))
+    return Camera(Intrinsics.from_matrix(K), distortion, image_size(pinhole, ""))
+
+
+def matrix_data(field: Field, length: int) -> Array:
+    """Read a matrix in row order: as rows, cols and data, as nested lists or as one list.
+
+    Parameters
+    ----------
+    field : Field
+    length : int
+        How many numbers there must be, 9 for a 3 x 3 matrix; -1 allows any.
+    """
+    if isinstance(field.value, dict):
+        data = field["data"].array(-1)
+        rows, cols = field["rows"].integer(), field["cols"].integer()
+        channels = _channels(field)
+        if rows * cols * channels != len(data) or (length == 9 and rows != 3):
+            raise InputError(f"{field.path} has {rows} rows, {cols} cols and {len(data)} numbers; correct it")
+    elif isinstance(field.value, list) and field.value and isinstance(field.value[0], list):
+        data = field.array(-1, -1)
+        if length == 9 and data.shape != (3, 3):
+            field.fail("3 x 3 numbers")
+        data = data.ravel()
+    else:
+        data = field.array(-1)
+    if length >= 0 and len(data) != length:
+        field.fail(f"{length} numbers")
+    return data
+
+
+def _channels(field: Field) -> int:
+    """Channels of an OpenCV matrix, ``dt: "2f"`` has two."""
+    head = str(field["dt"].value)[:-1] if "dt" in field else ""
+    return int(head) if head.isdigit() else 1
+
+
+def _ended(keys: tuple[str, ...], side: str) -> tuple[str, ...]:
+    """The keys of one camera of several, with the ending straight behind them or after an underscore."""
+    if not side:
+        return keys
+    # One letter is a coefficient's name, k1, in another file.
+    return tuple(form for key in keys if key != "k" for form in (f"{key}{side}", f"{key}_{side}"))
+
+
+def _first(root: Field, keys: tuple[str, ...]) -> Field | None:
+    return next((root[key] for key in keys if key in root), None)
+
+
+def _intrinsics(root: Field, side: str) -> Intrinsics:
+    field = _first(root, _ended(_MATRIX_KEYS, side))
+    if field is None:
+        raise InputError(
+            f"holds no camera matrix; give a file with the key {', '.join(_MATRIX_KEYS[:2])} or K"
+        )
+    K = matrix_data(field, 9).reshape(3, 3)
+    if K[2, 2] != 1:
+        raise InputError(
+            f"{field.path}: its last entry must be 1, found {K[2, 2]:g}; divide the matrix by it"
+        )
+    try:
+        return Intrinsics.from_matrix(K)
+    except InputError as error:
+        raise InputError(f"{field.path}: {error}; correct it") from error
+
+
+def _distortion(root: Field, side: str, whole: bool) -> tuple[str, Array]:
+    field = _first(root, _ended(_DISTORTION_KEYS, side))
+    if field is None:
+        if whole:
+            _refuse_unread(root)
+        return "none", np.zeros(0)
+    coefficients = matrix_data(field, -1)
+    stated = _first(root, (*_ended(("distortion_model",), side), "distortion_model"))
+    if stated is not None:
+        model = stated.text() or "plumb_bob"
+    else:
+        fisheye = "fisheye_model" in root and root["fisheye_model"].value in (1, True)
+        model = "equidistant" if fisheye else "plumb_bob"
+    return from_ros(model, coefficients)
+
+
+def _refuse_unread(root: Field) -> None:
+    """Refuse a key that may be the distortion under a name that is not known."""
+    for key in root.keys():  # noqa: SIM118 - a Field, not a dict
+        if ("dist" in key.lower() and key not in _OTHERS) or key.lower() in ("k1", "k2", "coeffs"):
+            raise InputError(
+                f"the key {key[:60]!r} may be the distortion, and is not a known name of it; rename it to "
+                "distortion_coefficients, or remove it"
+            )
+
+
+def image_size(root: Field, side: str = "") -> tuple[int, int] | None:
+    """Width and height [px] under one of their usual names, None where they are unknown."""
+    width, height = (
+        _first(root, (*(_ended(keys, side) if side else ()), *keys)) for keys in (_WIDTH_KEYS, _HEIGHT_KEYS)
+    )
+    if width is not None and height is not None:
+        size = width.integer(), height.integer()
+    else:
+        field = _first(root, (*(_ended(_SIZE_KEYS, side) if side else ()), *_SIZE_KEYS))
+        if field is None:
+            return None
+        values = list(field.items())
+        if len(values) != 2:
+            field.fail("two whole numbers, width and height")
+        size = values[0].integer(), values[1].integer()
+    return size if size[0] and size[1] else None

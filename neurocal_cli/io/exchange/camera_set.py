@@ -1,0 +1,113 @@
+"""What a camera file holds, whatever program wrote it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import InputError
+from neurocal_cli.stereo.rig import Rig
+
+__all__ = ["METRES", "CameraSet", "Format"]
+
+METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
+
+
+@dataclass(frozen=True, eq=False)
+class CameraSet:
+    """One camera, or several that are fixed to each other.
+
+    Attributes
+    ----------
+    cameras : tuple of Camera
+    relative : tuple of Pose
+        Of each further camera, from the first one: ``X_k = R X_0 + t``; one less than the cameras.
+    poses : dict of Pose by view
+        From the world to the first camera.
+    unit : str, optional
+        Of the translations; None where the file does not tell.
+    origin : Calibration or Rig, optional
+        All that a neurocal file holds beyond that.
+    program : str
+        What wrote the file, for messages.
+    """
+
+    cameras: tuple[Camera, ...]
+    relative: tuple[Pose, ...] = ()
+    poses: Mapping[str, Pose] = field(default_factory=dict)
+    unit: str | None = None
+    origin: Calibration | Rig | None = None
+    program: str = "OpenCV"
+
+    def __post_init__(self) -> None:
+        if len(self.relative) != len(self.cameras) - 1:
+            raise InputError(
+                f"holds {len(self.cameras)} cameras, but not how they stand to each other; give a file with "
+                "one camera, or with the poses"
+            )
+
+    @property
+    def has_lengths(self) -> bool:
+        """Whether it holds any translation, so that the unit matters."""
+        return bool(self.relative or self.poses)
+
+    def in_metres(self) -> CameraSet:
+        """The same with translations in metres.
+
+        Raises
+        ------
+        InputError
+            A unit that is not known, or no length.
+        """
+        if not self.has_lengths:
+            return self
+        if self.unit not in METRES:
+            stated = "not known" if self.unit in (None, "unknown") else repr(self.unit)
+            raise InputError(
+                f"the file is to be in metres, but the unit of {self.program}'s file is {stated}; give "
+                f"--unit, one of {', '.join(METRES)}"
+            )
+        scale = METRES[self.unit]
+        return replace(
+            self,
+            relative=tuple(Pose(pose.R, scale * pose.t) for pose in self.relative),
+            poses={name: Pose(pose.R, scale * pose.t) for name, pose in self.poses.items()},
+            unit="m",
+        )
+
+
+@dataclass(frozen=True)
+class Format:
+    """What the files of one program can hold, and how they are written.
+
+    Attributes
+    ----------
+    program : str
+        Name for messages.
+    models : tuple of str
+        Distortion models that it has, by our names, the simplest first.
+    skew : bool
+        Whether its programs use an angle of the image axes other than 90 degrees.
+    poses : bool
+        Whether it holds the poses of views.
+    most_cameras : int
+    metres : bool
+        Whether lengths are metres.
+    needs_size : bool
+        Whether the size of the images must be known.
+    text : callable
+        The files' contents by their names; "" is the name of a single file. Its arguments are the cameras,
+        which fit the format, and the ending of the output's name, such as ".xml".
+    """
+
+    program: str
+    models: tuple[str, ...]
+    skew: bool
+    poses: bool
+    most_cameras: int
+    metres: bool
+    needs_size: bool
+    text: Callable[[CameraSet, str], Mapping[str, str | bytes]]

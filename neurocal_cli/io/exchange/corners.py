@@ -1,0 +1,321 @@
+"""Points that other programs measured: corners of boards in dictionaries, lists and tables.
+
+* A dictionary (FileStorage, JSON, ``.npz``, ``.mat``) with image points of each view and places on the board;
+* a single ``.npy`` array of image points;
+* mrcal's ``corners.vnl``: a line for each corner, ``filename x y [level]``, row by row;
+* text files of numbers: one with the places on the board, and one for each view.
+
+Corners that name no place on the board need the board. MATLAB counts pixels from 1.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.board import Board
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.camera_tree import image_size
+from neurocal_cli.io.exchange.dictionary import arrays_of
+from neurocal_cli.io.exchange.matlab import FIRST_PIXEL, unit_of
+from neurocal_cli.io.file_storage import parse_tree
+from neurocal_cli.io.files import decode, read_bytes
+from neurocal_cli.io.mat_file import read_variables
+from neurocal_cli.io.points_csv import read_points
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.points import Correspondences
+
+__all__ = ["read_corners"]
+
+_IMAGE = (
+    "image_points",
+    "imagePoints",
+    "imgpoints",
+    "img_points",
+    "imgPoints",
+    "ImagePoints",
+    "corners",
+    "all_corners",
+)
+_WORLD = (
+    "object_points",
+    "objectPoints",
+    "objpoints",
+    "obj_points",
+    "objPoints",
+    "grid_points",
+    "worldPoints",
+    "WorldPoints",
+    "world_points",
+)
+_VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
+_TABLE = re.compile(r"\A(?:#[^\n]*\n|\s*\n)*[^\n#]*\bX\b[^\n]*\bv\b", re.IGNORECASE)
+_NUMBERS = re.compile(r"\A(?:[-+0-9.eE]+[ \t,;]+){1,2}[-+0-9.eE]+\s*\n")
+
+
+def read_corners(
+    paths: Sequence[str | Path], board: Board | None, notes: list[str], unit: str | None = None
+) -> Correspondences | None:
+    """Read points from files of any program.
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+        One file, or the places on the board and then a file for each view.
+    board : Board, optional
+        Where the corners are in the world, for files that do not say.
+    notes : list of str
+        Remarks about what was left out are appended.
+    unit : str, optional
+        Of the places that a file states.
+
+    Returns
+    -------
+    Correspondences, or None where the first file holds no points.
+
+    Raises
+    ------
+    FormatError
+        A file that cannot be read, or corners that are not those of the board.
+    """
+    names = [str(path) for path in paths]
+    if "-" in names:
+        return None  # it can be read only once, and may be a camera
+    data, source = read_bytes(names[0])
+    if len(names) == 1 and data.startswith(b"\x93NUMPY"):
+        return _corners(Field({"corners": _npy(data, source)}, source), board, unit)
+    if data.startswith(b"PK\x03\x04"):
+        return _dictionary(Field(arrays_of(data, source), source), board, unit)
+    if data.startswith(b"MATLAB 5.0 MAT-file"):
+        return _matlab(data, source, board, unit)
+    if b"\0" in data:
+        return None
+    text = decode(data, source)
+    if _VNL.match(text):
+        return _vnl(text, source, board)
+    if _NUMBERS.match(text):
+        return _separate(names, board, unit)
+    if _TABLE.match(text):
+        return read_points(names, notes=notes)
+    if text.lstrip()[:1] in ("{", "<", "%") or _names_points(text):
+        return _dictionary(parse_tree(text, source), board, unit)
+    return None
+
+
+def _names_points(text: str) -> bool:
+    return any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
+
+
+def _npy(data: bytes, source: str) -> Any:
+    try:
+        return np.load(io.BytesIO(data), allow_pickle=False).tolist()
+    except (ValueError, OSError, EOFError) as error:
+        raise FormatError("is no .npy file of numbers; save it again with numpy.save", source) from error
+
+
+def _dictionary(root: Field, board: Board | None, unit: str | None) -> Correspondences | None:
+    if not isinstance(root.value, dict) or not any(name in root for name in _IMAGE):
+        return None
+    return _corners(root, board, unit)
+
+
+def _corners(root: Field, board: Board | None, unit: str | None, first: float = 0.0) -> Correspondences:
+    """Points of a dictionary; `first` is the number of the first pixel."""
+    field = next(root[name] for name in _IMAGE if name in root)
+    pixels = _stack(field, 2) - first
+    views = len(pixels)
+    names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
+    if "view_names" in root:
+        names = [entry.text() for entry in root["view_names"].items()]
+        if len(names) != views or len(set(names)) < views:
+            root["view_names"].fail(f"{views} different names")
+    world = next((_stack(root[name], 3) for name in _WORLD if name in root), None)
+    stated = root["unit"].text() if "unit" in root else unit
+    ids = [entry.text() for entry in root["points"].items()] if "points" in root else None
+    if world is None:
+        world, ids, stated = *_of_board(board, pixels.shape[1], field), board.unit if board else stated
+    if world.shape[1] != pixels.shape[1] or len(world) not in (1, views):
+        field.fail(f"{world.shape[1]} points in each view, as there are places on the board")
+    world = np.broadcast_to(world, (views, *world.shape[1:]))
+    points = _assembled(world, pixels, names, ids, stated, root.source)
+    return replace(points, image_size=image_size(root))
+
+
+def _of_board(board: Board | None, count: int, field: Field) -> tuple[Array, list[str]]:
+    """The vertices of a board of one plane, (1, N, 3), and their ids."""
+    if board is None:
+        raise FormatError(
+            f"{field.path} has {count} corners a view, but not their places on the board; give --cols, "
+            "--rows and --square, or --board",
+            field.source,
+        )
+    if len(board.planes) != 1 or board.planes[0].cols * board.planes[0].rows != count:
+        sizes = " and ".join(f"{plane.cols} x {plane.rows}" for plane in board.planes)
+        raise FormatError(
+            f"there are {count} corners a view, and {sizes} vertices on the board; give the board that was "
+            "measured",
+            field.source,
+        )
+    (plane,) = board.planes
+    return plane.vertices().reshape(1, -1, 3), list(plane.vertex_ids())
+
+
+def _stack(field: Field, width: int) -> Array:
+    """Points of each view, (V, N, width); places on a board may lack Z."""
+    value = field.value
+    if isinstance(value, dict):  # an OpenCV matrix, of one channel or several
+        value = np.reshape(
+            field["data"].array(-1, unknown=True), (field["rows"].integer(), field["cols"].integer(), -1)
+        )
+    try:
+        array = np.array(value, dtype=float)
+    except (TypeError, ValueError):
+        field.fail("the same number of points in each view, as numbers")
+    if array.ndim == 1 and array.size % 3 == 0 and width == 3:  # OpenCV writes vectors of points flat
+        array = array.reshape(1, -1, 3)
+    if array.ndim == 4:  # (V, N, 1, 2), as OpenCV's functions return them, or (V, 1, N, 2)
+        array = array.reshape(len(array), -1, array.shape[-1])
+    if array.ndim == 3 and array.shape[1] == 1 and array.shape[-1] in (2, 3) and array.shape[0] > 1:
+        array = array.reshape(1, -1, array.shape[-1])  # (N, 1, 2): one view
+    if array.ndim == 2:
+        array = array[None]
+    if width == 3 and array.ndim == 3 and array.shape[-1] == 2:
+        array = np.concatenate([array, np.zeros((*array.shape[:2], 1))], axis=2)
+    if array.ndim != 3 or array.shape[-1] != width or array.size == 0:
+        field.fail(f"points of {width} coordinates")
+    return array
+
+
+def _assembled(
+    world: Array, pixels: Array, names: list[str], ids: list[str] | None, unit: str | None, source: str
+) -> Correspondences:
+    """Rows of all views; corners that are NaN were not found."""
+    views, count = pixels.shape[:2]
+    found = np.isfinite(pixels).all(axis=2)
+    if not found.any():
+        raise FormatError("holds no corner that was found; give another file", source)
+    labels = ids if ids is not None else [str(k) for k in range(count)]
+    try:
+        return Correspondences(
+            world[found],
+            pixels[found],
+            np.repeat(names, count).reshape(views, count)[found],
+            point=np.tile(labels, views).reshape(views, count)[found],
+            unit=unit or "unknown",
+            source=source,
+        )
+    except InputError as error:
+        raise FormatError(str(error)) from error
+
+
+def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> Correspondences | None:
+    tree = read_variables(data, source)
+    if not any(name in tree for name in _IMAGE):
+        return None
+    root = Field({name: _plain(value) for name, value in tree.items()}, source)
+    field = next(name for name in _IMAGE if name in tree)
+    if np.size(tree.get("ImageSize", ())) == 2:  # MATLAB's is height and width
+        root.value["image_size"] = [int(side) for side in np.ravel(tree["ImageSize"])[::-1]]
+    root.value.setdefault("unit", unit_of(tree))
+    stack = np.asarray(tree[field], dtype=float)
+    if stack.ndim == 3:  # M x 2 x P
+        root.value[field] = np.moveaxis(stack, 2, 0).tolist()
+    return _corners(root, board, unit, first=FIRST_PIXEL)
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
+def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
+    """Read mrcal's table; a corner that was not found is ``-``, and each level doubles the sigma."""
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        corners = rows.setdefault(words[0], [])
+        if "-" in words[1:3]:
+            if len(words) > 3:
+                corners.append((np.nan, np.nan, 0.0))
+            continue
+        try:
+            level = float(words[3]) if len(words) > 3 and words[3] != "-" else 0.0
+            corners.append((float(words[1]), float(words[2]), level))
+        except (ValueError, IndexError) as error:
+            raise FormatError("is no line 'filename x y level'; correct it", source, number) from error
+    seen = {name: corners for name, corners in rows.items() if corners}
+    counts = {len(corners) for corners in seen.values()}
+    if len(counts) != 1:
+        raise FormatError(
+            "the images have different numbers of corners; write all of them, - for none", source
+        )
+    stack = np.array(list(seen.values()))
+    world, ids = _of_board(board, counts.pop(), Field(None, source, "the table"))
+    names = [Path(name).stem for name in seen]
+    names = names if len(set(names)) == len(names) else list(seen)
+    # A negative level marks a corner that mrcal itself takes for an outlier.
+    pixels = np.where(stack[:, :, 2:] < 0, np.nan, stack[:, :, :2])
+    found = np.isfinite(pixels).all(axis=2)
+    points = _assembled(
+        np.broadcast_to(world, (len(stack), *world.shape[1:])),
+        pixels,
+        names,
+        ids,
+        board.unit if board else None,
+        source,
+    )
+    sigma = 2.0 ** stack[:, :, 2][found]
+    if not (sigma > 1).any():
+        return points
+    return replace(points, covariance=np.column_stack([sigma**2, 0 * sigma, sigma**2]))
+
+
+def _separate(names: list[str], board: Board | None, unit: str | None) -> Correspondences | None:
+    """Files of numbers: the places on the board, X Y Z, unless a board is given, and u v of each view."""
+    tables = [_table(name) for name in names]
+    if tables[0].shape[1] == 3 or board is None:
+        places, tables, names = tables[0], tables[1:], names[1:]
+        if not tables:
+            raise FormatError("holds places alone; give the files of the pixels after it", str(names))
+        world = np.zeros((1, len(places), 3))
+        world[0, :, : places.shape[1]] = places
+        ids, stated = None, unit
+    else:
+        world, ids = _of_board(board, len(tables[0]), Field(None, names[0], "the file"))
+        stated = board.unit
+    for name, table in zip(names, tables, strict=True):
+        if table.shape != (world.shape[1], 2):
+            raise FormatError(
+                f"has {len(table)} rows of {table.shape[1]}; give {world.shape[1]} rows of u and v", name
+            )
+    stems = [Path(name).stem for name in names]
+    labels = stems if len(set(stems)) == len(stems) else names
+    pixels = np.stack(tables)
+    world = np.broadcast_to(world, (len(tables), *world.shape[1:]))
+    return _assembled(world, pixels, labels, ids, stated, names[0])
+
+
+def _table(name: str) -> Array:
+    data, source = read_bytes(name)
+    rows = []
+    for number, line in enumerate(decode(data, source).splitlines(), start=1):
+        words = re.split(r"[\s,;]+", line.strip())
+        if words == [""] or words[0].startswith("#"):
+            continue
+        try:
+            rows.append([float(word) for word in words if word])
+        except ValueError as error:
+            raise FormatError("is no row of numbers; correct it", source, number) from error
+        if len(rows[-1]) != len(rows[0]) or len(rows[0]) not in (2, 3):
+            raise FormatError("must be a row of 2 numbers or of 3, as all the others", source, number)
+    if not rows:
+        raise FormatError("holds no numbers; give another file", source)
+    return np.array(rows)

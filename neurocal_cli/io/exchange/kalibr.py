@@ -1,0 +1,99 @@
+"""Kalibr's camchain files: cameras in a chain, lengths in metres.
+
+``T_cn_cnm1`` takes points from the camera before into this one. The centre of the top-left pixel is (0, 0),
+as Kalibr's corners are OpenCV's. radtan is k1, k2, p1, p2; equidistant is our fisheye.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import InputError
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format
+from neurocal_cli.io.exchange.rotations import after, inverse
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import flow, text
+
+__all__ = ["FORMAT", "from_tree", "is_tree"]
+
+_MODELS = {"radtan": "k1k2p1p2", "equidistant": "fisheye", "equi": "fisheye", "none": "none"}
+
+
+def is_tree(root: Field) -> bool:
+    """Whether the tree is a camchain, or one camera's part of it."""
+    return "cam0" in root or "camera_model" in root
+
+
+def from_tree(root: Field) -> CameraSet:
+    """Read a chain of cameras.
+
+    Raises
+    ------
+    InputError, FormatError
+        A camera model or distortion that is not known, a key that is missing.
+    """
+    if "cam0" not in root:
+        return CameraSet((_camera(root, "camera"),), unit="m", program="Kalibr")
+    cameras, relative = [_camera(root["cam0"], "cam0")], [Pose(np.eye(3), np.zeros(3))]
+    while f"cam{len(cameras)}" in root:
+        name = f"cam{len(cameras)}"
+        T = root[name]["T_cn_cnm1"].array(4, 4)
+        relative.append(after(Pose(T[:3, :3], T[:3, 3]), relative[-1]))
+        cameras.append(_camera(root[name], name))
+    return CameraSet(tuple(cameras), tuple(relative[1:]), unit="m", program="Kalibr")
+
+
+def _camera(field: Field, name: str) -> Camera:
+    model = field["camera_model"].text()
+    if model != "pinhole":
+        raise InputError(
+            f"{name}: the camera model {model[:40]!r} is not known; calibrate it as pinhole-equi or "
+            "pinhole-radtan, or with neurocal from the points"
+        )
+    fu, fv, pu, pv = field["intrinsics"].array(4)
+    lens = field["distortion_model"].text() if "distortion_model" in field else "none"
+    if lens not in _MODELS:
+        raise InputError(
+            f"{name}: the distortion model {lens[:40]!r} is not known; calibrate it as radtan or "
+            "equidistant, or with neurocal from the points"
+        )
+    ours = _MODELS[lens]
+    k = field["distortion_coeffs"].array(-1) if ours != "none" else np.zeros(0)
+    if ours != "none" and len(k) != 4:
+        field["distortion_coeffs"].fail("4 numbers")
+    size = None
+    if "resolution" in field:
+        width, height = (entry.integer(1) for entry in field["resolution"].items())
+        size = width, height
+    return Camera(Intrinsics(fu, fv, pu, pv), Distortion(ours, k), size, name)
+
+
+def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    lines, before = [], Pose(np.eye(3), np.zeros(3))
+    for k, camera in enumerate(cameras.cameras):
+        a, _, b, u0, v0 = camera.entries
+        fisheye = camera.distortion.model == "fisheye"
+        coefficients = camera.distortion.coefficients if camera.distortion.coefficients.size else np.zeros(4)
+        lines += [
+            f"cam{k}:",
+            f"  cam_overlaps: [{', '.join(str(n) for n in range(len(cameras.cameras)) if n != k)}]",
+            "  camera_model: pinhole",
+            f"  distortion_coeffs: {flow(coefficients)}",
+            f"  distortion_model: {'equidistant' if fisheye else 'radtan'}",
+            f"  intrinsics: {flow(np.array([a, b, u0, v0]))}",
+            f"  resolution: {list(camera.image_size or (0, 0))}",
+            f"  rostopic: {text(f'/{camera.name}/image_raw')}",
+        ]
+        if k:
+            pose = cameras.relative[k - 1]
+            step = after(pose, inverse(before))
+            lines.append("  T_cn_cnm1:")
+            lines += [f"  - {flow(row)}" for row in np.vstack([step.D, [0.0, 0.0, 0.0, 1.0]])]
+            before = pose
+    return {"": "\n".join([*lines, ""])}
+
+
+FORMAT = Format("Kalibr", ("none", "k1k2p1p2", "fisheye"), False, False, 99, True, True, _text)

@@ -1,0 +1,116 @@
+"""mrcal's camera models: one camera each, with its pose in a world that the cameras of a rig share.
+
+The text is a Python dictionary. The centre of the top-left pixel is (0, 0). ``extrinsics`` (``rt_cam_ref`` in
+newer versions) is rotation vector and translation from the world to the camera.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format
+from neurocal_cli.io.exchange.rotations import from_vector, to_vector
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import number
+
+__all__ = ["FORMAT", "REFERENCE", "is_text", "parse"]
+
+REFERENCE = "reference"  # the name of the world as a view
+_LENGTHS = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
+_NAMES = {"none": "PINHOLE", "k1k2p1p2": "OPENCV4", "plumb_bob": "OPENCV5", "rational": "OPENCV8"}
+_START = re.compile(r"\A(?:\s*#[^\n]*\n)*\s*\{\s*(?:#[^\n]*\n\s*)*'[a-z_]+'\s*:")
+
+
+def is_text(text: str) -> bool:
+    """Whether a text is a camera model."""
+    return bool(_START.match(text)) and "'lensmodel'" in text
+
+
+def parse(text: str, source: str) -> CameraSet:
+    """Read a camera model.
+
+    Raises
+    ------
+    FormatError, InputError
+        What is wrong with it, a lens model that is not known.
+    """
+    try:
+        tree: Any = ast.literal_eval(text.strip())
+    except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
+        raise FormatError("is no camera model of mrcal; write it again", source) from error
+    root = Field(tree, source)
+    model = root["lensmodel"].text().removeprefix("LENSMODEL_")
+    if model not in _LENGTHS:
+        raise InputError(
+            f"the lens model {model[:60]!r} is not known; convert it in mrcal first: "
+            "mrcal-convert-lensmodel LENSMODEL_OPENCV8"
+        )
+    values = _numbers(root["intrinsics"], 4 + _LENGTHS[model])
+    lens = _distortion(values[4:])
+    width, height = _numbers(root["imagersize"], 2)
+    key = "rt_cam_ref" if "rt_cam_ref" in root else "extrinsics"
+    rt = _numbers(root[key], 6)
+    camera = Camera(Intrinsics(*values[:4]), lens, (int(width), int(height)))
+    return CameraSet((camera,), (), {REFERENCE: Pose(from_vector(rt[:3]), rt[3:])}, None, program="mrcal")
+
+
+def _numbers(field: Field, count: int) -> Array:
+    """Numbers of a list or a tuple."""
+    values = list(field.value) if isinstance(field.value, tuple) else field.value
+    return Field(values, field.source, field.path).array(count)
+
+
+def _distortion(k: Array) -> Distortion:
+    if k[8:].any():
+        raise InputError(
+            "the thin prism coefficients of LENSMODEL_OPENCV12 are not known; convert it to OPENCV8"
+        )
+    k = k[:8]
+    if not k.any():
+        return Distortion()
+    names = {4: "k1k2p1p2", 5: "plumb_bob", 8: "rational"}
+    return Distortion(names[len(k)], k)
+
+
+def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    if len(cameras.cameras) == 1:
+        world = cameras.poses.get(REFERENCE, Pose(np.eye(3), np.zeros(3)))
+        return {"": _model(cameras.cameras[0], world)}
+    poses = (Pose(np.eye(3), np.zeros(3)), *cameras.relative)
+    names = ["left", "right"] if len(poses) == 2 else [f"camera{k}" for k in range(len(poses))]
+    return {
+        f"{name}.cameramodel": _model(camera, pose)
+        for name, camera, pose in zip(names, cameras.cameras, poses, strict=True)
+    }
+
+
+def _model(camera: Camera, pose: Pose) -> str:
+    a, _, b, u0, v0 = camera.entries
+    width, height = camera.image_size or (0, 0)
+    values = [a, b, u0, v0, *camera.distortion.coefficients.tolist()]
+    return (
+        "{\n"
+        f"    'lensmodel':  'LENSMODEL_{_NAMES[camera.distortion.model]}',\n"
+        "    # fx, fy, cx, cy, and the coefficients of the distortion\n"
+        f"    'intrinsics': [ {_list(values)} ],\n"
+        "    # rotation vector and translation from the world to the camera\n"
+        f"    'extrinsics': [ {_list([*to_vector(pose.R), *pose.t])} ],\n"
+        f"    'imagersize': [ {width}, {height} ],\n"
+        "}\n"
+    )
+
+
+def _list(values: list[float]) -> str:
+    return ", ".join(number(value) for value in values)
+
+
+FORMAT = Format("mrcal", tuple(_NAMES), False, False, 99, False, True, _text)

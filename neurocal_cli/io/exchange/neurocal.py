@@ -1,0 +1,109 @@
+"""neurocal's own files, of cameras that were calibrated here or elsewhere."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration, ViewResult
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import MODELS, Distortion
+from neurocal_cli.camera.pinhole import POSE_NAMES
+from neurocal_cli.errors import FormatError
+from neurocal_cli.io.calibration_tree import (
+    calibration_from_field,
+    distortion_from_field,
+    intrinsics_from_field,
+)
+from neurocal_cli.io.calibration_yaml import format_calibration
+from neurocal_cli.io.camera_tree import image_size
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format
+from neurocal_cli.io.rig_yaml import format_rig, rig_from_field
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.points import Correspondences
+from neurocal_cli.stereo.rig import Rig
+
+__all__ = ["FORMAT", "as_rig", "from_tree"]
+
+_UNKNOWN = "unknown"  # the unit of lengths that no file stated
+
+
+def from_tree(root: Field, whole: bool) -> CameraSet:
+    """Read a calibration or a rig; without its poses and points unless the whole of it is wanted.
+
+    Raises
+    ------
+    FormatError
+        A key that is missing or wrong.
+    """
+    if "neurocal" not in root:
+        if not whole:
+            raise FormatError("is a stereo rig; give the file of one camera", root.source)
+        rig = rig_from_field(root)
+        poses = {name: view.pose for name, view in rig.left.views.items()}
+        cameras = rig.left.camera, rig.right.camera
+        return CameraSet(cameras, (rig.pose,), poses, _unit(rig.unit), rig, "neurocal")
+    if not whole:
+        intrinsics, (model, k) = intrinsics_from_field(root)[0], distortion_from_field(root)
+        name = root["camera_name"].text() if "camera_name" in root else "camera"
+        camera = Camera(intrinsics, Distortion(model, k), image_size(root), name)
+        return CameraSet((camera,), program="neurocal")
+    calibration = calibration_from_field(root)
+    poses = {name: view.pose for name, view in calibration.views.items()}
+    return CameraSet((calibration.camera,), (), poses, _unit(calibration.unit), calibration, "neurocal")
+
+
+def as_rig(cameras: CameraSet) -> Rig:
+    """The rig of two cameras, without points."""
+    if isinstance(cameras.origin, Rig) and cameras.program == "neurocal":
+        return cameras.origin
+    left, right = (_calibration(cameras, k) for k in range(2))
+    unknown = dict.fromkeys((*POSE_NAMES, "baseline"), float("nan"))
+    (pose,) = cameras.relative
+    return Rig(
+        left,
+        right,
+        pose,
+        unknown,
+        np.full((6, 6), np.nan),
+        (),
+        stop_reason=f"from a file of {cameras.program}",
+    )
+
+
+def _calibration(cameras: CameraSet, k: int) -> Calibration:
+    camera = cameras.cameras[k]
+    unit = cameras.unit or _UNKNOWN
+    poses = cameras.poses if k == 0 else {}
+    views = {name: ViewResult(pose, {}, 0, float("nan")) for name, pose in poses.items()}
+    return Calibration(
+        intrinsics=camera.intrinsics,
+        std={},
+        fixed=frozenset(),
+        views=views,
+        points=Correspondences.none(camera.image_size, unit),
+        type=1,
+        method="convert",
+        trainer="none",
+        seed=0,
+        converged=True,
+        stop_reason=f"from a file of {cameras.program}",
+        rmse_px=float("nan"),
+        max_px=float("nan"),
+        distortion_model=camera.distortion.model,
+        distortion=camera.distortion.coefficients,
+        camera_name=camera.name,
+    )
+
+
+def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    if len(cameras.cameras) == 2:
+        return {"": format_rig(as_rig(cameras))}
+    origin = cameras.origin
+    return {"": format_calibration(origin if isinstance(origin, Calibration) else _calibration(cameras, 0))}
+
+
+def _unit(unit: str) -> str | None:
+    return None if unit == _UNKNOWN else unit
+
+
+FORMAT = Format("neurocal", tuple(MODELS), True, True, 2, False, False, _text)

@@ -1,0 +1,136 @@
+"""Cameras from files of any program. The content tells which; a name or an ending never does."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.io.camera_tree import boofcv_camera
+from neurocal_cli.io.exchange import colmap, dictionary, kalibr, matlab, mrcal, neurocal, ros
+from neurocal_cli.io.exchange.camera_set import CameraSet
+from neurocal_cli.io.exchange.rotations import after, inverse
+from neurocal_cli.io.file_storage import parse_tree
+from neurocal_cli.io.files import decode, read_bytes
+from neurocal_cli.io.tree_fields import Field
+
+__all__ = ["read_cameras"]
+
+# By what a binary file begins with.
+_BINARY: tuple[tuple[bytes, Callable[[bytes, str], CameraSet]], ...] = (
+    (b"PK\x03\x04", dictionary.read_npz),
+    (b"MATLAB 5.0 MAT-file", matlab.read_mat),
+)
+_COLMAP = re.compile(r"^(?:#[^\n]*\n|\s*\n)*\s*\d+[ \t]+[A-Z][A-Z_]+[ \t]+\d+[ \t]+\d+[ \t]").match
+
+
+def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
+    """Read the cameras of a file, or of two files that belong together.
+
+    Parameters
+    ----------
+    paths : sequence of str or Path
+        One file of neurocal, ROS, OpenCV (YAML, XML, JSON), Kalibr, COLMAP (``cameras.txt``, or the folder
+        that holds it), mrcal, MATLAB (``.mat``), BoofCV, or a JSON or ``.npz`` dictionary. Or two: the left
+        and the right camera of ROS or mrcal, or the two files of OpenCV's stereo sample. ``-`` is stdin.
+    whole : bool
+        Whether all of a neurocal file is wanted; else its poses and points are not looked at.
+
+    Raises
+    ------
+    FormatError
+        A file that cannot be read, that is of no known kind, or that holds what no camera of ours is.
+    """
+    names = [str(path) for path in paths]
+    if len(names) == 1:
+        return _read(names[0], whole)
+    if len(names) > 2:
+        raise InputError(f"there are {len(names)} files; give one, or the two of one rig")
+    trees = [_tree(name) for name in names]
+    if all(tree is not None and dictionary.is_part(tree) for tree in trees):
+        first, second = (tree for tree in trees if tree is not None)
+        merged = Field({**first.value, **second.value}, f"{first.source}, {second.source}")
+        return _named(dictionary.from_tree, merged)
+    left, right = (_read(name) for name in names)
+    return _joined(left, right, names)
+
+
+def _read(name: str, whole: bool = True) -> CameraSet:
+    if colmap.is_folder(name):
+        return colmap.read_folder(name)
+    data, source = read_bytes(name)
+    for mark, read in _BINARY:
+        if data.startswith(mark):
+            return _named(lambda root, read=read: read(data, root.source), Field(None, source))  # type: ignore[misc]
+    if data.startswith(b"\x89HDF"):
+        raise FormatError("is a MATLAB file of version 7.3; save it with -v7", source)
+    return _parsed(decode(data, source, "a camera file"), source, whole)
+
+
+def _parsed(text: str, source: str, whole: bool) -> CameraSet:
+    if _COLMAP(text):
+        return _named(lambda root: colmap.parse(text, root.source), Field(None, source))
+    if mrcal.is_text(text):
+        return _named(lambda root: mrcal.parse(text, root.source), Field(None, source))
+    return _named(lambda root: _from_tree(root, whole), parse_tree(text, source))
+
+
+def _tree(name: str) -> Field | None:
+    """The tree of a file that is one, None for others."""
+    if name == "-" or colmap.is_folder(name):
+        return None
+    data, source = read_bytes(name)
+    if b"\0" in data[:200]:
+        return None
+    text = decode(data, source, "a camera file")
+    if _COLMAP(text) or mrcal.is_text(text):
+        return None
+    return parse_tree(text, source)
+
+
+def _from_tree(root: Field, whole: bool) -> CameraSet:
+    if not isinstance(root.value, dict):
+        raise InputError("is not a camera file; give a neurocal, ROS or OpenCV file")
+    if "neurocal" in root or ("left" in root and "right" in root):
+        return neurocal.from_tree(root, whole)
+    if kalibr.is_tree(root):
+        return kalibr.from_tree(root)
+    if "pinhole" in root:
+        return CameraSet((boofcv_camera(root),), program="BoofCV")
+    if ros.is_tree(root):
+        return ros.from_tree(root)
+    return dictionary.from_tree(root)
+
+
+def _named(read: Callable[[Field], CameraSet], root: Field) -> CameraSet:
+    """Put the file's name before what is wrong with it."""
+    try:
+        return read(root)
+    except FormatError:
+        raise
+    except InputError as error:
+        raise FormatError(str(error), root.source) from error
+
+
+def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSet:
+    """One rig of two files of one camera each."""
+    for part, name in zip((left, right), names, strict=True):
+        if len(part.cameras) != 1:
+            raise FormatError("holds several cameras itself; give it alone", name)
+    if left.program != right.program or left.program not in ("ROS", "mrcal"):
+        raise InputError(
+            f"{names[0]} and {names[1]} do not say how the cameras stand to each other; give two files of "
+            "ROS or of mrcal, or the file of the rig"
+        )
+    if left.program == "ROS":
+        return ros.joined(left, right)
+    # mrcal's poses are those of the cameras in one world.
+    first, second = (part.poses[mrcal.REFERENCE] for part in (left, right))
+    return replace(
+        left,
+        cameras=(left.cameras[0], right.cameras[0]),
+        relative=(after(second, inverse(first)),),
+        poses={},
+    )

@@ -1,0 +1,84 @@
+"""ROS's camera_info files: one camera each; of a pair the rectified projections say how they stand.
+
+``projection_matrix`` of the right camera holds ``-fx b`` [px m], and the rectification matrices turn both
+cameras into parallel ones: so R = R2^T R1 and t = R2^T (P2[0, 3], P2[1, 3], 0) / f.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.camera_info import camera_info_lines
+from neurocal_cli.io.camera_tree import camera_from_tree, matrix_data
+from neurocal_cli.io.exchange.camera_set import CameraSet, Format
+from neurocal_cli.io.exchange.neurocal import as_rig
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.stereo.rectification import rectify
+
+__all__ = ["FORMAT", "from_tree", "is_tree", "joined"]
+
+_RECTIFIED = "rectified"  # the name under which a camera of a pair keeps its R and t / f in `poses`
+
+
+def is_tree(root: Field) -> bool:
+    """Whether the tree is a camera_info file."""
+    return "camera_matrix" in root and "rectification_matrix" in root
+
+
+def from_tree(root: Field) -> CameraSet:
+    """Read the camera, with its place in a rectified pair where it has one."""
+    camera, poses = camera_from_tree(root), {}
+    if "projection_matrix" in root:
+        R = matrix_data(root["rectification_matrix"], 9).reshape(3, 3)
+        P = matrix_data(root["projection_matrix"], 12).reshape(3, 4)
+        if P[0, 0] > 0 and P[1, 1] > 0:
+            poses[_RECTIFIED] = Pose(R, np.array([P[0, 3] / P[0, 0], P[1, 3] / P[1, 1], 0.0]))
+    return CameraSet((camera,), (), poses, "m", program="ROS")
+
+
+def joined(left: CameraSet, right: CameraSet) -> CameraSet:
+    """The rig of the files of its two cameras.
+
+    Raises
+    ------
+    InputError
+        Files that are not those of a rectified pair.
+    """
+    first, second = (part.poses.get(_RECTIFIED) for part in (left, right))
+    if first is None or second is None or not second.t.any() or first.t.any():
+        raise InputError(
+            "the two ROS files are no pair: the right camera's projection_matrix must hold the baseline, and "
+            "the left one's none; give the left camera first, or the file of the rig"
+        )
+    pose = Pose(second.R.T @ first.R, second.R.T @ second.t)
+    return replace(left, cameras=(left.cameras[0], right.cameras[0]), relative=(pose,), poses={})
+
+
+def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
+    if len(cameras.cameras) == 1:
+        return {"": _info(cameras.cameras[0], None)}
+    rectified = rectify(as_rig(replace(cameras, origin=None)))
+    if rectified is None:
+        raise InputError("ROS's files need images of one known size; give --image-size")
+    pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
+    return {
+        f"{side}.yaml": _info(camera, pair)
+        for side, camera, pair in zip(("left", "right"), cameras.cameras, pairs, strict=True)
+    }
+
+
+def _info(camera: Camera, rectified: tuple[Array, Array] | None) -> str:
+    lens = camera.distortion
+    lines = camera_info_lines(
+        camera.name, camera.image_size, camera.A, lens.model, lens.coefficients, rectified
+    )
+    return "\n".join([*lines, ""])
+
+
+FORMAT = Format("ROS", ("none", "plumb_bob", "rational", "fisheye"), False, False, 2, True, True, _text)

@@ -1,0 +1,59 @@
+"""Rotations as other programs write them: as a vector along the axis, and as a unit quaternion.
+
+SciPy gets copies, because older versions take no read-only array.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.geometry import Array
+
+__all__ = [
+    "after",
+    "from_quaternion",
+    "from_vector",
+    "inverse",
+    "to_quaternion",
+    "to_vector",
+]
+
+
+def to_vector(R: Array) -> Array:
+    """Axis times angle [rad] of a rotation (3, 3), also by nearly pi, as OpenCV's ``Rodrigues``."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_matrix(np.array(R)).as_rotvec())
+
+
+def from_vector(r: Array) -> Array:
+    """The rotation (3, 3) of axis times angle [rad]."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_rotvec(np.array(r, dtype=float).reshape(3)).as_matrix())
+
+
+def to_quaternion(R: Array) -> Array:
+    """Unit quaternion w, x, y, z with w >= 0 of a rotation (3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    x, y, z, w = Rotation.from_matrix(np.array(R)).as_quat()
+    return np.array([w, x, y, z]) * (1.0 if w >= 0 else -1.0)
+
+
+def from_quaternion(q: Array) -> Array:
+    """The rotation (3, 3) of a quaternion w, x, y, z of any length but 0."""
+    from scipy.spatial.transform import Rotation
+
+    return np.asarray(Rotation.from_quat(np.roll(np.asarray(q, dtype=float), -1)).as_matrix())
+
+
+def inverse(pose: Pose) -> Pose:
+    """The way back."""
+    return Pose(pose.R.T, -pose.R.T @ pose.t)
+
+
+def after(second: Pose, first: Pose) -> Pose:
+    """First the one, then the other: ``X'' = R2 (R1 X + t1) + t2``."""
+    return Pose(second.R @ first.R, second.R @ first.t + second.t)

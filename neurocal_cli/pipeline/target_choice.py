@@ -1,0 +1,110 @@
+"""The target found with the camera, where the data ask for it: lens and target are chosen together.
+
+A bent board looks like a lens. So the target is found under the lens that was chosen for the given target,
+the lens is chosen anew for the target that was found, and so on until the lens stays. The points that were
+set aside are judged anew, too: many of them contradict only the given target.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
+from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
+from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.calibration import Rejected
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.initialisation.options import Options
+from neurocal_cli.pipeline.fit import fit_again
+from neurocal_cli.pipeline.outlier_rejection import fit_robustly
+from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
+from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
+from neurocal_cli.verdict.view_groups import view_groups
+
+__all__ = ["with_target"]
+
+_ROUNDS = 3
+
+
+def with_target(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
+) -> tuple[Solution, Rejected]:
+    """Find the target, and fit the camera to it.
+
+    Parameters
+    ----------
+    problem : Problem
+        With all points, where their file has them.
+    solution, rejected
+        For the given target.
+    options : Options
+    choice : {"auto", "given", "flat", "free"}
+
+    Returns
+    -------
+    solution, rejected
+        The ones given where the target stays as it is.
+    """
+    if choice == "given" or solution.refusal or options.distortion == "plumb-line":
+        return solution, rejected
+    found = _found(solution, choice, None)
+    if found is None:
+        return solution, rejected
+    if choice == "auto" and (found.target.evidence < LEAST_GAIN or _of_several_cameras(solution)):
+        return solution, rejected
+    best: tuple[Solution, Rejected] = solution, rejected
+    for _ in range(_ROUNDS):
+        (new, adjusted), *_ = found.fits
+        start = replace(solution, problem=new, adjusted=adjusted)
+        again = _fitted_to(problem, found.target, (start, best[1]), options)
+        if again is None:
+            break
+        lens = new.distortion.model
+        found = _found(again[0], choice, found.target)
+        if found is None:
+            break
+        (new, adjusted), *_ = found.fits
+        best = replace(again[0], problem=new, adjusted=adjusted, target=found.target), again[1]
+        if new.distortion.model == lens:
+            break
+    return best
+
+
+def _of_several_cameras(solution: Solution) -> bool:
+    """Whether two cameras, or a zoom that moves, leave hardly more than noise: then the target is not why."""
+    problem = solution.problem
+    if not (problem.free_poses and problem.free.any()):
+        return False
+    return (
+        view_groups(problem.views, solution.state, solution.adjusted.normal, problem.free_camera) is not None
+    )
+
+
+def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
+    problem, views = solution.problem, solution.problem.views
+    given, label, point = distinct_points([problem.points])
+    repeated = repeated_poses(views, solution.state, point_residuals(views, solution.state))
+    plane = planes_of(given, point) if known is None else known.plane
+    if not enough_views(label, repeated.n_poses, int(plane.max()) + 1):
+        return None
+    # Only a lens that nobody named may change.
+    find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
+    return find([(problem, solution.adjusted)], choice == "flat", known)
+
+
+def _fitted_to(
+    problem: Problem, target: Target, before: tuple[Solution, Rejected], options: Options
+) -> tuple[Solution, Rejected] | None:
+    """The camera for a target, its lens and its outliers chosen anew; None where that fails."""
+    solution, rejected = before
+    try:
+        if len(rejected) or rejected.views:
+            again, rejected = fit_robustly(problem.with_points(target.applied(problem.points)), options)
+        else:
+            points = target.applied(problem.points)
+            again = fit_again(solution, points, options, only_from_here=True)
+    except DegenerateGeometryError:
+        return None
+    return None if again.refusal else (again, rejected)

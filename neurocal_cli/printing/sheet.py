@@ -1,0 +1,241 @@
+"""A board on a sheet of paper: squares, folds, rulers and a line of text, in millimetres.
+
+The square between vertices (0, 0) and (1, 1) is black. That is where detection, like OpenCV, begins to count.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.board import Board
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.printing.unfolding import Laid, unfolded
+
+__all__ = ["PAPERS", "Line", "Sheet", "Text", "default_board", "millimetres", "on_paper", "paper_size"]
+
+# Width and height [mm], upright.
+PAPERS = {
+    "A0": (841.0, 1189.0),
+    "A1": (594.0, 841.0),
+    "A2": (420.0, 594.0),
+    "A3": (297.0, 420.0),
+    "A4": (210.0, 297.0),
+    "A5": (148.0, 210.0),
+    "letter": (215.9, 279.4),
+    "legal": (215.9, 355.6),
+    "tabloid": (279.4, 431.8),
+}
+_MILLIMETRES = {"mm": 1.0, "cm": 10.0, "dm": 100.0, "m": 1000.0, "inch": 25.4, "in": 25.4}
+
+_EDGE = 5.0  # that printers leave white [mm]
+_QUIET = 5.0  # white around the pattern, to rulers and edge [mm]
+_RULER = 9.0  # room for a ruler with its numbers [mm]
+_TICK = 10.0  # between the marks of a ruler [mm]
+_LONGEST = 200.0  # ruler [mm]
+_COLS, _ROWS = 9, 6  # of the board that is made without being asked for: one count is odd, one even
+
+
+@dataclass(frozen=True)
+class Line:
+    """A thin line; ends in mm."""
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    width: float = 0.2
+    dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text whose base line begins, or whose middle is, at a place in mm."""
+
+    place: tuple[float, float]
+    content: str
+    size: float = 3.0
+    middle: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """What is printed.
+
+    Attributes
+    ----------
+    width, height : float [mm]
+        Of the paper; the origin is its top-left corner, y is downwards.
+    squares : (N, 4, 2) array [mm]
+        Corners of the black squares and parts of squares.
+    lines, texts : tuples
+    laid : list of Laid
+        The planes on the sheet, in the board's unit, before they were scaled and moved.
+    scale : float
+        Millimetres of a unit of the board.
+    origin : (2,) array [mm]
+        Where the origin of `laid` is on the paper.
+    """
+
+    width: float
+    height: float
+    squares: Array
+    lines: tuple[Line, ...]
+    texts: tuple[Text, ...]
+    laid: tuple[Laid, ...]
+    scale: float
+    origin: Array
+
+
+def millimetres(unit: str) -> float:
+    """Millimetres of one unit.
+
+    Raises
+    ------
+    InputError
+        A unit that is no length we know.
+    """
+    if unit not in _MILLIMETRES:
+        raise InputError(f"the unit {unit[:20]!r} is no known length; use one of {', '.join(_MILLIMETRES)}")
+    return _MILLIMETRES[unit]
+
+
+def paper_size(name: str) -> tuple[float, float]:
+    """Width and height of a paper by its name, or of ``420x297`` [mm].
+
+    Raises
+    ------
+    InputError
+        No such paper.
+    """
+    for known, size in PAPERS.items():
+        if name.lower() == known.lower():
+            return size
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)x(\d+(?:\.\d+)?)", name)
+    if match and all(20 <= float(side) <= 5000 for side in match.groups()):
+        return float(match[1]), float(match[2])
+    raise InputError(
+        f"the paper {name[:20]!r} is not known; use {', '.join(PAPERS)}, or its size in mm such as 420x297"
+    )
+
+
+def default_board(paper: tuple[float, float]) -> Board:
+    """A board of 9 x 6 inner vertices whose squares are as large as fits on a paper, in whole mm.
+
+    Of 10 x 7 squares, so that it does not look the same after a turn of 180 degrees.
+
+    Raises
+    ------
+    InputError
+        Paper too small for squares of 5 mm.
+    """
+    room = _room(max(paper), min(paper))
+    square = float(np.floor(min(room[0] / (_COLS + 1), room[1] / (_ROWS + 1))))
+    if square < 5:
+        raise InputError("the paper is too small for a board of 9 x 6 inner vertices; give a larger one")
+    return Board.single(_COLS, _ROWS, square, "mm")
+
+
+def on_paper(board: Board, paper: tuple[float, float]) -> Sheet:
+    """Lay a board out on paper, upright or lying, whichever it fits.
+
+    Parameters
+    ----------
+    board : Board
+    paper : (width, height) [mm]
+
+    Raises
+    ------
+    InputError
+        A board larger than the paper, an unknown unit, planes that cannot be laid flat.
+    """
+    scale = millimetres(board.unit)
+    laid, folds = unfolded(board)
+    outlines = scale * np.concatenate([one.outline for one in laid])
+    low, high = outlines.min(axis=0), outlines.max(axis=0)
+    size = high - low
+    for width, height in (paper, paper[::-1]):
+        room = _room(width, height)
+        if (size <= np.array(room) + 1e-6).all():
+            break
+    else:
+        room = _room(max(paper), min(paper))
+        raise InputError(
+            f"the board is {max(size):.4g} x {min(size):.4g} mm with its border, and {room[0]:.4g} x "
+            f"{room[1]:.4g} mm of the paper can be printed on; give a larger --paper or a smaller --square"
+        )
+    corner = np.array([_EDGE + _RULER + _QUIET, _EDGE + _QUIET]) + 0.5 * (np.array(room) - size)
+    origin = corner - low
+    lines = [
+        Line(_pair(scale * fold.start + origin), _pair(scale * fold.end + origin), dashed=True)
+        for fold in folds
+    ]
+    # Dashes are drawn beside the pattern only, where they change no edge.
+    lines = [part for line in lines for part in _beside(line, corner, corner + size)]
+    rulers, numbers = _rulers(corner, size, width, height)
+    squares = scale * np.concatenate([_black(one) for one in laid]) + origin
+    text = Text((_EDGE + _RULER + _QUIET, height - _EDGE), _caption(board), 2.8)
+    return Sheet(width, height, squares, (*lines, *rulers), (*numbers, text), tuple(laid), scale, origin)
+
+
+def _room(width: float, height: float) -> tuple[float, float]:
+    """Space for the pattern: without the edges, the quiet zone, the rulers, and the text at the bottom."""
+    return width - 2 * (_EDGE + _QUIET) - _RULER, height - 2 * (_EDGE + _QUIET) - _RULER - 4.0
+
+
+def _black(laid: Laid) -> Array:
+    """(N, 4, 2) corners of the black squares of a plane, those at the border cut to its reach."""
+    low, high = laid.bounds
+    c, r = np.meshgrid(np.arange(-1, laid.plane.cols), np.arange(-1, laid.plane.rows))
+    black = (c + r) % 2 == 0
+    first = np.column_stack([c[black], r[black]]).astype(float)
+    start, end = np.maximum(first, low), np.minimum(first + 1, high)
+    kept = ((end - start) > 1e-9).all(axis=1)
+    (a, b), (x, y) = start[kept].T, end[kept].T
+    return laid.at(np.stack([np.stack([a, b], -1), np.stack([x, b], -1), np.stack([x, y], -1),
+                             np.stack([a, y], -1)], axis=1))  # fmt: skip
+
+
+def _beside(line: Line, low: Array, high: Array) -> list[Line]:
+    """The parts of a fold outside the pattern: 4 mm at either end, within the quiet zone."""
+    start, end = np.array(line.start), np.array(line.end)
+    along = (end - start) / np.linalg.norm(end - start)
+    parts = []
+    for place, way in ((start, -along), (end, along)):
+        parts.append(Line(_pair(place + 0.7 * way), _pair(place + (_QUIET - 0.5) * way), line.width, True))
+    return parts
+
+
+def _rulers(corner: Array, size: Array, width: float, height: float) -> tuple[list[Line], list[Text]]:
+    """A ruler below the pattern and one beside it, of whole centimetres, from 0."""
+    lines, texts = [], []
+    below = height - _EDGE - 4.0 - _RULER + 3.0
+    beside = _EDGE + 2.0
+    for axis, start in ((0, np.array([corner[0], below])), (1, np.array([beside, corner[1]]))):
+        length = _TICK * np.floor(min(_LONGEST, float(size[axis])) / _TICK)
+        along, across = np.eye(2)[axis], np.eye(2)[1 - axis]
+        lines.append(Line(_pair(start), _pair(start + length * along)))
+        for mark in np.arange(0.0, length + 1, _TICK):
+            tall = 2.5 if mark % (5 * _TICK) == 0 else 1.5
+            place = start + mark * along
+            lines.append(Line(_pair(place), _pair(place + tall * across)))
+            if mark % (5 * _TICK) == 0:
+                shift = np.array([0.0, 5.5]) if axis == 0 else np.array([3.2, 0.9])
+                last = axis == 0 and mark + 5 * _TICK > length
+                shown = f"{mark:.0f}{' mm' if last else ''}"
+                texts.append(Text(_pair(place + shift), shown, 2.5, middle=axis == 0))
+    return lines, texts
+
+
+def _caption(board: Board) -> str:
+    sizes = ", ".join(
+        f"{plane.name + ': ' if plane.name else ''}{plane.cols} x {plane.rows} inner vertices, square "
+        f"{plane.square:g} {board.unit}"
+        for plane in board.planes
+    )
+    return f"{sizes}. Print at 100 %, then measure the rulers."
+
+
+def _pair(point: Array) -> tuple[float, float]:
+    return float(point[0]), float(point[1])

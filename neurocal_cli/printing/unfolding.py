@@ -1,0 +1,205 @@
+"""Several planes of a board side by side on one sheet, joined at the lines along which it is folded.
+
+The printed side is the one that sees the other planes: the inside of a corner. The sheet's coordinates are x
+to the right and y downwards, in the board's unit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.board import Board, Plane
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = ["Fold", "Laid", "unfolded"]
+
+_SAME = 1e-6  # of a square: lengths below are rounding
+_FARTHEST = 3.0  # squares from a board to a fold; beyond, the planes do not belong on one sheet
+_REACH = 1.0  # squares of the pattern beyond the outer vertices, one whole
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """A plane on the sheet.
+
+    Attributes
+    ----------
+    plane : Plane
+    origin : (2,) array
+        Vertex (0, 0).
+    axes : (2, 2) array
+        Rows: x_axis and y_axis on the sheet, unit vectors.
+    reach : (2, 2) array [squares]
+        How far the pattern goes on beyond the outer vertices, ``[axis, low or high]``.
+    """
+
+    plane: Plane
+    origin: Array
+    axes: Array
+    reach: Array
+
+    def at(self, grid: Array) -> Array:
+        """Places on the sheet of grid coordinates (..., 2) [squares]."""
+        return np.asarray(self.origin + self.plane.square * np.asarray(grid, dtype=float) @ self.axes)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Grid coordinates of two opposite corners of the pattern [squares]."""
+        last = np.array([self.plane.cols - 1, self.plane.rows - 1], dtype=float)
+        return -self.reach[:, 0], last + self.reach[:, 1]
+
+    @property
+    def outline(self) -> Array:
+        """(4, 2) corners of the pattern on the sheet."""
+        low, high = self.bounds
+        return self.at(np.array([low, [high[0], low[1]], high, [low[0], high[1]]]))
+
+
+@dataclass(frozen=True, eq=False)
+class Fold:
+    """A line along which the sheet is folded, from end to end of the pattern; (2,) arrays."""
+
+    start: Array
+    end: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Map:
+    """Where points of a plane come to lie on the sheet, ``B X + b``; B (2, 3), b (2,)."""
+
+    B: Array
+    b: Array
+
+    def __call__(self, points: Array) -> Array:
+        return np.asarray(points @ self.B.T + self.b)
+
+
+def unfolded(board: Board) -> tuple[list[Laid], list[Fold]]:
+    """Lay the planes of a board flat.
+
+    Parameters
+    ----------
+    board : Board
+        Of one plane, or of planes that meet in lines beside them, as the faces of a corner.
+
+    Returns
+    -------
+    laid : list of Laid
+        In the order of the planes.
+    folds : list of Fold
+
+    Raises
+    ------
+    InputError
+        Planes that do not meet in such a line, or that would lie on each other on the sheet.
+    """
+    planes = board.planes
+    maps, folds = [_first_map(planes)], []
+    for k in range(1, len(planes)):
+        new, fold = _joined(planes[k], planes[:k], maps)
+        maps.append(new)
+        folds.append(fold)
+    laid = [_laid(plane, place, planes) for plane, place in zip(planes, maps, strict=True)]
+    _check_apart(laid)
+    return laid, folds
+
+
+def _first_map(planes: tuple[Plane, ...]) -> _Map:
+    """The first plane's x_axis is to the right, as one sees it from the printed side."""
+    plane = planes[0]
+    down = np.array(plane.y_axis)
+    if len(planes) > 1:
+        others = np.mean([_middle(other) for other in planes[1:]], axis=0)
+        if (others - _middle(plane)) @ plane.normal > 0:  # x, y and the way to the eye are right-handed
+            down = -down
+    B = np.array([plane.x_axis, down])
+    return _Map(B, -B @ np.array(plane.origin))
+
+
+def _joined(plane: Plane, before: tuple[Plane, ...], maps: list[_Map]) -> tuple[_Map, Fold]:
+    """A plane laid beside the first of those before it that it meets."""
+    for other, place in zip(before, maps, strict=True):
+        line = _meeting(plane, other)
+        if line is None:
+            continue
+        point, along = line
+        inward, opposite = (_across(p, point, along) for p in (plane, other))
+        B = np.outer(place.B @ along, along) - np.outer(place.B @ opposite, inward)
+        new = _Map(B, place(point) - B @ point)
+        marks = np.concatenate([p.at(_corners(p)) for p in (plane, other)])
+        lengths = (marks - point) @ along
+        ends = place(point + np.outer([lengths.min(), lengths.max()], along))
+        return new, Fold(ends[0], ends[1])
+    raise InputError(
+        f"the plane {plane.name!r} meets none of the planes before it in a line beside both; print it alone"
+    )
+
+
+def _middle(plane: Plane) -> Array:
+    return plane.at(np.array([plane.cols - 1, plane.rows - 1]) / 2)
+
+
+def _corners(plane: Plane) -> Array:
+    """Grid coordinates of the corners of the pattern, uncut."""
+    return np.array([[-1, -1], [plane.cols, -1], [plane.cols, plane.rows], [-1, plane.rows]], dtype=float)
+
+
+def _meeting(a: Plane, b: Plane) -> tuple[Array, Array] | None:
+    """A point and the direction of the line where two planes meet, if it is beside both boards."""
+    along = np.cross(a.normal, b.normal)
+    length = float(np.linalg.norm(along))
+    if length < _SAME:
+        return None
+    along = along / length
+    heights = [a.normal @ np.array(a.origin), b.normal @ np.array(b.origin), along @ _middle(a)]
+    point = np.linalg.solve(np.array([a.normal, b.normal, along]), np.array(heights))
+    for plane in (a, b):
+        across = (plane.vertices().reshape(-1, 3) - point) @ _across(plane, point, along)
+        if not -_SAME * plane.square <= across.min() <= _FARTHEST * plane.square:
+            return None
+    return point, along
+
+
+def _across(plane: Plane, point: Array, along: Array) -> Array:
+    """The direction in a plane, perpendicular to a line in it, that leads to the middle of the board."""
+    way = _middle(plane) - point
+    way = way - (way @ along) * along
+    length = float(np.linalg.norm(way))
+    return np.asarray(way / length) if length > 0 else way
+
+
+def _laid(plane: Plane, place: _Map, planes: tuple[Plane, ...]) -> Laid:
+    """A plane on the sheet, its pattern cut off at the lines where other planes meet it."""
+    reach = np.full((2, 2), _REACH)
+    for other in planes:
+        line = None if other is plane else _meeting(plane, other)
+        if line is None:
+            continue
+        point, along = line
+        inward = _across(plane, point, along)
+        slopes = np.array([plane.x_axis, plane.y_axis]) @ inward
+        axis = int(np.argmax(np.abs(slopes)))
+        if abs(slopes[axis]) < 1 - _SAME:
+            raise InputError(
+                f"the fold at {plane.name!r} is not along its rows or columns; turn the plane's axes"
+            )
+        room = ((plane.vertices().reshape(-1, 3) - point) @ inward).min() / plane.square
+        side = 0 if slopes[axis] > 0 else 1
+        reach[axis, side] = min(reach[axis, side], room)
+    axes = np.array([plane.x_axis, plane.y_axis]) @ place.B.T
+    return Laid(plane, place(np.array(plane.origin)), axes, reach)
+
+
+def _check_apart(laid: list[Laid]) -> None:
+    boxes = [(one.outline.min(axis=0), one.outline.max(axis=0)) for one in laid]
+    for k, (low, high) in enumerate(boxes):
+        for n in range(k):
+            gap = np.maximum(low - boxes[n][1], boxes[n][0] - high)
+            if (gap < -_SAME * laid[k].plane.square).all():
+                raise InputError(
+                    f"the planes {laid[n].plane.name!r} and {laid[k].plane.name!r} would lie on each other "
+                    "on the sheet; print them one by one"
+                )

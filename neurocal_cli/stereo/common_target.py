@@ -1,0 +1,77 @@
+"""The target that both cameras of a rig saw, found with both of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.errors import NeurocalError
+from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
+from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
+
+__all__ = ["common_target"]
+
+
+def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
+    """Find the target from all views of several cameras.
+
+    Parameters
+    ----------
+    cameras : sequence of Calibration
+        Of one world unit. Where one holds a target already, all hold the same, and the search begins there.
+    choice : {"auto", "given", "flat", "free"}
+
+    Returns
+    -------
+    Target or None
+        None where it stays as given.
+    """
+    if choice == "given" or any(camera.straight_lines is not None for camera in cameras):
+        return None
+    known = cameras[0].target
+    given, label, point = distinct_points([camera.points for camera in cameras])
+    plane = planes_of(given, point) if known is None else known.plane
+    if not enough_views(label, sum(len(camera.views) for camera in cameras), int(plane.max()) + 1):
+        return None
+    try:
+        fits = [_fit(camera) for camera in cameras]
+    except NeurocalError:
+        return None
+    chosen = known is None and all(camera.lens_choice for camera in cameras)
+    found = (find_lens_and_target if chosen else find_target)(fits, choice == "flat", known)
+    if found is None or (choice == "auto" and found.target.evidence < LEAST_GAIN):
+        return None
+    return found.target
+
+
+def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
+    """A calibration as the problem that it solves, at its minimum."""
+    camera, given = calibration.camera, calibration.intrinsics
+    centre = (given.u0, given.v0) if calibration.type == 2 else None
+    problem = problem_for(
+        calibration.points,
+        calibration.type,
+        image_center=centre,
+        intrinsics=given if calibration.type == 3 else None,
+        skew="theta" not in calibration.fixed or calibration.type == 3,
+        distortion=camera.distortion,
+    ).with_seen_pixels()
+    views = [calibration.views[name] for name in problem.views.names]
+    state = CameraState(
+        np.array([camera.entries]),
+        np.stack([view.pose.R for view in views]),
+        np.stack([view.pose.t for view in views]),
+        camera.distortion.model,
+        camera.distortion.coefficients,
+    )
+    fixed = problem.fixed | frozenset(calibration.fixed)
+    problem = replace(problem, fixed=fixed)
+    return problem, problem.adjust(normalised(state, problem.views))

@@ -1,0 +1,150 @@
+"""What the two rectified cameras of a rig see: the cameras, points moved to them, and how well rows agree."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.distortion.undistortion import map_points
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+from neurocal_cli.stereo.pairing import pair_points, pair_views
+from neurocal_cli.stereo.rectification import Rectification, rectify
+from neurocal_cli.stereo.rig import Rig
+
+__all__ = [
+    "RectifiedPair",
+    "RowError",
+    "rectified_pair",
+    "rectify_points",
+    "row_error",
+    "row_error_of_rig",
+]
+
+_ACROSS = 0.7  # least cosine of a measured direction to the one across the rows, 45 degrees
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedPair:
+    """The rectified cameras of a rig.
+
+    Attributes
+    ----------
+    matrices : Rectification
+    originals, cameras : two of Camera
+        As they are, and without distortion in the frames of R1 and R2.
+    rotations : two of (3, 3) array
+        From each camera's frame to that of its rectified one.
+    axis : int
+        0: the cameras stand beside each other, and rows correspond; 1: above each other, and columns do.
+    """
+
+    matrices: Rectification
+    originals: tuple[Camera, Camera]
+    cameras: tuple[Camera, Camera]
+    rotations: tuple[Array, Array]
+    axis: int
+
+
+@dataclass(frozen=True)
+class RowError:
+    """By how much corresponding points miss each other's row, or column [px]."""
+
+    rms_px: float
+    max_px: float
+    n_points: int
+
+
+def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
+    """Rectify the cameras of a rig.
+
+    Parameters
+    ----------
+    rig : Rig
+    alpha : float, optional
+        See `rectification.rectify`.
+
+    Raises
+    ------
+    InputError
+        Images of unknown or of different sizes.
+    """
+    matrices = rectify(rig, alpha)
+    if matrices is None:
+        raise InputError(
+            "both cameras must have images of one known size to be rectified; put image_width and "
+            "image_height into the rig's file"
+        )
+    originals = rig.left.camera, rig.right.camera
+    cameras = [
+        Camera(Intrinsics.from_matrix(P[:, :3]), Distortion(), camera.image_size, camera.name)
+        for camera, P in zip(originals, (matrices.P1, matrices.P2), strict=True)
+    ]
+    axis = 0 if matrices.P2[0, 3] != 0 else 1
+    return RectifiedPair(matrices, originals, (cameras[0], cameras[1]), (matrices.R1, matrices.R2), axis)
+
+
+def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> Correspondences:
+    """Points of one camera, 0 left or 1 right, where its rectified camera sees them.
+
+    Raises
+    ------
+    InputError
+        Another image size; a pixel that the distortion does not reach.
+    """
+    size = pair.cameras[side].image_size
+    if points.image_size not in (None, size):
+        raise InputError(
+            f"{points.source}: the image_size is {points.image_size}, but the camera's is {size}; give the "
+            "points of this camera"
+        )
+    moved = map_points(points, pair.originals[side], pair.cameras[side], pair.rotations[side])
+    return replace(moved, image_size=size)
+
+
+def row_error(pair: RectifiedPair, left: Correspondences, right: Correspondences) -> RowError:
+    """Distance of the rows (columns, for cameras above each other) of the same points, rectified.
+
+    Parameters
+    ----------
+    pair : RectifiedPair
+    left, right : Correspondences
+        As `rectify_points` returns them. Mid-points that were measured in one direction only are left out
+        where that is along the row.
+
+    Raises
+    ------
+    InputError
+        No point is in both.
+    """
+    common = pair_points(left, right, pair_views(left.view_names, right.view_names))
+    across = 1 - pair.axis
+    difference = left.pixels[common.left, across] - right.pixels[common.right, across]
+    kept = np.ones(len(difference), dtype=bool)
+    for points, rows in ((left, common.left), (right, common.right)):
+        if points.across is not None:
+            n = points.across[rows]
+            kept &= ~n.any(axis=1) | (np.abs(n[:, across]) > _ACROSS)
+    if kept.any():
+        difference = difference[kept]
+    return RowError(float(np.sqrt(np.mean(difference**2))), float(np.abs(difference).max()), len(difference))
+
+
+def row_error_of_rig(rig: Rig, pair: RectifiedPair) -> RowError | None:
+    """Distance of the rows of the points from which the rig was found; None where it has none.
+
+    Of the pairs of views that determine the rig.
+    """
+    if not rig.pairs or not len(rig.left.points) or not len(rig.right.points):
+        return None
+    moved = []
+    for side, points in enumerate((rig.left.points, rig.right.points)):
+        names = np.array([names[side] for names in rig.pairs])
+        own = np.isin(np.array(points.view_names)[points.view_index], names)
+        moved.append(rectify_points(pair, side, points.select(own)))
+    return row_error(pair, moved[0], moved[1])

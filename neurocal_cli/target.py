@@ -1,0 +1,190 @@
+"""The target as a calibration found it: where its points really are, beside where the file has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.board import Board, Plane
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+
+__all__ = ["TARGETS", "Target", "board_of", "distinct_points", "is_flat", "planes_of"]
+
+TARGETS = ("auto", "given", "flat", "free")
+
+_DIGITS = 9  # of a coordinate over the target's size: the same point is written alike in all views
+_THIN = 1e-6  # of the size: a plane up to rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """Points of a target, given and found.
+
+    What no photograph tells is kept from the given points: the found ones are turned, moved and scaled as a
+    whole so that they are nearest to them.
+
+    Attributes
+    ----------
+    given, found : (n, 3) array [world unit]
+    std : (n, 3) array [world unit]
+        Standard deviations of the found ones, along the world's axes.
+    plane : (n,) int array
+        Which of the target's planes each point belongs to.
+    sizes : dict of float [world unit]
+        Prior standard deviation of each part of the offsets, as the data tell it; see `target_shape.prior`.
+    flat : bool
+        Whether points were left in their plane.
+    evidence : float
+        By how much the found target raises the logarithm of the evidence.
+    point : (n,) labels, optional
+        Ids.
+    """
+
+    given: Array
+    found: Array
+    std: Array
+    plane: NDArray[np.intp]
+    sizes: Mapping[str, float]
+    flat: bool
+    evidence: float
+    point: NDArray[np.str_] | None = None
+
+    @property
+    def offsets(self) -> Array:
+        """(n, 3) found less given [world unit]."""
+        return self.found - self.given
+
+    def places(self, world: Array) -> NDArray[np.intp]:
+        """(N,) which of the target's points some world points are, by their given coordinates; -1: none."""
+        return _places(self.given, world)
+
+    def rows_of(self, world: Array) -> NDArray[np.intp]:
+        """The same by the coordinates that were found."""
+        return _places(self.found, world)
+
+    def applied(self, points: Correspondences) -> Correspondences:
+        """Points with the coordinates that were found, where they are points of this target."""
+        place = self.places(points.world)
+        world = np.where((place >= 0)[:, None], self.found[place], points.world)
+        return points if (place < 0).all() else replace(points, world=world)
+
+    def bend(self) -> float:
+        """Most by which a plane's points lie above and below their mean plane, together [world unit]."""
+        worst = 0.0
+        for plane in range(int(self.plane.max()) + 1):
+            local, _ = _in_plane(self.found[self.plane == plane], self.given[self.plane == plane])
+            rows = np.column_stack([np.ones(len(local)), local[:, :2]])
+            height = local[:, 2] - rows @ np.linalg.lstsq(rows, local[:, 2], rcond=None)[0]
+            worst = max(worst, float(np.ptp(height)))
+        return worst
+
+    def stretch(self) -> float:
+        """By which share the most stretched plane is longer along one direction than across it."""
+        worst = 0.0
+        for plane in range(int(self.plane.max()) + 1):
+            found, given = _in_plane(self.found[self.plane == plane], self.given[self.plane == plane])
+            rows = np.column_stack([np.ones(len(given)), given[:, :2]])
+            linear = np.linalg.lstsq(rows, found[:, :2], rcond=None)[0][1:]
+            along, across = np.linalg.svd(linear, compute_uv=False)
+            worst = max(worst, float(along / across - 1))
+        return worst
+
+
+def board_of(target: Target, unit: str) -> Board:
+    """The chessboard that a target is, with its points as they were found.
+
+    Raises
+    ------
+    InputError
+        The points have no ids of a chessboard.
+    """
+    if target.point is None:
+        raise InputError(
+            "the points have no ids, so they are no board's; calibrate from points that detect found"
+        )
+    planes: dict[str, list[tuple[tuple[float, float], Array, Array]]] = {}
+    for label, given, found in zip(target.point.tolist(), target.given, target.found, strict=True):
+        name, place = _place(str(label))
+        planes.setdefault(name, []).append((place, given, found))
+    return Board(tuple(_plane(name, rows) for name, rows in planes.items()), unit)
+
+
+def _place(label: str) -> tuple[str, tuple[float, float]]:
+    """Plane and grid place of an id ``[plane/]c:r``, ``[plane/]h:c:r`` or ``[plane/]v:c:r``."""
+    name, _, place = label.rpartition("/")
+    *kind, c, r = place.split(":") if place.count(":") in (1, 2) else ("?", "", "")
+    half = {(): (0.0, 0.0), ("h",): (0.5, 0.0), ("v",): (0.0, 0.5)}.get(tuple(kind))
+    if half is None or not (c.isdecimal() and r.isdecimal()):
+        raise InputError(f"the point {label!r} has no id of a chessboard; calibrate from points of detect")
+    return name, (int(c) + half[0], int(r) + half[1])
+
+
+def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> Plane:
+    grid = np.array([place for place, _, _ in rows])
+    given, found = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
+    unknowns = np.linalg.lstsq(np.column_stack([np.ones(len(grid)), grid]), given, rcond=None)[0]
+    square = float(np.linalg.norm(unknowns[1]))
+    x_axis, y_axis = unknowns[1:] / np.linalg.norm(unknowns[1:], axis=1)[:, None]
+    cols, rows_ = (np.ceil(grid.max(axis=0)) + 1).astype(int).tolist()
+    origin, x, y = (tuple((np.round(v, _DIGITS) + 0.0).tolist()) for v in (unknowns[0], x_axis, y_axis))
+    measured = tuple(map(tuple, np.column_stack([grid, found]).tolist()))
+    return Plane(name, cols, rows_, round(square, _DIGITS), origin, x, y, measured)
+
+
+def distinct_points(
+    some: Sequence[Correspondences],
+) -> tuple[Array, NDArray[np.intp], NDArray[np.str_] | None]:
+    """The different world points (n, 3), which of them each row is (N,), and their ids, if all have one."""
+    world = np.concatenate([points.world for points in some])
+    _, first, label = np.unique(_whole(world, _scale(world)), axis=0, return_index=True, return_inverse=True)
+    ids = None
+    if all(points.point is not None for points in some):
+        ids = np.concatenate([np.asarray(points.point).astype(str) for points in some])[first]
+    return world[first], label.ravel(), ids
+
+
+def planes_of(given: Array, point: NDArray[np.str_] | None) -> NDArray[np.intp]:
+    """Plane of each point: what its id says before a slash, else all are of one."""
+    one = np.zeros(len(given), dtype=np.intp)
+    if point is None or not np.char.count(point, "/").astype(bool).all():
+        return one
+    names = np.array([str(label).split("/")[0] for label in point])
+    planes = np.unique(names, return_inverse=True)[1].ravel()
+    some = [given[planes == k] for k in range(int(planes.max()) + 1)]
+    return planes if all(len(part) > 3 and is_flat(part) for part in some) else one
+
+
+def is_flat(given: Array) -> bool:
+    """Whether points lie in one plane, up to rounding."""
+    extent = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
+    return bool(extent[-1] < _THIN * extent[0])
+
+
+def _in_plane(found: Array, given: Array) -> tuple[Array, Array]:
+    """Both around their centres, along the principal axes of the given ones."""
+    centred = given - given.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2].T
+    return (found - found.mean(axis=0)) @ axes, centred @ axes
+
+
+def _places(known: Array, world: Array) -> NDArray[np.intp]:
+    both = _whole(np.concatenate([known, world]), _scale(known))
+    label = np.unique(both, axis=0, return_inverse=True)[1].ravel()
+    place = np.full(int(label.max()) + 1, -1, dtype=np.intp)
+    place[label[: len(known)]] = np.arange(len(known))
+    return place[label[len(known) :]]
+
+
+def _scale(world: Array) -> float:
+    """The last digit that tells points apart [world unit]."""
+    size = float(np.ptp(world, axis=0).max()) if len(world) else 1.0
+    return float(10.0 ** (np.ceil(np.log10(size)) - _DIGITS)) if size > 0 else 1.0
+
+
+def _whole(world: Array, scale: float) -> NDArray[np.float64]:
+    return np.round(world / scale)

@@ -1,0 +1,180 @@
+"""The target found together with the cameras: linearise, solve for the offsets, move, until nothing moves.
+
+Each step solves for cameras, poses and offsets at once (`posterior`); then the cameras and poses go to
+their minimum for the target as it is then believed to be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
+from neurocal_cli.geometry import Array, nearest_similarity
+from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.target_shape.information import Information, Sight, information_of
+from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, posterior
+from neurocal_cli.target_shape.prior import prior_of
+
+__all__ = ["LEAST_GAIN", "Found", "enough_views", "find_target"]
+
+_STEPS = 10
+_SETTLED = 0.02  # of the cameras' standard deviations
+_LARGEST = 0.02  # of the target's size: more is no target that happens to be bent
+_STRETCHED = 0.01  # prints are by a few thousandths; more is a square of another size along one side
+_FEWEST, _FEWEST_OF_FOLDED = 3, 2  # different views of most points
+LEAST_GAIN = 10.0
+"""Of the logarithm of the evidence, for a target to be found unasked: sizes for four parts, each at a level
+of one in a hundred. tests/test_target_shape.py (slow) holds that clean sets keep the given target."""
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A target, and the problems with their minima for it.
+
+    Attributes
+    ----------
+    target : Target
+    fits : tuple of (Problem, Adjusted)
+        Each problem's points are where the target has them.
+    evidence : float
+        Its logarithm, for cameras of any lens.
+    """
+
+    target: Target
+    fits: tuple[tuple[Problem, Adjusted], ...]
+    evidence: float
+
+
+def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -> bool:
+    """Whether the points are seen often enough, from different sides, for a target to be found.
+
+    Two views tell how the planes of a folded target stand; the bend of one plane takes three.
+    """
+    least = _FEWEST if n_planes == 1 else _FEWEST_OF_FOLDED
+    return n_different >= least and bool(np.median(np.bincount(label)) >= least)
+
+
+def find_target(
+    fits: Sequence[tuple[Problem, Adjusted]], flat: bool = False, known: Target | None = None
+) -> Found | None:
+    """Find where the points of a target really are.
+
+    Parameters
+    ----------
+    fits : sequence of (Problem, Adjusted)
+        Cameras that saw the target, each at its minimum. Points with the same coordinates are the same.
+    flat : bool
+        Whether the points stay in their planes.
+    known : Target, optional
+        Where the points of the fits are already, and where to begin.
+
+    Returns
+    -------
+    Found or None
+        None where the points do not determine a target, or ask for one that is no print of the given one.
+    """
+    search = _Search(fits, flat, known)
+    try:
+        with np.errstate(all="ignore"):
+            return search.run()
+    except np.linalg.LinAlgError:
+        return None
+
+
+class _Search:
+    """The fits as they move."""
+
+    def __init__(self, fits: Sequence[tuple[Problem, Adjusted]], flat: bool, known: Target | None) -> None:
+        self.fits, self.flat = list(fits), flat
+        worlds = [problem.points.world for problem, _ in fits]
+        if known is None:
+            self.given, label, self.ids = distinct_points([problem.points for problem, _ in fits])
+            self.plane = planes_of(self.given, self.ids)
+            self.sizes = None
+        else:
+            self.given, self.ids, self.plane = known.given, known.point, known.plane
+            label = known.rows_of(np.concatenate(worlds))
+            self.sizes = dict(known.sizes)
+        self.label = np.split(label, np.cumsum([len(world) for world in worlds])[:-1])
+        self.prior = prior_of(self.given, self.plane)
+        found = np.zeros_like(self.given) if known is None else known.offsets
+        self.offsets = self.prior.along_axes(found)
+
+    def run(self) -> Found | None:
+        for _ in range(_STEPS):
+            info = self._information().around_given(self.offsets)
+            found = posterior(info, self.prior, self.sizes, self.flat)
+            std = np.sqrt(found.variance * np.diagonal(found.camera))
+            settled = bool((np.abs(found.camera_step) < _SETTLED * std).all())
+            if not self._move(found):
+                return None
+            if settled:
+                break
+        gain = found.evidence - evidence_of_given(info)
+        self._align()
+        target = self._target(found, gain)
+        return Found(target, tuple(self.fits), found.evidence) if target.stretch() < _STRETCHED else None
+
+    def _information(self) -> Information:
+        sights = [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
+        return information_of(sights, len(self.given)).turned(self.prior.axes)
+
+    def _move(self, found: Posterior) -> bool:
+        if not np.abs(found.offsets).max() < _LARGEST * self.prior.size:
+            return False
+        self.offsets, self.sizes = found.offsets, found.sizes
+        world = self.given + self.prior.in_world(self.offsets)
+        self.fits = [
+            _at(*fit, in_pixels(fit[0], fit[1].state), world[label])
+            for fit, label in zip(self.fits, self.label, strict=True)
+        ]
+        return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
+
+    def _align(self) -> None:
+        """Turn, shift and scale the target to be nearest to the given one; no pixel sees that."""
+        if not all(problem.free_poses for problem, _ in self.fits):
+            return
+        world = self.given + self.prior.in_world(self.offsets)
+        s, R, t = nearest_similarity(world, self.given)
+        world = s * world @ R.T + t
+        self.offsets = self.prior.along_axes(world - self.given)
+        for k, label in enumerate(self.label):
+            problem, adjusted = self.fits[k]
+            state = in_pixels(problem, adjusted.state)
+            turned = state.R @ R.T
+            state = replace(state, R=turned, t=s * state.t - turned @ t)
+            self.fits[k] = _at(problem, adjusted, state, world[label])
+
+    def _target(self, found: Posterior, gain: float) -> Target:
+        axes = self.prior.axes
+        variance = np.einsum("nij,nj->ni", axes**2, found.std**2)
+        return Target(
+            self.given,
+            self.given + self.prior.in_world(self.offsets),
+            np.sqrt(variance),
+            self.plane,
+            found.sizes,
+            self.flat,
+            gain,
+            self.ids,
+        )
+
+
+def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> Sight:
+    """What a fit's camera saw; label (N,) in the order of its points."""
+    views = problem.views
+    ordered = label if views.order is None else label[views.order]
+    return Sight(views, adjusted.state, problem.free_camera, problem.free_poses, ordered)
+
+
+def _at(problem: Problem, adjusted: Adjusted, state: CameraState, world: Array) -> tuple[Problem, Adjusted]:
+    """A camera with its views for other places of the points: the minimum near a state in pixels."""
+    new = replace(problem.with_points(replace(problem.points, world=world)), restraint=problem.restraint)
+    return new, new.adjust(replace(adjusted, state=normalised(state, new.views)))

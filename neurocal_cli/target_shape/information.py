@@ -1,0 +1,235 @@
+"""What the pixels tell of cameras, poses and the points of the target, all at once.
+
+Every point of the target may be off its given place by d, the same in all views. Around a state, the
+squared error is a quadratic in the cameras' free parameters c, the poses q and the offsets d. Poses meet
+each other only in c and d, and points meet each other only in c and q: both kinds are blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+
+__all__ = ["Information", "Sight", "by_world", "information_of", "labelled", "point_terms"]
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """What one camera saw of the target.
+
+    Attributes
+    ----------
+    views : Views
+        With the target as it is believed to be.
+    state : CameraState
+        At the minimum for that.
+    free : (5 + K,) bool array
+    free_poses : bool
+    label : (N,) int array
+        The target's point in each row, in the order of `views`.
+    """
+
+    views: Views
+    state: CameraState
+    free: NDArray[np.bool_]
+    free_poses: bool
+    label: NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """Sums of products of derivatives and residuals [px], by blocks.
+
+    Attributes
+    ----------
+    camera, camera_right : (f, f), (f,) array
+        Of the free parameters of all cameras, one after the other, in each one's normalised units.
+    pose, pose_camera, pose_right : (P, 6, 6), (P, 6, f), (P, 6) array
+    point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
+        Offsets in the world's axes and unit.
+    pose_point : (P, 6, n, 3) array
+    cost : float
+        Sum of squares.
+    equations : float
+    """
+
+    camera: Array
+    camera_right: Array
+    pose: Array
+    pose_camera: Array
+    pose_right: Array
+    point: Array
+    point_camera: Array
+    point_right: Array
+    pose_point: Array
+    cost: float
+    equations: float
+
+    def turned(self, axes: Array) -> Information:
+        """With each point's offset along its own axes, the columns of (n, 3, 3)."""
+        transposed = np.swapaxes(axes, 1, 2)
+        return replace(
+            self,
+            point=transposed @ self.point @ axes,
+            point_camera=transposed @ self.point_camera,
+            point_right=(transposed @ self.point_right[..., None])[..., 0],
+            pose_point=np.einsum("pqni,nij->pqnj", self.pose_point, axes),
+        )
+
+    def around_given(self, offsets: Array) -> Information:
+        """The same quadratic in the whole offsets (n, 3), not in what they change by."""
+        by_point = (self.point @ offsets[..., None])[..., 0]
+        return replace(
+            self,
+            camera_right=self.camera_right + np.einsum("nif,ni->f", self.point_camera, offsets),
+            pose_right=self.pose_right + np.einsum("pqni,ni->pq", self.pose_point, offsets),
+            point_right=self.point_right + by_point,
+            cost=self.cost + float((offsets * (2 * self.point_right + by_point)).sum()),
+        )
+
+
+def information_of(sights: Sequence[Sight], n_points: int) -> Information:
+    """Sum over all that was seen of one target; each camera has its own free parameters and poses."""
+    widths = [int(sight.free.sum()) for sight in sights]
+    poses = [sight.views.n_views if sight.free_poses else 0 for sight in sights]
+    f, P = sum(widths), sum(poses)
+    found = Information(
+        np.zeros((f, f)), np.zeros(f), np.zeros((P, 6, 6)), np.zeros((P, 6, f)), np.zeros((P, 6)),
+        np.zeros((n_points, 3, 3)), np.zeros((n_points, 3, f)), np.zeros((n_points, 3)),
+        np.zeros((P, 6, n_points, 3)), 0.0, sum(sight.views.n_equations for sight in sights),
+    )  # fmt: skip
+    cost = 0.0
+    ends = zip(np.cumsum(widths).tolist(), np.cumsum(poses).tolist(), strict=True)
+    for sight, width, count, (end, last) in zip(sights, widths, poses, ends, strict=True):
+        cost += _add(found, sight, slice(end - width, end), slice(last - count, last))
+    return replace(found, cost=cost)
+
+
+def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
+    """Add what one camera saw; its cost."""
+    views = sight.views
+    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
+    label = labelled(views, sight.label)
+    terms = point_terms(views.batches, sight.state, views.scale, label, columns, len(found.point))
+    normal, px2 = terms.normal, views.pixel_scale**2
+    found.camera[own, own] += px2 * normal[:, columns[:, None], columns].sum(axis=0)
+    found.camera_right[own] += px2 * normal[:, columns, -1].sum(axis=0)
+    found.point[...] += px2 * terms.point
+    found.point_camera[:, :, own] += px2 * terms.point_camera
+    found.point_right[...] += px2 * terms.point_right
+    if sight.free_poses:
+        found.pose[poses] = px2 * normal[:, POSE, POSE]
+        found.pose_camera[poses, :, own] = px2 * normal[:, POSE, columns]
+        found.pose_right[poses] = px2 * normal[:, POSE, -1]
+        found.pose_point[poses] = px2 * terms.pose_point
+    return px2 * float(normal[:, -1, -1].sum())
+
+
+@dataclass(frozen=True, eq=False)
+class PointTerms:
+    """Sums of products with the derivatives by the points of the target, of one camera, normalised.
+
+    Attributes
+    ----------
+    normal : (V, 12 + K, 12 + K) array
+        As from `normal_blocks`.
+    point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
+        Points in the world's axes and unit.
+    pose_point : (V, 6, n, 3) array
+    """
+
+    normal: Array
+    point: Array
+    point_camera: Array
+    point_right: Array
+    pose_point: Array
+
+
+def point_terms(
+    batches: PointBatches,
+    state: CameraState,
+    scale: Array,
+    label: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    n_points: int,
+) -> PointTerms:
+    """Sum up what one camera saw of the points.
+
+    Parameters
+    ----------
+    batches : PointBatches
+    state : CameraState
+    scale : (V,) array
+        S2 of each view [world unit].
+    label : (T, n) int array
+        The target's point in each place of the batches, -1: none.
+    columns : (f,) int array
+        Of the camera's parameters that count.
+    n_points : int
+        Points of the target.
+    """
+    width, n, f, V = 12 + len(state.k), batches.local.shape[2], len(columns), batches.n_views
+    used = np.concatenate([columns, np.arange(POSE.start, POSE.stop), [-1]])
+    by_batch = np.empty((len(batches.view), width, width))
+    point = np.empty((len(batches.view), n, 3, f + 10))
+    buffer = batches.memory(width)
+    for chunk in batches.chunks():
+        view = batches.view[chunk]
+        part = buffer[: len(view)]
+        derivatives(batches, chunk, state, part)
+        J = part.reshape(len(view), width, 2 * n)
+        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
+        by_point = by_world(part, state, scale, view)
+        rows = np.concatenate([by_point, part[:, used]], axis=1)
+        np.matmul(np.moveaxis(by_point, 3, 1), np.moveaxis(rows, 3, 1).swapaxes(2, 3), out=point[chunk])
+    view = np.broadcast_to(batches.view[:, None], label.shape)
+    real = label >= 0
+    flat, point = label[real], point[real]
+    summed = _summed_by(flat, point.reshape(len(flat), -1), n_points).reshape(-1, 3, f + 10)
+    cross = np.zeros((V * n_points, 6, 3))
+    np.add.at(cross, view[real] * n_points + flat, np.swapaxes(point[:, :, 3 + f : -1], 1, 2))
+    return PointTerms(
+        batches.sum_by_view(by_batch),
+        summed[:, :, :3],
+        summed[:, :, 3 : 3 + f],
+        summed[:, :, -1],
+        np.swapaxes(cross.reshape(V, n_points, 6, 3), 1, 2),
+    )
+
+
+def by_world(part: Array, state: CameraState, scale: Array, view: NDArray[np.intp]) -> Array:
+    """(T, 3, 2, n) derivatives by the world's coordinates, from those of `derivatives`.
+
+    d Xc = R dM / S2, and the derivative by tau is that by the point in front of the camera.
+    """
+    turn = np.swapaxes(state.R[view] / scale[view][:, None, None], 1, 2)
+    by_tau = part[:, POSE.start + 3 : POSE.stop]
+    return np.asarray((turn @ by_tau.reshape(len(view), 3, -1)).reshape(by_tau.shape))
+
+
+def labelled(views: Views, label: NDArray[np.intp]) -> NDArray[np.intp]:
+    """(T, n) the target's point in each place of the batches, -1 in places that only fill."""
+    numbers = np.column_stack([label, label]).astype(float)
+    laid = batches_of(views.local, numbers, None, views.index, views.n_views)
+    found = np.rint(laid.pixels[:, 0]).astype(np.intp)
+    if laid.whitening is not None:
+        found[laid.whitening[:, 0] == 0] = -1
+    return found
+
+
+def _summed_by(label: NDArray[np.intp], rows: Array, n: int) -> Array:
+    """(n, m) sums of the rows (N, m) with the same label."""
+    order = np.argsort(label, kind="stable")
+    ordered = label[order]
+    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    out = np.zeros((n, rows.shape[1]))
+    out[ordered[first]] = np.add.reduceat(rows[order], first, axis=0)
+    return out

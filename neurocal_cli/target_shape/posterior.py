@@ -1,0 +1,402 @@
+"""Offsets of the target's points from the pixels and the prior, and the prior's sizes from the evidence.
+
+With the noise's variance as the unit, the squared error and the prior make one quadratic
+
+    E = |r|^2 + sum_g lambda_g |w_g|^2,    lambda_g = sigma^2 / size_g^2,
+
+over the cameras, the poses and the parts w of the offsets. Whichever of poses and points has more unknowns
+is eliminated first, block by block; what is left is dense, so the cost grows linearly with views (or with
+points). MacKay's (1992) steps find the sizes: of the n_g coefficients of a part, the data determine
+
+    gamma_g = n_g - lambda_g tr (H^-1)_gg,    lambda_g <- gamma_g sigma^2 / |w_g|^2.
+
+The evidence, with the noise's variance marginalised too, tells whether there are offsets at all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.target_shape.information import Information
+from neurocal_cli.target_shape.prior import Prior
+
+__all__ = ["Posterior", "evidence_of_given", "known_sizes", "posterior"]
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The most probable offsets, and what is known of the rest.
+
+    Attributes
+    ----------
+    offsets : (n, 3) array [world unit]
+        Along each point's axes.
+    variance : float
+        Of the noise [px^2].
+    camera_step : (f,) array
+        Of the cameras' free parameters.
+    camera : (f, f) array
+        Their covariance in units of the noise's variance; that the offsets are uncertain is in it.
+    followed : (f, n, 3) array
+        S_cd S_dd^-1: how the cameras' scores follow those of the offsets.
+    std : (n, 3) array [world unit]
+        Of the offsets, along each point's axes.
+    sizes : dict of float by name [world unit]
+    determined : float
+        How many of the offsets' unknowns the data determine.
+    evidence : float
+        Its logarithm; a priori every value of a camera's normalised parameters is as likely as any.
+    """
+
+    offsets: Array
+    variance: float
+    camera_step: Array
+    camera: Array
+    followed: Array
+    std: Array
+    sizes: dict[str, float]
+    determined: float
+    evidence: float
+
+
+_SINGLE = {"place": [0, 1], "height": [2]}  # axes of a point by itself
+_OUT_OF_PLANE = ("bend", "height")
+_START = {
+    "fold": 3e-3,
+    "bend": 3e-3,
+    "stretch": 1e-3,
+    "warp": 5e-4,
+    "place": 3e-4,
+    "height": 3e-4,
+}  # of the target's size
+# Two coefficients tell no size, and a skew of the image axes looks like a shear of the target: prints are
+# stretched by a few thousandths.
+_MOST = {"stretch": 2e-3}
+_NOTHING = 1e-7  # of its size
+_SETTLED = 0.03  # relative change of the sizes
+_NO_GAIN = 0.02  # of the logarithm of the evidence
+_HALVINGS = 6
+_PASSES = 40
+
+
+def evidence_of_given(info: Information) -> float:
+    """Logarithm of the evidence of the target as it is given."""
+    spare = info.equations - len(info.camera) - 6 * len(info.pose)
+    if len(info.pose):
+        root = np.linalg.inv(np.linalg.cholesky(info.pose))
+        rows = root @ np.concatenate([info.pose_camera, info.pose_right[..., None]], axis=2)
+        logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        flat = rows.reshape(-1, rows.shape[2])
+    else:
+        flat, logdet = np.zeros((0, len(info.camera) + 1)), 0.0
+    S = info.camera - flat[:, :-1].T @ flat[:, :-1]
+    g = info.camera_right - flat[:, :-1].T @ flat[:, -1]
+    step = np.linalg.solve(S, g) if len(g) else g
+    logdet += float(np.linalg.slogdet(S)[1]) if len(g) else 0.0
+    cost = info.cost - float(flat[:, -1] @ flat[:, -1]) - float(g @ step)
+    return _log_evidence(spare, cost, logdet)
+
+
+def _log_evidence(spare: float, cost: float, logdet: float) -> float:
+    """Of a quadratic with this minimum and determinant; a priori the noise has a variance as 1 / sigma^2."""
+    return math.lgamma(0.5 * spare) - 0.5 * spare * math.log(math.pi * cost) - 0.5 * logdet
+
+
+class _System:
+    """The quadratic with its parts: what does not depend on the sizes is computed once."""
+
+    def __init__(self, info: Information, prior: Prior) -> None:
+        self.info, self.prior = info, prior
+        self.n, self.P = len(info.point), len(info.pose)
+        self.f, self.m = len(info.camera), prior.basis.shape[2]
+        basis = prior.basis
+        by_basis = info.point @ basis  # (n, 3, m)
+        across = np.einsum("nif,nim->fm", info.point_camera, basis)
+        inner = np.einsum("nim,nik->mk", basis, by_basis)
+        self.shared = np.block([[info.camera, across], [across.T, inner]])
+        self.right = np.concatenate([info.camera_right, np.einsum("nim,ni->m", basis, info.point_right)])
+        self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
+        pose_basis = info.pose_point.reshape(self.P * 6, 3 * self.n) @ basis.reshape(3 * self.n, self.m)
+        self.pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, 6, self.m)], axis=2)
+        self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
+        self.points_first = 3 * self.n >= 6 * self.P
+        if not self.points_first:
+            self._eliminate_poses()
+
+    @property
+    def s(self) -> int:
+        return self.f + self.m
+
+    def _eliminate_poses(self) -> None:
+        info, s = self.info, self.s
+        root = np.linalg.inv(np.linalg.cholesky(info.pose))
+        columns = [self.pose_shared, info.pose_point.reshape(self.P, 6, -1), info.pose_right[..., None]]
+        rows = root @ np.concatenate(columns, axis=2)
+        flat = rows.reshape(6 * self.P, -1)
+        dim = s + 3 * self.n
+        M = np.zeros((dim + 1, dim + 1))
+        M[:s, :s] = self.shared
+        M[:s, s:dim] = self.point_shared.reshape(3 * self.n, s).T
+        M[s:dim, :s] = M[:s, s:dim].T
+        for i in range(3):
+            for j in range(3):
+                at = s + 3 * np.arange(self.n)
+                M[at + i, at + j] = info.point[:, i, j]
+        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.point_right.reshape(-1), info.cost
+        M[-1, :dim] = M[:dim, -1]
+        self.dense = M - flat.T @ flat
+        self.logdet_poses = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+
+    def solve(self, smooth: Array, single: Array) -> _Solved:
+        """At given precisions (m,) of the smooth parts and (3,) of a point by itself."""
+        return self._points_first(smooth, single) if self.points_first else self._poses_first(smooth, single)
+
+    def _poses_first(self, smooth: Array, single: Array) -> _Solved:
+        s, f = self.s, self.f
+        dim = s + 3 * self.n
+        M = self.dense[:dim, :dim].copy()
+        at = np.arange(dim)
+        M[at[f:s], at[f:s]] += smooth
+        M[at[s:], at[s:]] += np.tile(single, self.n)
+        inverse, logdet = _inverse(M)
+        x = inverse @ self.dense[:dim, -1]
+        cost = float(self.dense[-1, -1] - self.dense[:dim, -1] @ x)
+        var_single = np.diagonal(inverse)[s:].reshape(self.n, 3)
+        with_offsets = self._with_offsets(inverse[:f, f:s], inverse[:f, s:].reshape(f, self.n, 3))
+        cross = inverse[f:s, s:].reshape(self.m, self.n, 3)
+        along_gauge = (inverse[s:, s:] @ self.gauge).reshape(self.n, 3, -1)
+        var = self._variance(inverse[f:s, f:s], cross, var_single, along_gauge)
+        return _Solved(
+            x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
+            np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], with_offsets, var,
+        )  # fmt: skip
+
+    def _points_first(self, smooth: Array, single: Array) -> _Solved:
+        info, s, f, n, P = self.info, self.s, self.f, self.n, self.P
+        root = np.linalg.inv(np.linalg.cholesky(info.point + np.diag(single)))  # (n, 3, 3)
+        poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, 6 * P, 3).swapaxes(1, 2)
+        rows = root @ np.concatenate([self.point_shared, poses, info.point_right[..., None]], axis=2)
+        flat = rows.reshape(3 * n, -1)
+        dim = s + 6 * P
+        M = np.zeros((dim + 1, dim + 1))
+        M[:s, :s] = self.shared
+        at = np.arange(f, s)
+        M[at, at] += smooth
+        M[:s, s:dim] = self.pose_shared.reshape(6 * P, s).T
+        M[s:dim, :s] = M[:s, s:dim].T
+        at = s + 6 * np.arange(P)
+        for i in range(6):
+            for j in range(6):
+                M[at + i, at + j] = info.pose[:, i, j]
+        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.pose_right.reshape(-1), info.cost
+        M[-1, :dim] = M[:dim, -1]
+        M -= flat.T @ flat
+        inverse, logdet = _inverse(M[:dim, :dim])
+        x = inverse @ M[:dim, -1]
+        cost = float(M[-1, -1] - M[:dim, -1] @ x)
+        # The points' own: how they follow all the others.
+        back = np.swapaxes(root, 1, 2)
+        e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
+        follow = back @ rows[:, :, :-1]  # (n, 3, dim)
+        spread = follow.reshape(3 * n, dim) @ inverse  # (3 n, dim)
+        var_single = np.diagonal(back @ root, axis1=1, axis2=2) + (
+            (spread * follow.reshape(3 * n, dim)).sum(axis=1).reshape(n, 3)
+        )
+        logdet -= 2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        cross = -spread.T.reshape(dim, n, 3)
+        own = ((back @ root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
+        along_gauge = own + spread @ (follow.reshape(3 * n, dim).T @ self.gauge)
+        var = self._variance(inverse[f:s, f:s], cross[f:s], var_single, along_gauge.reshape(n, 3, -1))
+        return _Solved(
+            x[:f], x[f:s], e, cost, logdet, np.diagonal(inverse)[f:s], var_single,
+            inverse[:f, :f], self._with_offsets(inverse[:f, f:s], cross[:f]), var,
+        )  # fmt: skip
+
+    def _with_offsets(self, smooth: Array, single: Array) -> Array:
+        """(f, n, 3) covariance between the cameras and the whole offsets."""
+        return np.asarray(np.einsum("fm,nim->fni", smooth, self.prior.basis) + single)
+
+    def _variance(self, smooth: Array, cross: Array, single: Array, single_gauge: Array) -> Array:
+        """(n, 3) variance of the whole offsets, without turns, shifts and a scale of all points together.
+
+        With G the orthonormal directions of these, it is the diagonal of (I - G G^T) C (I - G G^T).
+        """
+        basis, G = self.prior.basis, self.gauge.reshape(self.n, 3, -1)
+        diagonal = (
+            ((basis @ smooth) * basis).sum(axis=2) + 2 * np.einsum("nim,mni->ni", basis, cross) + single
+        )
+        by_smooth = np.einsum("nim,nig->mg", basis, G)
+        C_G = basis @ (smooth @ by_smooth + np.einsum("mni,nig->mg", cross, G))
+        C_G += np.einsum("mni,mg->nig", cross, by_smooth) + single_gauge
+        inner = np.einsum("nig,nih->gh", G, C_G)
+        return np.asarray(diagonal - 2 * (G * C_G).sum(axis=2) + ((G @ inner) * G).sum(axis=2))
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    camera: Array
+    smooth: Array
+    single: Array
+    cost: float
+    logdet: float
+    smooth_variance: Array
+    single_variance: Array
+    camera_covariance: Array
+    camera_offsets: Array
+    offset_variance: Array
+
+
+def _inverse(M: Array) -> tuple[Array, float]:
+    scale = 1.0 / np.sqrt(np.diagonal(M))
+    scaled = M * scale[:, None] * scale
+    root = np.linalg.inv(np.linalg.cholesky(scaled))
+    logdet = -2 * float(np.log(np.diagonal(root)).sum() + np.log(scale).sum())
+    return (root.T @ root) * scale[:, None] * scale, logdet
+
+
+def posterior(
+    info: Information, prior: Prior, sizes: Mapping[str, float] | None = None, flat: bool = False
+) -> Posterior:
+    """Find the sizes of the parts, and the offsets.
+
+    Parameters
+    ----------
+    info : Information
+        Around the given target, offsets along each point's axes.
+    prior : Prior
+    sizes : dict of float by name [world unit], optional
+        To begin with.
+    flat : bool
+        Whether nothing leaves the plane.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Points that do not determine the cameras.
+    """
+    parts = _Parts(info, prior, flat)
+    noise = np.sqrt(info.cost / parts.spare)
+    start = parts.start() if sizes is None else parts.allowed(sizes)
+    now = parts.at({name: size / noise for name, size in start.items()})
+    for _ in range(_PASSES):
+        wanted = parts.renewed(now)
+        if parts.change(now.ratios, wanted) < _SETTLED:
+            break
+        better = next(parts.better(now, wanted), None)
+        if better is None:
+            break
+        gain, now = better.evidence - now.evidence, better
+        if gain < _NO_GAIN:
+            break
+    return parts.posterior(now)
+
+
+def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Posterior:
+    """The same with sizes and a variance of the noise that are known.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Points that do not determine the cameras.
+    """
+    parts = _Parts(info, prior, flat=False)
+    noise = np.sqrt(variance)
+    return parts.posterior(parts.at({name: size / noise for name, size in sizes.items()}))
+
+
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """The quadratic solved for one set of sizes, in units of the noise's standard deviation."""
+
+    ratios: dict[str, float]
+    solved: _Solved
+    variance: float
+    evidence: float
+
+
+class _Parts:
+    """The parts of the offsets with their sizes."""
+
+    def __init__(self, info: Information, prior: Prior, flat: bool) -> None:
+        self.system, self.prior, self.flat = _System(info, prior), prior, flat
+        self.least = _NOTHING * prior.size
+        self.spare = info.equations - self.system.f - 6 * self.system.P
+
+    def start(self) -> dict[str, float]:
+        names = (*self.prior.groups, *_SINGLE)
+        return self.allowed({name: _START[name] * self.prior.size for name in names})
+
+    def allowed(self, sizes: Mapping[str, float]) -> dict[str, float]:
+        """Without those that leave the plane, where nothing may."""
+        return dict(sizes) | {name: self.least for name in _OUT_OF_PLANE if self.flat and name in sizes}
+
+    def at(self, ratios: dict[str, float]) -> _Solution:
+        smooth = np.empty(self.system.m)
+        for name, places in self.prior.groups.items():
+            smooth[places] = (self.prior.size / ratios[name]) ** 2
+        place, height = (ratios[name] ** -2 for name in _SINGLE)
+        solved = self.system.solve(smooth, np.array([place, place, height]))
+        logprior = float(np.log(smooth).sum()) + self.system.n * float(2 * np.log(place) + np.log(height))
+        evidence = _log_evidence(self.spare, solved.cost, solved.logdet - logprior)
+        return _Solution(ratios, solved, solved.cost / self.spare, evidence)
+
+    def _coefficients(self, now: _Solution, name: str) -> tuple[Array, Array, float]:
+        """A part's coefficients, their variances, and the offset for a coefficient of 1."""
+        if name in self.prior.groups:
+            places = self.prior.groups[name]
+            return now.solved.smooth[places], now.solved.smooth_variance[places], self.prior.size
+        columns = _SINGLE[name]
+        return now.solved.single[:, columns], now.solved.single_variance[:, columns], 1.0
+
+    def renewed(self, now: _Solution) -> dict[str, float]:
+        """MacKay's step, longer for parts of which the data determine little, where it would be too short."""
+        new, noise = {}, np.sqrt(now.variance)
+        for name, ratio in now.ratios.items():
+            w, var, unit = self._coefficients(now, name)
+            share = float(np.clip(1.0 - (unit / ratio) ** 2 * var.mean(), 1e-6, 1.0))
+            change = float((w**2).mean()) * (unit / ratio / noise) ** 2 / share
+            most = _MOST.get(name, 1.0) * self.prior.size
+            new[name] = float(
+                np.clip(ratio * change ** (1.0 - 0.5 * share), self.least / noise, most / noise)
+            )
+        allowed = self.allowed({name: ratio * noise for name, ratio in new.items()})
+        return {name: size / noise for name, size in allowed.items()}
+
+    def better(self, now: _Solution, wanted: dict[str, float]) -> Iterator[_Solution]:
+        """Sizes on the way to the wanted ones, ever nearer, that raise the evidence."""
+        for halvings in range(_HALVINGS):
+            part = 0.5**halvings
+            trial = {name: ratio * (wanted[name] / ratio) ** part for name, ratio in now.ratios.items()}
+            found = self.at(trial)
+            if found.evidence > now.evidence:
+                yield found
+
+    def change(self, old: Mapping[str, float], new: Mapping[str, float]) -> float:
+        """Largest relative one of the sizes."""
+        return float(max(abs(np.log(new[name] / old[name])) for name in old))
+
+    def posterior(self, now: _Solution) -> Posterior:
+        n, f, prior, solved = self.system.n, self.system.f, self.prior, now.solved
+        determined = 0.0
+        for name, ratio in now.ratios.items():
+            w, var, unit = self._coefficients(now, name)
+            determined += w.size - (unit / ratio) ** 2 * float(var.sum())
+        along = solved.camera_offsets.reshape(f, -1)
+        followed = np.asarray(-np.linalg.solve(solved.camera_covariance, along) if f else along)
+        noise = np.sqrt(now.variance)
+        return Posterior(
+            offsets=(prior.basis @ solved.smooth) + solved.single,
+            variance=now.variance,
+            camera_step=solved.camera,
+            camera=solved.camera_covariance,
+            followed=followed.reshape(f, n, 3),
+            std=noise * np.sqrt(np.maximum(solved.offset_variance, 0.0)),
+            sizes={name: float(ratio * noise) for name, ratio in now.ratios.items()},
+            determined=determined,
+            evidence=now.evidence,
+        )

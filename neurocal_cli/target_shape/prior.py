@@ -1,0 +1,150 @@
+"""How a target may differ from its file: planes that stand at other angles, bends, stretches, single points.
+
+A priori each part of the offsets is Gaussian with a size that the data tell (`posterior`):
+
+- fold: a plane of a folded target as a whole, turned and shifted;
+- bend: out of the plane, smooth;
+- stretch: in the plane, linear: one side longer than stated, or sides that are not at right angles;
+- warp: in the plane, smooth;
+- place and height: of each point by itself, in the plane and out of it.
+
+Smooth means the covariance exp(-|x - y|^2 / (2 l^2)) between two points of a plane, a Gaussian process; its
+largest eigenfunctions stand for it. A target that is solid all through warps in all directions alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.target import is_flat
+
+__all__ = ["Prior", "prior_of"]
+
+_LENGTH = 0.35  # of a plane's size, as printed boards bend; tests/test_target_shape.py tries others
+_LEAST = 1e-4  # of the largest eigenvalue: smaller ones are nothing
+_MOST = 150  # points that the eigenfunctions are found from
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """The parts that offsets are made of.
+
+    Attributes
+    ----------
+    axes : (n, 3, 3) array
+        Columns: each point's axes, two in its plane and the normal.
+    basis : (n, 3, m) array
+        Offsets along these axes [world unit] for each coefficient of 1.
+    groups : dict of int array by name
+        Coefficients of the same size.
+    gauge : (3 n, 7) array
+        Orthonormal directions that no photograph tells: shifts, turns and a scale of the whole target.
+    size : float
+        Of the target [world unit].
+    """
+
+    axes: Array
+    basis: Array
+    groups: dict[str, NDArray[np.intp]]
+    gauge: Array
+    size: float
+
+    def along_axes(self, world: Array) -> Array:
+        """Offsets (n, 3) in the world's axes, along each point's own."""
+        return np.asarray((world[:, None] @ self.axes)[:, 0])
+
+    def in_world(self, along: Array) -> Array:
+        """The inverse."""
+        return np.asarray((self.axes @ along[..., None])[..., 0])
+
+
+def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:
+    """Parts for the points of a target.
+
+    Parameters
+    ----------
+    given : (n, 3) array [world unit]
+    plane : (n,) int array
+        Plane that each point belongs to, numbered from 0.
+    """
+    n, planes = len(given), int(plane.max()) + 1
+    size = float(np.ptp(given - given.mean(axis=0), axis=0).max())
+    axes = np.empty((n, 3, 3))
+    parts: list[tuple[str, Array]] = []
+    for k in range(planes):
+        rows = np.flatnonzero(plane == k)
+        own, centred = _axes(given[rows])
+        axes[rows] = own
+        for name, part in _of_plane(centred @ own, is_flat(given[rows])):
+            parts.append((name, _at(rows, part, n)))
+        if planes > 1:
+            parts.append(("fold", _at(rows, _as_a_whole(centred / size, own), n)))
+    groups: dict[str, NDArray[np.intp]] = {}
+    first = 0
+    for name, part in parts:
+        new = np.arange(first, first + part.shape[2])
+        groups[name] = np.concatenate([groups[name], new]) if name in groups else new
+        first += part.shape[2]
+    basis = size * np.concatenate([part for _, part in parts], axis=2)
+    return Prior(axes, basis, groups, _gauge(given, axes), size)
+
+
+def _gauge(given: Array, axes: Array) -> Array:
+    centred = given - given.mean(axis=0)
+    shifts = np.broadcast_to(np.eye(3), (len(given), 3, 3))
+    turns = np.stack([np.cross(unit, centred) for unit in np.eye(3)], axis=2)
+    world = np.concatenate([shifts, turns, centred[..., None]], axis=2)
+    return np.linalg.qr((np.swapaxes(axes, 1, 2) @ world).reshape(3 * len(given), 7))[0]
+
+
+def _axes(given: Array) -> tuple[Array, Array]:
+    """Principal axes as columns, and the points around their centre."""
+    centred = given - given.mean(axis=0)
+    return np.linalg.svd(centred, full_matrices=False)[2].T, centred
+
+
+def _at(rows: NDArray[np.intp], part: Array, n: int) -> Array:
+    """Of all points (n, 3, m), from those of one plane."""
+    whole = np.zeros((n, *part.shape[1:]))
+    whole[rows] = part
+    return whole
+
+
+def _of_plane(local: Array, flat: bool) -> list[tuple[str, Array]]:
+    """Smooth and linear parts; local (n, 3) along the plane's axes."""
+    places = local / np.ptp(local, axis=0).max()
+    modes = _smooth(places)
+    n, m = modes.shape
+    bend, warp = np.zeros((n, 3, m)), np.zeros((n, 3, 2 * m))
+    bend[:, 2], warp[:, 0, :m], warp[:, 1, m:] = modes, modes, modes
+    if not flat:
+        return [("warp", np.concatenate([warp, bend], axis=2))]
+    x, y = places[:, 0], places[:, 1]
+    stretch = np.zeros((n, 3, 2))
+    stretch[:, 0, 0], stretch[:, 1, 0] = x, -y
+    stretch[:, 0, 1], stretch[:, 1, 1] = y, x
+    return [("bend", bend), ("warp", warp), ("stretch", stretch)]
+
+
+def _as_a_whole(centred: Array, axes: Array) -> Array:
+    """Shifts and turns of a plane (n, 3, 6), along its axes."""
+    shifts = np.broadcast_to(axes.T, (len(centred), 3, 3))
+    turns = np.stack([np.cross(unit, centred) @ axes for unit in np.eye(3)], axis=2)
+    return np.concatenate([shifts, turns], axis=2)
+
+
+def _smooth(places: Array) -> Array:
+    """(n, k) eigenfunctions of the smooth covariance times the roots of their eigenvalues."""
+    nodes = places[np.unique(np.linspace(0, len(places) - 1, _MOST).astype(np.intp))]
+
+    def kernel(a: Array, b: Array) -> Array:
+        squared = ((a[:, None] - b[None]) ** 2).sum(axis=2)
+        return np.asarray(np.exp(-0.5 * squared / _LENGTH**2))
+
+    values, vectors = np.linalg.eigh(kernel(nodes, nodes))
+    used = values > _LEAST * values[-1]
+    return np.asarray(kernel(places, nodes) @ (vectors[:, used] / np.sqrt(values[used])))

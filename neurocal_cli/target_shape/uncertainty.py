@@ -1,0 +1,95 @@
+"""What a camera's uncertainty is where its target was found with it.
+
+The target's points are uncertain themselves, so that the camera is known less well than from a target that
+is given. Its covariance comes from the whole system, with the offsets marginalised. For everything that
+looks at one view at a time, the derivatives by the camera are taken along the way that the offsets follow
+it: J_c - J_d T^T with T = S_cd S_dd^-1. These are the efficient scores of the camera (Bickel et al. 1993),
+of which sums over views have the information that is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, camera_columns, derivatives
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+from neurocal_cli.target import Target
+from neurocal_cli.target_shape.information import Sight, by_world, information_of, labelled
+from neurocal_cli.target_shape.posterior import known_sizes
+from neurocal_cli.target_shape.prior import prior_of
+
+__all__ = ["TargetUncertainty", "target_uncertainty"]
+
+
+@dataclass(frozen=True, eq=False)
+class TargetUncertainty:
+    """What a camera is known to be when its target is not quite known.
+
+    Attributes
+    ----------
+    entries : (f, f) array
+        Covariance of A's free entries and the free distortion coefficients, normalised.
+    normal : (V, 12 + K, 12 + K) array
+        As from `reprojection.normal_blocks`, with the efficient scores of what is free of the camera.
+    determined : float
+        Unknowns of the target that the data determine.
+    """
+
+    entries: Array
+    normal: Array
+    determined: float
+
+
+def target_uncertainty(
+    target: Target, views: Views, state: CameraState, free: NDArray[np.bool_], free_poses: bool, world: Array
+) -> TargetUncertainty:
+    """Uncertainty of one camera at its minimum for a target that was found.
+
+    Parameters
+    ----------
+    target : Target
+    views, state, free, free_poses
+        As for `adjust`, at the minimum.
+    world : (N, 3) array
+        Where the target has each point, in the order of `views`.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Points that do not determine the camera.
+    """
+    label = target.rows_of(world)
+    prior = prior_of(target.given, target.plane)
+    sight = Sight(views, state, free, free_poses, label)
+    info = information_of([sight], len(target.given)).turned(prior.axes)
+    offsets = prior.along_axes(target.offsets)
+    spare = info.equations - len(info.camera) - 6 * len(info.pose)
+    found = known_sizes(info.around_given(offsets), prior, target.sizes, info.cost / spare)
+    followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
+    followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # points of no target: -1
+    normal = _efficient(views, state, np.flatnonzero(free), labelled(views, label), followed)
+    return TargetUncertainty(found.variance * found.camera, normal, found.determined)
+
+
+def _efficient(
+    views: Views, state: CameraState, free: NDArray[np.intp], label: NDArray[np.intp], followed: Array
+) -> Array:
+    batches, width = views.batches, 12 + len(state.k)
+    columns = camera_columns(len(state.k))[free]
+    n = batches.local.shape[2]
+    by_batch = np.empty((len(batches.view), width, width))
+    buffer = batches.memory(width)
+    for chunk in batches.chunks():
+        view = batches.view[chunk]
+        part = buffer[: len(view)]
+        derivatives(batches, chunk, state, part)
+        by_point = by_world(part, state, views.scale, view)
+        J = part.copy()
+        J[:, columns] -= np.einsum("ftni,ticn->tfcn", followed[:, label[chunk]], by_point)
+        J = J.reshape(len(view), width, 2 * n)
+        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
+    return batches.sum_by_view(by_batch)

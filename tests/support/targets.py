@@ -1,0 +1,92 @@
+"""Boards that are not what their file says, and their photographs, drawn at random."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.camera.distortion import distort
+from neurocal_cli.geometry import Array, rotation_step
+from neurocal_cli.points import Correspondences
+
+SHAPES = ("flat", "parabola", "twist", "waves", "stretch", "in_plane", "out_of_plane", "both", "flexing")
+COLS, ROWS, SQUARE = 9, 7, 25.0  # 200 mm long
+SIZE = (1280, 960)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """What a set was made from."""
+
+    K: Array
+    k: Array
+    given: Array
+    found: Array
+
+
+def board() -> Array:
+    """Vertices (63, 3) as the file has them [mm]."""
+    x, y = np.meshgrid(SQUARE * np.arange(COLS), SQUARE * np.arange(ROWS))
+    return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+
+
+def offsets(shape: str, amount: float, rng: np.random.Generator) -> Array:
+    """(63, 3) how far the vertices are from there [mm]; `amount` is the size of it [mm]."""
+    given = board()
+    x, y = ((given - given.mean(axis=0)) / 100.0)[:, :2].T  # -1 to 1
+    d = np.zeros_like(given)
+    angle = rng.uniform(0, np.pi)
+    along = x * np.cos(angle) + y * np.sin(angle)
+    if shape == "parabola":
+        d[:, 2] = amount * along**2
+    elif shape == "twist":
+        d[:, 2] = amount * x * y
+    elif shape == "waves":
+        d[:, 2] = amount * np.sin(4 * along + rng.uniform(0, 6))
+    elif shape == "stretch":
+        d[:, 0] = 0.003 * given[:, 0]
+    if shape in ("in_plane", "both"):
+        d[:, :2] += amount * rng.standard_normal((len(d), 2))
+    if shape in ("out_of_plane", "both"):
+        d[:, 2] += amount * rng.standard_normal(len(d))
+    return d
+
+
+def photographed(
+    shape: str,
+    seed: int,
+    n_views: int = 15,
+    amount: float = 0.5,
+    sigma: float = 0.1,
+    k: tuple[float, ...] = (-0.2, 0.08),
+) -> tuple[Correspondences, Truth]:
+    """Views of a board of some shape; k1 and k2 in the camera."""
+    rng = np.random.default_rng([seed, SHAPES.index(shape)])
+    f = rng.uniform(900, 1500)
+    K = np.array(
+        [[f, 0, 639.5 + rng.uniform(-30, 30)], [0, f * 1.002, 479.5 + rng.uniform(-30, 30)], [0, 0, 1.0]]
+    )
+    given = board()
+    d = offsets(shape, amount, rng)
+    rows = []
+    while len(rows) < n_views:
+        bend = d
+        if shape == "flexing":
+            bend = offsets("parabola", amount * rng.standard_normal(), rng)
+        R = rotation_step(np.append(rng.uniform(-0.7, 0.7, 2), rng.uniform(-3, 3))[None])[0]
+        depth = f * 200 / rng.uniform(500, 1000)
+        aim = rng.uniform(-0.3, 0.3, 2) * np.array(SIZE) / f * depth
+        X = (given + bend - given.mean(axis=0)) @ R.T + np.append(aim, depth)
+        x, y = distort("k1k2", np.array(k), X[:, 0] / X[:, 2], X[:, 1] / X[:, 2])
+        uv = np.column_stack([K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]])
+        if (uv < 5).any() or (uv > np.array(SIZE) - 5).any():
+            continue
+        rows.append(uv + sigma * rng.standard_normal(uv.shape))
+    points = Correspondences(
+        np.tile(given, (n_views, 1)),
+        np.concatenate(rows),
+        np.repeat([f"v{n:02d}" for n in range(n_views)], len(given)),
+        SIZE,
+    )
+    return points, Truth(K, np.array(k), given, given + d)

@@ -1,0 +1,246 @@
+"""Corners that other programs measured, and points as other programs take them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.command_line import run
+from support.real_data import RealFiles
+
+from neurocal_cli import Board, Correspondences, calibrate, read_points, write_points
+from neurocal_cli.errors import FormatError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.exchange.corner_texts import corner_text
+from neurocal_cli.io.exchange.corners import read_corners
+
+BOARD = Board.single(5, 4, 25.0)
+SIZE = ["--cols", 5, "--rows", 4, "--square", 25]
+WORLD = BOARD.planes[0].vertices().reshape(-1, 3)
+
+
+def pixels(views: int = 3) -> Array:
+    return np.random.default_rng(1).uniform(0, 600, (views, 20, 2))
+
+
+def points(seen: Array) -> Correspondences:
+    found = np.isfinite(seen).all(axis=2)
+    ids = np.array(BOARD.planes[0].vertex_ids())
+    return Correspondences(
+        np.broadcast_to(WORLD, (len(seen), 20, 3))[found],
+        seen[found],
+        np.repeat([f"im{k}" for k in range(len(seen))], 20).reshape(-1, 20)[found],
+        (640, 480),
+        point=np.tile(ids, (len(seen), 1))[found],
+    )
+
+
+def rows(found: Correspondences) -> dict[tuple[str, str], list[float]]:
+    assert found.point is not None
+    return {
+        (found.view_names[k], str(label)): [*world, *pixel]
+        for k, label, world, pixel in zip(
+            found.view_index, found.point, found.world.tolist(), found.pixels.tolist(), strict=True
+        )
+    }
+
+
+@pytest.mark.parametrize("gap", [False, True], ids=["whole", "with gaps"])
+@pytest.mark.parametrize(
+    ("target", "ending"),
+    [("opencv", ".yaml"), ("opencv", ".xml"), ("opencv", ".json"), ("matlab", ".mat"), ("json", ".json"),
+     ("npz", ".npz"), ("mrcal", ".vnl"), ("neurocal", ".csv")],
+)  # fmt: skip
+def test_points_come_back_from_each_format(target: str, ending: str, gap: bool, tmp_path: Path) -> None:
+    seen = pixels()
+    if gap:
+        seen[1, 3] = seen[2, 19] = np.nan
+    write_points(points(seen), tmp_path / "points.csv")
+    given = read_points(tmp_path / "points.csv")
+    place = tmp_path / f"corners{ending}"
+    result = run("convert", tmp_path / "points.csv", "--to", target, "-o", place)
+    if gap and target == "opencv":
+        assert result.exit_code == 1
+        assert "2 of 20 points are not in all views" in result.stderr
+        return
+    assert result.exit_code == 0, result.stderr
+    words = SIZE if target == "mrcal" else []
+    result = run("convert", place, *words, "--to", "neurocal", "-o", tmp_path / "again.csv")
+    assert result.exit_code == 0, result.stderr
+    found = read_points(tmp_path / "again.csv")
+    if target == "matlab":  # it has no ids of points
+        assert np.abs(found.pixels - given.pixels).max() < 1e-9
+        assert np.abs(found.world - given.world).max() == 0
+    else:
+        assert rows(found) == rows(given)
+    assert (found.unit, found.image_size) == ("mm", None if target == "mrcal" else (640, 480))
+
+
+def test_opencv_opens_the_matrices(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    for ending in (".yml", ".xml", ".json"):
+        place = tmp_path / f"corners{ending}"
+        place.write_text(str(corner_text(points(pixels()), "opencv", ending)))
+        storage = cv2.FileStorage(str(place), cv2.FILE_STORAGE_READ)
+        assert np.abs(storage.getNode("image_points").mat() - pixels()).max() == 0
+        assert np.abs(storage.getNode("object_points").mat().reshape(-1, 3) - WORLD).max() == 0
+        assert storage.getNode("view_names").at(1).string() == "im1"
+
+
+def test_corners_as_opencv_s_calibration_sample_writes_them_are_read(tmp_path: Path) -> None:
+    cv2 = pytest.importorskip("cv2")
+    storage = cv2.FileStorage(str(tmp_path / "out.yml"), cv2.FILE_STORAGE_WRITE)
+    storage.write("image_points", pixels().astype(np.float32))
+    storage.write("grid_points", WORLD.reshape(-1, 1, 3).astype(np.float32))
+    storage.release()
+    found = read_corners([tmp_path / "out.yml"], None, [])
+    assert found is not None
+    assert np.abs(found.pixels - pixels().reshape(-1, 2)).max() < 1e-4
+    assert np.abs(found.world[:20] - WORLD).max() == 0
+
+
+SHAPES = {
+    "views x points x 2": (3, 20, 2),
+    "as findChessboardCorners returns them": (3, 20, 1, 2),
+}
+
+
+@pytest.mark.parametrize("shape", SHAPES.values(), ids=SHAPES)
+def test_arrays_of_numpy_are_corners(shape: tuple[int, ...], tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", pixels().reshape(shape))
+    np.savez(tmp_path / "a.npz", imgpoints=pixels().reshape(shape), objpoints=np.tile(WORLD, (3, 1, 1)))
+    for name, board in (("a.npy", BOARD), ("a.npz", None)):
+        found = read_corners([tmp_path / name], board, [])
+        assert found is not None
+        assert np.abs(found.pixels - pixels().reshape(-1, 2)).max() == 0
+        assert np.abs(found.world[20:40] - WORLD).max() == 0
+        assert found.unit == ("mm" if board else "unknown")
+
+
+def test_one_view_of_opencv_s_shape_is_a_view(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", pixels(1)[0][:, None])
+    found = read_corners([tmp_path / "a.npy"], BOARD, [])
+    assert found is not None
+    assert found.n_views == 1
+
+
+def test_the_table_of_mrcal_has_levels_gaps_and_outliers(tmp_path: Path) -> None:
+    lines = ["## made by mrgingham", "# filename x y level"]
+    for name in ("a/1.png", "a/2.png"):
+        lines += [f"{name} {k}.5 {k}.25 {k % 3}" for k in range(18)] + [f"{name} - - -", f"{name} 3 4 -1"]
+    lines.append("a/3.png - - -")
+    (tmp_path / "corners.vnl").write_text("\n".join(lines))
+    with pytest.raises(FormatError, match="different numbers of corners"):
+        read_corners([tmp_path / "corners.vnl"], BOARD, [])
+    lines[-1] = "a/3.png - -"  # no board in this image
+    (tmp_path / "corners.vnl").write_text("\n".join(lines))
+    found = read_corners([tmp_path / "corners.vnl"], BOARD, [])
+    assert found is not None
+    assert found.view_names == ("1", "2")
+    assert found.n_points == 36
+    assert found.covariance is not None
+    assert found.covariance[:3, 0].tolist() == [1, 4, 16]
+
+
+def test_files_of_places_and_pixels_apart(tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "world.txt", WORLD)
+    for k, view in enumerate(pixels()):
+        np.savetxt(tmp_path / f"im{k}.txt", view, delimiter=",")
+    names = [tmp_path / name for name in ("world.txt", "im0.txt", "im1.txt", "im2.txt")]
+    for words in (names, [*names[1:], *SIZE]):
+        result = run("convert", *words, "--to", "neurocal", "--unit", "cm", "-o", tmp_path / "p.csv")
+        assert result.exit_code == 0, result.stderr
+        found = read_points(tmp_path / "p.csv")
+        assert found.view_names == ("im0", "im1", "im2")
+        assert found.unit == "cm"
+        assert np.abs(found.pixels - pixels().reshape(-1, 2)).max() < 1e-9
+
+
+def test_the_points_of_zhang_calibrate(real_files: RealFiles, tmp_path: Path) -> None:
+    """His files have the four corners of a square in a row; the known camera is the published one."""
+    (model,) = real_files("zhang_planar/Model.txt")
+    np.savetxt(tmp_path / "world.txt", np.loadtxt(model).reshape(-1, 2))
+    views = []
+    for path in real_files("zhang_planar/data?.txt"):
+        views.append(tmp_path / path.name)
+        np.savetxt(views[-1], np.loadtxt(path).reshape(-1, 2))
+    found = read_corners([tmp_path / "world.txt", *views], None, [], "inch")
+    assert found is not None
+    camera = calibrate(found, distortion="k1k2")
+    assert abs(camera.K[0, 0] - 832.5) < 1
+    assert abs(camera.K[1, 1] - 832.53) < 1
+
+
+REFUSED = {
+    '{"corners": [[[1, 2], [3, 4]]]}': "corners has 2 corners a view, but not their places on the board",
+    '{"corners": [[[1, 2], [3, 4]], [[1, 2]]]}': "corners must be the same number of points in each view",
+    '{"corners": [[[1, 2]]], "objpoints": [[1, 2, 3], [4, 5, 6]]}': "corners must be 2 points in each view",
+    '{"corners": [[["a", 2]]]}': "corners must be the same number",
+    "1 2 3\n": "holds places alone",
+    "1 2 3\n1 2\n": ":2: must be a row of 2 numbers or of 3",
+    "# filename x y level\na 1\n": ":2: is no line 'filename x y level'",
+}
+
+
+@pytest.mark.parametrize("text", REFUSED, ids=list(REFUSED.values()))
+def test_a_fault_is_named(text: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text(text)
+    result = run("convert", tmp_path / "file", "--to", "neurocal")
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert REFUSED[text] in result.stderr
+
+
+def test_the_wrong_board_is_named(tmp_path: Path) -> None:
+    np.save(tmp_path / "a.npy", pixels())
+    result = run("convert", tmp_path / "a.npy", "--to", "neurocal", "--cols", 5, "--rows", 5, "--square", 1)
+    assert result.exit_code == 1
+    assert "there are 20 corners a view, and 5 x 5 vertices on the board" in result.stderr
+
+
+@pytest.mark.parametrize("target", ["ros", "kalibr", "colmap"])
+def test_programs_that_take_no_points_are_named(target: str, tmp_path: Path) -> None:
+    write_points(points(pixels()), tmp_path / "points.csv")
+    result = run("convert", tmp_path / "points.csv", "--to", target)
+    assert result.exit_code == 1
+    assert f"{target} has no file of points" in result.stderr
+
+
+def test_mid_points_are_not_passed_on_silently(tmp_path: Path) -> None:
+    ids = ["h:0:0", "h:1:0", "v:0:0", "v:1:0"]
+    given = Correspondences(
+        np.eye(4, 3), np.arange(8.0).reshape(4, 2), point=ids, across=np.tile([1.0, 0.0], (4, 1))
+    )
+    write_points(given, tmp_path / "points.csv")
+    result = run("convert", tmp_path / "points.csv", "--to", "json", "-o", tmp_path / "a.json")
+    assert result.exit_code == 0
+    assert "mid-points are measured in one direction only" in result.stderr
+    assert len(json.loads((tmp_path / "a.json").read_text())["image_points"][0]) == 4
+    result = run("convert", tmp_path / "points.csv", "--to", "mrcal")
+    assert "mrcal takes the vertices of one flat board" in result.stderr
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    target=st.sampled_from(["opencv", "matlab", "json", "npz", "mrcal"]),
+    start=st.floats(0, 1),
+    length=st.integers(0, 30),
+    junk=st.binary(max_size=6),
+)
+def test_a_damaged_file_is_read_or_refused_in_one_line(
+    target: str, start: float, length: int, junk: bytes, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    place = tmp_path_factory.getbasetemp() / "damaged-points"
+    text = corner_text(points(pixels(1)), target, ".yaml")
+    data = text.encode() if isinstance(text, str) else text
+    k = int(start * len(data))
+    place.write_bytes(data[:k] + junk + data[k + length :])
+    message = ""
+    try:
+        read_corners([place], BOARD, [])
+    except FormatError as error:
+        message = str(error)
+    assert message.isprintable()
