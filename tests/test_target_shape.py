@@ -230,7 +230,8 @@ def test_given_poses_find_the_target_as_well() -> None:
     points, truth = photographed("out_of_plane", 13, amount=0.1)
     camera = calibrate(points)
     poses = {name: view.pose for name, view in camera.views.items()}
-    found = calibrate(points, type=4, extrinsics=poses, distortion="k1k2")
+    found = calibrate(points, type=4, extrinsics=poses, distortion="k1k2", target="free")
+    assert found.target is not None
     assert np.abs(errors(found, truth.K)).max() < 3
 
 

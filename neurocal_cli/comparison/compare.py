@@ -100,7 +100,7 @@ def compare(
     cameras: list[dict[str, Compared]] = []
     steps, done = len(points) * (1 + len(methods)), 0
     for one in points:
-        first = calibrate(one, distortion=distortion, skew=skew, outliers=outliers, seed=seed)
+        first = calibrate(one, distortion=distortion, skew=skew, outliers=outliers, seed=seed, target="given")
         if first.n_rejected:
             notes.append(f"{one.source}: {first.n_rejected} outliers are left out for all methods")
         kept.append(first.points)

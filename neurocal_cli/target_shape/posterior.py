@@ -22,10 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import unit_diagonal
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
 
-__all__ = ["Posterior", "evidence_of_given", "known_sizes", "posterior"]
+__all__ = ["Posterior", "cost_at", "evidence_of_given", "known_sizes", "posterior"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,19 +88,29 @@ _PASSES = 40
 def evidence_of_given(info: Information) -> float:
     """Logarithm of the evidence of the target as it is given."""
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
-    if len(info.pose):
-        root = np.linalg.inv(np.linalg.cholesky(info.pose))
-        rows = root @ np.concatenate([info.pose_camera, info.pose_right[..., None]], axis=2)
-        logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
-        flat = rows.reshape(-1, rows.shape[2])
-    else:
-        flat, logdet = np.zeros((0, len(info.camera) + 1)), 0.0
+    S, g, cost, logdet = _poses_eliminated(info)
+    cost -= float(g @ np.linalg.solve(S, g)) if len(g) else 0.0
+    return _log_evidence(spare, cost, logdet + (float(np.linalg.slogdet(S)[1]) if len(g) else 0.0))
+
+
+def cost_at(info: Information, offsets: Array) -> float:
+    """Squared error with these offsets (n, 3), at the best cameras and poses for them."""
+    S, g, cost, _ = _poses_eliminated(info.around_given(-offsets))
+    scaled, scale = unit_diagonal(S)
+    return cost - float((scale * g) @ np.linalg.pinv(scaled, hermitian=True) @ (scale * g))
+
+
+def _poses_eliminated(info: Information) -> tuple[Array, Array, float, float]:
+    """The cameras' matrix, right side and cost; the logarithm of the determinant of the poses' part."""
+    if not len(info.pose):
+        return info.camera, info.camera_right, info.cost, 0.0
+    root = np.linalg.inv(np.linalg.cholesky(info.pose))
+    rows = root @ np.concatenate([info.pose_camera, info.pose_right[..., None]], axis=2)
+    flat = rows.reshape(-1, rows.shape[2])
     S = info.camera - flat[:, :-1].T @ flat[:, :-1]
     g = info.camera_right - flat[:, :-1].T @ flat[:, -1]
-    step = np.linalg.solve(S, g) if len(g) else g
-    logdet += float(np.linalg.slogdet(S)[1]) if len(g) else 0.0
-    cost = info.cost - float(flat[:, -1] @ flat[:, -1]) - float(g @ step)
-    return _log_evidence(spare, cost, logdet)
+    logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+    return S, g, info.cost - float(flat[:, -1] @ flat[:, -1]), logdet
 
 
 def _log_evidence(spare: float, cost: float, logdet: float) -> float:
@@ -386,7 +397,7 @@ class _Parts:
         for name, ratio in now.ratios.items():
             w, var, unit = self._coefficients(now, name)
             determined += w.size - (unit / ratio) ** 2 * float(var.sum())
-        along = solved.camera_offsets.reshape(f, -1)
+        along = solved.camera_offsets.reshape(f, 3 * n)
         followed = np.asarray(-np.linalg.solve(solved.camera_covariance, along) if f else along)
         noise = np.sqrt(now.variance)
         return Posterior(
