@@ -20,7 +20,7 @@ from neurocal_cli.simulation.noise import NoiseStudy, cramer_rao, study_noise
 from neurocal_cli.simulation.pictures import pictures, visible_points
 from neurocal_cli.simulation.plots import draw_rates
 from neurocal_cli.simulation.rates import data_set, study_rates
-from neurocal_cli.simulation.report import rates_json, rates_tables
+from neurocal_cli.simulation.report import noise_json, rates_json, rates_tables, simulation_tables, text_of
 from neurocal_cli.simulation.scenes import (
     PAPER_BOARD,
     PAPER_CAMERA,
@@ -235,9 +235,15 @@ def test_pictures_show_the_points_where_the_truth_says() -> None:
 
 def test_a_method_without_an_answer_is_counted() -> None:
     """A single flat view: no method can."""
-    scene = scene_of(LENS, BOARD, random_poses(LENS, BOARD, 1, np.random.default_rng(0)))
+    scene = scene_of(PAPER_CAMERA, BOARD, random_poses(PAPER_CAMERA, BOARD, 1, np.random.default_rng(0)))
     with pytest.raises(NeurocalError):
         calibrate(scene.points())
     study = study_noise(scene, [0.2], 3, ("linear",), seed=0)
     assert study.methods["linear"].failed.tolist() == [3]
     assert np.isnan(study.methods["linear"].rms).all()
+    assert np.isnan(cramer_rao(scene, "linear")).all()
+    assert np.isfinite(cramer_rao(scene, "tsai")).all()
+    assert "nan" not in text_of(*simulation_tables(study, None, False))
+    assert noise_json(study)["methods"]["linear"]["rms"]["t_x"] == [None]
+    with pytest.raises(NeurocalError, match="one view of one plane"):
+        study_starts(scene, 0.5, 2)
