@@ -26,6 +26,7 @@ __all__ = [
     "evaluation_report",
     "evaluation_tables",
     "number_or_none",
+    "parameter_rows",
     "plural",
     "printable",
     "rounded",
@@ -81,7 +82,7 @@ def calibration_report(calibration: Calibration) -> str:
     """
     blocks = [
         [_headline(calibration)],
-        align(_parameter_rows(calibration)),
+        align(parameter_rows(calibration)),
         _view_lines(calibration.views),
         [*_training_lines(calibration), *target_lines(calibration.target, calibration.unit)],
         [] if calibration.verdict is None else verdict_lines(calibration.verdict),
@@ -185,8 +186,8 @@ def _headline(calibration: Calibration) -> str:
     return ", ".join(parts)
 
 
-def _parameter_rows(calibration: Calibration) -> list[list[str]]:
-    """Intrinsic parameters, and the pose as well when there is only one view."""
+def parameter_rows(calibration: Calibration) -> list[list[str]]:
+    """Rows of the intrinsic parameters, and of the pose as well when there is only one view."""
     rows = [["parameter", "value", "std", "relative"]]
     for name in INTRINSIC_NAMES:
         unit = "rad" if name == "theta" else "px"

@@ -167,9 +167,10 @@ def test_no_board_in_any_image_is_exit_1_without_a_file(folder: Path, tmp_path: 
         tmp_path / "o",
     )
     assert (result.exit_code, result.stdout) == (1, "")
-    *lines, last = result.stderr.splitlines()
+    *lines, told, last = result.stderr.splitlines()
     assert len(lines) == 3
     assert all("detected 9 x 6 inner vertices, but the board has 6 x 4" in line for line in lines)
+    assert told.startswith("warning: most images show 9 x 6 inner vertices, and 6 x 4 were asked for")
     assert last == "Error: none of the 3 images shows the board; see the reason above"
     assert not (tmp_path / "p.csv").exists()
     assert not (tmp_path / "o").exists()

@@ -49,6 +49,7 @@ LEVELS = (
     {"plots"},
     {"target_plot"},
     {"zoom_lens"},
+    {"html_report"},
     {"simulation"},
     {"io"},
     {"detection"},

@@ -33,6 +33,7 @@ _SUMMARIES = {
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
     "simulate": "Calibrate simulated cameras, and compare methods where the truth is known.",
     "rectify": "Rectify pairs of images and points of two cameras.",
+    "report": "Show a calibration, a rig or a zoom lens as one HTML page.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
     "target": "Write the board as it was found.",
     "triangulate": "Compute points in space from their pixels in the left and the right image.",

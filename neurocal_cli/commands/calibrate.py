@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.options import Command, check_plot, output_option, plot_option, points_argument
+from neurocal_cli.commands.options import (
+    Command,
+    check_plot,
+    lean_option,
+    output_option,
+    plot_option,
+    points_argument,
+)
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
@@ -30,6 +37,7 @@ _NOT_CONVERGED = 3
     "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
 )
 @plot_option
+@lean_option
 @output_option("CAMERA.yaml", "the calibration")
 @click.pass_context
 def calibrate(
@@ -38,6 +46,7 @@ def calibrate(
     estimation: Estimation,
     camera_name: str,
     plot: str | None,
+    lean: bool,
     output: str,
 ) -> None:
     """Calibrate a camera from known points and their pixels.
@@ -65,7 +74,8 @@ def calibrate(
       neurocal calibrate sample_data/flat.csv -o camera.yaml --camera-name left
       neurocal calibrate sample_data/flat.csv --distortion k1 --no-skew \\
           --plot errors.png -o camera.yaml
-      neurocal calibrate sample_data/flat.csv --outliers keep --image-size 640 480
+      neurocal calibrate sample_data/flat.csv --outliers keep --image-size 640 480 \\
+          --lean -o camera.json
       neurocal calibrate sample_data/flat.csv --target free -o camera.yaml
       neurocal calibrate sample_data/points.csv --type 2 --image-center 172 121
       neurocal calibrate sample_data/stereo_left.csv --type 3 \\
@@ -83,7 +93,7 @@ def calibrate(
     _check_outputs(output, plot, camera_name)
     check_outputs((output, plot), (*points, estimation.intrinsics, estimation.extrinsics))
     calibration = _estimate(points, estimation, camera_name)
-    _write(calibration, output, plot)
+    _write(calibration, output, plot, lean)
     _report(calibration)
     if not calibration.converged:
         ctx.exit(_NOT_CONVERGED)
@@ -109,16 +119,16 @@ def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) 
         return learn(points, **arguments, camera_name=camera_name, progress=progress)
 
 
-def _write(calibration: Calibration, output: str, plot: str | None) -> None:
+def _write(calibration: Calibration, output: str, plot: str | None, lean: bool) -> None:
     """Write both files, the picture drawn before either is touched."""
-    from neurocal_cli.io.calibration_yaml import write_calibration
+    from neurocal_cli.io.result_files import write_result
 
     if plot is not None:
         from neurocal_cli.io.writing import write_whole
         from neurocal_cli.plots import draw_calibration
 
         write_whole(plot, draw_calibration(calibration, os.path.splitext(plot)[1][1:].lower()))
-    write_calibration(calibration, output)
+    warn(write_result(calibration, output, lean=lean))
 
 
 def _report(calibration: Calibration) -> None:

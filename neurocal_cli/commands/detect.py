@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 __all__ = ["detect"]
 
+_SECOND = 2  # images of another size, from which on it is no single one that strayed in
+
 
 @click.command(cls=Command)
 @click.argument(
@@ -110,7 +112,7 @@ def detect(
             "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
         )
     outcomes = _examined(images, target, board, output, points, gamma, overlay, jobs)
-    _report(outcomes)
+    _report(outcomes, target)
     _write(outcomes, target, overlay, output)
 
 
@@ -131,6 +133,7 @@ def _examined(
     paths = find_images(words)
     names = view_names(paths)
     check_outputs((output,), (*paths, board_file))
+    note(_mixed_sizes(paths))
     if overlay is not None:
         _check_overlay(overlay, paths)
     strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
@@ -145,14 +148,32 @@ def _examined(
     return list(zip(names, outcomes, strict=True))
 
 
+def _mixed_sizes(paths: Sequence[str]) -> list[str]:
+    """Tell of images of different sizes before any work: points of one camera are of one size."""
+    from collections import Counter
+
+    from neurocal_cli.io.image_sizes import image_sizes
+
+    sizes = Counter(size for size in image_sizes(paths) if size is not None)
+    if len(sizes) < 2 or sizes.most_common(2)[1][1] < _SECOND:
+        return []
+    counts = ", ".join(f"{count} of {w} x {h} px" for (w, h), count in sizes.most_common(4))
+    return [f"the images have {len(sizes)} sizes ({counts}); those of one camera have one"]
+
+
 def _check_overlay(folder: str, paths: Sequence[str]) -> None:
     if os.path.exists(folder) and not os.path.isdir(folder):
         raise UsageError(f"--overlay {folder} is a file; give a folder")
+    parent = os.path.realpath(folder)
+    while not os.path.exists(parent):
+        parent = os.path.dirname(parent)
+    if not (os.path.isdir(parent) and os.access(parent, os.W_OK)):
+        raise NeurocalError(f"--overlay {folder}: the folder cannot be made; give another place")
     if os.path.realpath(folder) in {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}:
         raise UsageError(f"--overlay {folder} is the folder of the images; give another folder")
 
 
-def _report(outcomes: Sequence[tuple[str, Outcome]]) -> None:
+def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board) -> None:
     """Say what is wrong with which image, and once what is to be known of several."""
     for _, outcome in outcomes:
         if outcome.problem:
@@ -164,6 +185,7 @@ def _report(outcomes: Sequence[tuple[str, Outcome]]) -> None:
     note(f"{_some(names)}: {text}" for text, names in remarks.items())
     found = [outcome.detection for _, outcome in outcomes if outcome.detection is not None]
     warn(dict.fromkeys(text for detection in found for text in detection.warnings))
+    warn(_another_board([outcome.shown for _, outcome in outcomes], board))
     if not found:
         what = (
             "the image does not show" if len(outcomes) == 1 else f"none of the {len(outcomes)} images shows"
@@ -174,6 +196,20 @@ def _report(outcomes: Sequence[tuple[str, Outcome]]) -> None:
         f"{sum(len(detection.ids) for detection in found)} points, "
         f"{sum(detection.rejected for detection in found)} rejected"
     )
+
+
+def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> list[str]:
+    """Tell of one other size of board that most images show: mostly squares were counted, not vertices."""
+    from collections import Counter
+
+    (size, count), *_ = Counter(shown).most_common(1)
+    if size is None or 2 * count <= len(shown) or len(shown) < 2 or len(board.planes) > 1:
+        return []
+    plane = board.planes[0]
+    return [
+        f"most images show {size[0]} x {size[1]} inner vertices, and {plane.cols} x {plane.rows} were asked "
+        "for; count inner vertices, not squares"
+    ]
 
 
 def _some(names: Sequence[str]) -> str:

@@ -19,6 +19,7 @@ __all__ = [
     "FiniteNumber",
     "check_plot",
     "json_option",
+    "lean_option",
     "output_option",
     "plot_option",
     "points_argument",
@@ -109,6 +110,16 @@ def json_option(f: F) -> F:
         is_flag=True,
         show_default="print tables",
         help="Print one JSON object instead of tables.",
+    )(f)
+
+
+def lean_option(f: F) -> F:
+    """Add ``--lean``, for a file without the points."""
+    return click.option(
+        "--lean",
+        is_flag=True,
+        show_default="no",
+        help="Leave the points, the poses and the network out of the file, so that it is short.",
     )(f)
 
 

@@ -9,7 +9,15 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
-from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option, plot_option
+from neurocal_cli.commands.options import (
+    INPUT,
+    Argument,
+    Command,
+    check_plot,
+    lean_option,
+    output_option,
+    plot_option,
+)
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
@@ -68,6 +76,7 @@ _NOT_CONVERGED = 3
     help="Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
 @plot_option
+@lean_option
 @output_option("RIG.yaml", "the rig")
 @click.pass_context
 def stereo(
@@ -80,6 +89,7 @@ def stereo(
     alpha: float | None,
     ros: tuple[str, str] | None,
     plot: str | None,
+    lean: bool,
     output: str,
 ) -> None:
     """Calibrate two cameras and the pose of the right one relative to the left one.
@@ -108,7 +118,8 @@ def stereo(
       neurocal calibrate sample_data/stereo_left.csv -o left.yaml
       neurocal calibrate sample_data/stereo_right.csv -o right.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
-          --left-intrinsics left.yaml --right-intrinsics right.yaml -o rig.yaml
+          --left-intrinsics left.yaml --right-intrinsics right.yaml \\
+          --lean -o rig.json
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --no-skew --distortion k1 --outliers keep --target given --image-size 640 480 \\
           --method neuro --starts 40 --seed 1 | neurocal evaluate stereo -
@@ -127,7 +138,7 @@ def stereo(
     _check_outputs(output, ros)
     check_outputs((output, plot, *(ros or ())), (left, right, left_intrinsics, right_intrinsics))
     rig = _estimate((left, right), sides, estimation)
-    _write(rig, output, alpha, ros, plot)
+    _write(rig, output, alpha, ros, plot, lean)
     _report(rig)
     if not rig.converged:
         ctx.exit(_NOT_CONVERGED)
@@ -188,9 +199,12 @@ def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], esti
         )
 
 
-def _write(rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plot: str | None) -> None:
+def _write(
+    rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plot: str | None, lean: bool
+) -> None:
     """Write all files, the picture drawn before any is touched."""
-    from neurocal_cli.io.rig_yaml import format_ros_pair, write_rig
+    from neurocal_cli.io.result_files import write_result
+    from neurocal_cli.io.rig_yaml import format_ros_pair
     from neurocal_cli.io.writing import write_whole
 
     if plot is not None:
@@ -200,7 +214,7 @@ def _write(rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | No
     if ros is not None:
         for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
             write_whole(name, text)
-    write_rig(rig, output, alpha)
+    warn(write_result(rig, output, lean=lean, alpha=alpha))
 
 
 def _report(rig: Rig) -> None:

@@ -11,6 +11,8 @@ from neurocal_cli.commands.streams import is_terminal
 
 __all__ = ["show"]
 
+_WIDEST = 10_000  # characters; no table is wider
+
 
 def show(report: str, tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str] = ()) -> None:
     """Print a report on stdout: plain text, or its tables, drawn, and lines below them on a terminal."""
@@ -21,6 +23,8 @@ def show(report: str, tables: Sequence[Sequence[Sequence[str]]], below: Sequence
     from rich.table import Table
     from rich.text import Text
 
+    from neurocal_cli.report import align
+
     console = Console()
     for rows in tables:
         table = Table()
@@ -28,6 +32,11 @@ def show(report: str, tables: Sequence[Sequence[Sequence[str]]], below: Sequence
             table.add_column(Text(heading), justify="left" if k == 0 else "right")
         for row in rows[1:]:
             table.add_row(*(Text(cell) for cell in row))
-        console.print(table)
+        wide = console.options.update(width=_WIDEST)
+        if console.measure(table, options=wide).maximum > console.width:
+            # Borders and padding take much of a narrow terminal, and words would be broken.
+            console.print(Text("\n".join(align(rows))), overflow="ignore", no_wrap=True, crop=False)
+        else:
+            console.print(table)
     for line in below:
         console.print(Text(line))

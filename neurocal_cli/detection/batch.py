@@ -12,6 +12,7 @@ import numpy as np
 from neurocal_cli.board import Board
 from neurocal_cli.detection.detect import Detection, Points, detect_points, wanted_sizes
 from neurocal_cli.detection.finding.grids import find_grids
+from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.io.images import Image, encode_png, read_image
@@ -59,6 +60,8 @@ class Outcome:
         Remarks for the user on the image and its detection.
     overlay : bytes, optional
         A PNG, also of images without the board.
+    shown : (cols, rows), optional
+        Inner vertices of another board that the image shows.
     """
 
     path: str
@@ -66,6 +69,7 @@ class Outcome:
     problem: str = ""
     notes: tuple[str, ...] = ()
     overlay: bytes | None = None
+    shown: tuple[int, int] | None = None
 
 
 def default_jobs(images: int) -> int:
@@ -116,7 +120,8 @@ def _detected(path: str, image: Image, options: DetectionOptions) -> Outcome:
     except NeurocalError as error:
         if options.overlay:
             overlay = encode_png(draw_failure(image.grey, grids, str(error)))
-        return Outcome(path, None, f"{image.source}: {error}", image.notes, overlay)
+        shown = error.shown if isinstance(error, NoBoardError) else None
+        return Outcome(path, None, f"{image.source}: {error}", image.notes, overlay, shown)
     if options.overlay:
         overlay = encode_png(draw_detection(image.grey, found))
     return Outcome(path, found, "", (*image.notes, *_remarks(found, options.board)), overlay)

@@ -12,6 +12,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_yaml import FORMAT
 from neurocal_cli.io.distortion_names import own_length
+from neurocal_cli.io.named_entries import read_named
 from neurocal_cli.io.rejected_yaml import read_rejected
 from neurocal_cli.io.target_yaml import read_target
 from neurocal_cli.io.tree_fields import Field
@@ -220,9 +221,9 @@ def _network(field: Field | None) -> NetworkRecord | None:
         return None
     return NetworkRecord(
         W=field["W"].array(3, 3),
-        V={view: field["V"][view].array(3, 4) for view in field["V"].keys()},  # noqa: SIM118
+        V={view: entry.array(3, 4) for view, entry in read_named(field["V"]).items()},
         S1=field["S1"].array(3, 3),
-        S2={view: field["S2"][view].array(4, 4) for view in field["S2"].keys()},  # noqa: SIM118
+        S2={view: entry.array(4, 4) for view, entry in read_named(field["S2"]).items()},
         starts=field["starts"].integer(),
         agreed=field["agreed"].integer(),
         iterations=field["iterations"].integer(),

@@ -19,10 +19,10 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.geometry import Array, rotation_to_euler
 from neurocal_cli.io.camera_info import camera_info_lines
+from neurocal_cli.io.named_entries import named_lines
 from neurocal_cli.io.rejected_yaml import rejected_lines
 from neurocal_cli.io.target_yaml import target_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
-from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, flows, mapping, number, quoted, text
 from neurocal_cli.points import Correspondences
 
@@ -48,8 +48,13 @@ def format_calibration(cal: Calibration) -> str:
 
 
 def write_calibration(cal: Calibration, path: str | Path) -> None:
-    """Write a calibration file, whole or not at all; ``-`` is stdout."""
-    write_whole(path, format_calibration(cal))
+    """Write a calibration file, whole or not at all; ``-`` is stdout.
+
+    A name that ends in ``.json`` or ``.xml`` gets JSON or OpenCV's XML, see `result_files`.
+    """
+    from neurocal_cli.io.result_files import write_result
+
+    write_result(cal, path)
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -62,11 +67,9 @@ def read_calibration(path: str | Path) -> Calibration:
     """
     # Parsing YAML takes 20 ms to load, which a command that only writes does not wait for.
     from neurocal_cli.io.calibration_tree import calibration_from_field
-    from neurocal_cli.io.tree_fields import Field
-    from neurocal_cli.io.yaml_tree import read_yaml
+    from neurocal_cli.io.file_storage import read_tree
 
-    tree, source = read_yaml(path)
-    return calibration_from_field(Field(tree, source))
+    return calibration_from_field(read_tree(path))
 
 
 def calibration_lines(cal: Calibration, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:
@@ -206,15 +209,15 @@ def _straight_lines(found: StraightLines) -> str:
 
 
 def _matrix_lines(name: str, matrices: Mapping[str, Array]) -> Iterator[str]:
-    yield f"  {name}:" if matrices else f"  {name}: {{}}"
     texts = flows(np.array(list(matrices.values())))
-    yield from (f"    {text(view)}: {matrix}" for view, matrix in zip(matrices, texts, strict=True))
+    yield from (f"  {line}" for line in named_lines(name, matrices, texts))
 
 
 def _observation_lines(points: Correspondences) -> Iterator[str]:
     columns = ["view", "X", "Y", "Z", "u", "v"]
     blocks = [points.world, points.pixels]
-    heads = [f"    - [{quoted(name)}, " for name in points.view_names]
+    # The rows are further in than their key: OpenCV's FileStorage wants that.
+    heads = [f"      - [{quoted(name)}, " for name in points.view_names]
     heads = [heads[k] for k in points.view_index.tolist()]
     if points.point is not None:
         columns.insert(1, "point")

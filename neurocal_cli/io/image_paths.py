@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
+import re
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,7 +12,7 @@ from pathlib import Path
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.files import one_line
 
-__all__ = ["IMAGE_ENDINGS", "find_images", "view_names"]
+__all__ = ["IMAGE_ENDINGS", "find_images", "natural_order", "view_names"]
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm")
 
@@ -23,8 +24,8 @@ def find_images(words: Iterable[str]) -> tuple[str, ...]:
     ----------
     words : iterable of str
         A file (or ``-``) stands for itself, whether it exists or not; a folder for the images in
-        it, by their endings, sorted; a pattern such as ``left*.png``, which no shell expanded, for
-        the files that match, sorted.
+        it, by their endings; a pattern such as ``left*.png``, which no shell expanded, for the files
+        that match. These are in natural order (1, 2, 10), as are words in alphabetical order.
 
     Raises
     ------
@@ -39,7 +40,16 @@ def find_images(words: Iterable[str]) -> tuple[str, ...]:
             paths += _matching(word)
         else:
             paths.append(word)
-    return tuple(paths)
+    # A shell expands a pattern in alphabetical order, in which 10 comes before 2.
+    return tuple(sorted(paths, key=natural_order) if paths == sorted(paths) else paths)
+
+
+def natural_order(name: str) -> list[tuple[int, str, int]]:
+    """Key for sorting names as people count: left1, left2, left10."""
+    parts = re.split(r"([0-9]+)", name)
+    return [
+        (1, "", int(part)) if part.isdecimal() and part.isascii() else (0, part, 0) for part in parts if part
+    ]
 
 
 def view_names(paths: Iterable[str]) -> tuple[str, ...]:
@@ -65,7 +75,7 @@ def view_names(paths: Iterable[str]) -> tuple[str, ...]:
 
 def _in_folder(folder: str) -> list[str]:
     try:
-        names = sorted(os.listdir(folder))
+        names = sorted(os.listdir(folder), key=natural_order)
     except OSError as error:
         raise FormatError("may not be read; change its permissions", one_line(folder)) from error
     # Hidden files are other programs' business: previews, half of a copy.
@@ -79,7 +89,7 @@ def _in_folder(folder: str) -> list[str]:
 
 
 def _matching(pattern: str) -> list[str]:
-    paths = sorted(path for path in glob.glob(pattern) if not os.path.isdir(path))
+    paths = sorted((path for path in glob.glob(pattern) if not os.path.isdir(path)), key=natural_order)
     if not paths:
         raise FormatError("no file matches this pattern; check the path", one_line(pattern))
     return paths

@@ -22,7 +22,7 @@ from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables
 from neurocal_cli.zoom_lens.settings import CONTROLS
 from neurocal_cli.zoom_lens.zoom_lens import Member, RejectedSetting, ZoomLens
 
-__all__ = ["format_lens", "read_lens", "write_lens"]
+__all__ = ["format_lens", "lens_from_field", "read_lens", "write_lens"]
 
 _FORMAT = 2
 _BLOCK = "neurocal_lens"
@@ -62,10 +62,15 @@ def read_lens(path: str | Path) -> ZoomLens:
     if not isinstance(tree, dict) or _BLOCK not in root:
         kind = "is a camera" if isinstance(tree, dict) and "camera_matrix" in root else "is not a lens"
         raise FormatError(f"{kind}; give a file that `neurocal lens fit` wrote", source)
+    return lens_from_field(root)
+
+
+def lens_from_field(root: Field) -> ZoomLens:
+    """Read a lens from the tree of its file; see `read_lens`."""
     try:
         return _lens(root[_BLOCK])
     except InputError as error:
-        raise FormatError(str(error), source) from error
+        raise FormatError(str(error), root.source) from error
 
 
 def _bool(value: bool) -> str:

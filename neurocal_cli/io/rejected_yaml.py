@@ -9,8 +9,9 @@ import numpy as np
 
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.io.named_entries import named_lines, read_named
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import number, quoted
 from neurocal_cli.points import Correspondences
 
 __all__ = ["read_rejected", "rejected_lines"]
@@ -23,7 +24,9 @@ def rejected_lines(rejected: Rejected) -> Iterator[str]:
     if not len(rejected) and not rejected.views:
         return
     yield "rejected:"
-    yield f"  views: {mapping(**{text(name): quoted(reason) for name, reason in rejected.views.items()})}"
+    yield from (
+        f"  {line}" for line in named_lines("views", rejected.views, map(quoted, rejected.views.values()))
+    )
     points = rejected.points
     if points is None:
         yield "  columns: []"
@@ -42,7 +45,7 @@ def rejected_lines(rejected: Rejected) -> Iterator[str]:
         if points.point is not None:
             cells.append(quoted(str(points.point[row])))
         values = [*points.world[row].tolist(), *points.pixels[row].tolist(), float(rejected.error_px[row])]
-        yield f"    - [{', '.join([*cells, *map(number, values)])}]"
+        yield f"      - [{', '.join([*cells, *map(number, values)])}]"
 
 
 def read_rejected(field: Field | None, unit: str) -> Rejected:
@@ -55,7 +58,7 @@ def read_rejected(field: Field | None, unit: str) -> Rejected:
     """
     if field is None:
         return Rejected()
-    views = {name: field["views"][name].text() for name in field["views"].keys()}  # noqa: SIM118
+    views = {name: entry.text() for name, entry in read_named(field["views"]).items()}
     names = [name.text() for name in field["columns"].items()]
     if not names:
         return Rejected(views=views)

@@ -16,11 +16,10 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.calibration_yaml import calibration_lines
+from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.verdict_yaml import read_verdict, verdict_lines
-from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
-from neurocal_cli.io.yaml_tree import read_yaml
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
 
@@ -45,8 +44,13 @@ def format_rig(rig: Rig, alpha: float | None = None) -> str:
 
 
 def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
-    """Write a rig file, whole or not at all; ``-`` is stdout."""
-    write_whole(path, format_rig(rig, alpha))
+    """Write a rig file, whole or not at all; ``-`` is stdout.
+
+    A name that ends in ``.json`` or ``.xml`` gets JSON or OpenCV's XML, see `result_files`.
+    """
+    from neurocal_cli.io.result_files import write_result
+
+    write_result(rig, path, alpha=alpha)
 
 
 def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
@@ -122,8 +126,7 @@ def read_rig(path: str | Path) -> Rig:
     FormatError
         The file cannot be read, is no YAML, or a key is missing or wrong.
     """
-    tree, source = read_yaml(path)
-    return rig_from_field(Field(tree, source))
+    return rig_from_field(read_tree(path))
 
 
 def rig_from_field(root: Field) -> Rig:

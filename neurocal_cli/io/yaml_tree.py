@@ -44,7 +44,8 @@ _WORDS: dict[str, Any] = {
 
 # The table as `calibration_yaml` writes it, at any depth of indentation.
 _ROWS = re.compile(
-    r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n((?:\1  - \[[^\n]*\]\n)+)", re.MULTILINE
+    r"^( *)observations:\n\1  columns: \[([^\n]*)\]\n\1  rows:\n(?P<rows>(?:\1  (?:  )?- \[[^\n]*\]\n)+)",
+    re.MULTILINE,
 )
 _LABELS = frozenset(("view", "point"))
 _CUT = "!neurocal/rows"  # the tag of a scalar that stands for rows which were cut out
@@ -86,7 +87,8 @@ def _cut_rows(text: str) -> tuple[str, list[Any]]:
     tables: list[Any] = []
 
     def cut(match: re.Match[str]) -> str:
-        rows, separator = match[3], f"\n{match[1]}  - "
+        rows = match["rows"]
+        separator = "\n" + rows[: rows.index("[")]  # files of older versions are less indented
         try:
             table = json.loads(
                 "[" + rows[len(separator) - 1 : -1].replace(separator, ",\n") + "]", parse_constant=_refuse
@@ -99,7 +101,7 @@ def _cut_rows(text: str) -> tuple[str, list[Any]]:
         if not all(len(row) > k and type(row[k]) is str for k in labels for row in table):
             return match[0]  # a name such as 1e5 without quotes is a number to JSON alone
         tables.append(table)
-        head = match[0][: match.start(3) - match.start() - 1]
+        head = match[0][: match.start("rows") - match.start() - 1]
         return f"{head} {_CUT} {len(tables) - 1}" + "\n" * (len(table) + 1)
 
     return _ROWS.sub(cut, text), tables

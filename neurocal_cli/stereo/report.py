@@ -15,7 +15,9 @@ from neurocal_cli.stereo.space_error import SpaceError
 from neurocal_cli.verdict.report import verdict_json, verdict_lines
 
 __all__ = [
+    "camera_rows",
     "rig_report",
+    "rig_rows",
     "stereo_evaluation_json",
     "stereo_evaluation_report",
     "stereo_evaluation_tables",
@@ -121,7 +123,7 @@ def _share(value: float) -> str:
 
 def rig_report(rig: Rig) -> str:
     """Summary of a calibrated rig: both cameras, the rig, the fit and the verdict, without the warnings."""
-    blocks = [[_headline(rig)], align(_camera_rows(rig)), align(_rig_rows(rig)), _view_lines(rig)]
+    blocks = [[_headline(rig)], align(camera_rows(rig)), align(rig_rows(rig)), _view_lines(rig)]
     blocks.append(_fit_lines(rig))
     if rig.verdict is not None:
         blocks.append(verdict_lines(rig.verdict))
@@ -145,7 +147,7 @@ def _headline(rig: Rig) -> str:
     return ", ".join(parts)
 
 
-def _camera_rows(rig: Rig) -> list[list[str]]:
+def camera_rows(rig: Rig) -> list[list[str]]:
     """Both cameras' parameters side by side."""
     rows = [["parameter", "left", "std", "right", "std"]]
     rows.append(["distortion model", rig.left.distortion_model, "", rig.right.distortion_model, ""])
@@ -177,7 +179,8 @@ def _estimate(value: float, name: str, camera: Calibration) -> list[str]:
     )
 
 
-def _rig_rows(rig: Rig) -> list[list[str]]:
+def rig_rows(rig: Rig) -> list[list[str]]:
+    """Rows of the pose of the right camera and the baseline, with their standard deviations."""
     rows = [["X_right = R X_left + t", "value", "std"]]
     for name, value in zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True):
         unit = "rad" if name.startswith("R") else printable(rig.unit)

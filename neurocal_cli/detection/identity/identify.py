@@ -29,7 +29,7 @@ from neurocal_cli.detection.identity.messages import (
     SYMMETRIC_BOARD,
     NoBoardError,
     ambiguity_message,
-    wrong_size_message,
+    wrong_size,
 )
 from neurocal_cli.detection.identity.placement import Placement, placements
 from neurocal_cli.detection.identity.trim import trimmed
@@ -138,7 +138,7 @@ def _candidates(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) 
         others = [c for c in every if not c.placements]
         usable = [c for c in usable if not any(_may_be_a_piece(c, other) for other in others)]
     if not usable:
-        raise NoBoardError(wrong_size_message(board, largest.grid, list(largest.ends.values())))
+        raise wrong_size(board, largest.grid, list(largest.ends.values()))
     return (_foremost(board, usable) + [c for c in usable if not c.whole])[: len(board.planes)]
 
 

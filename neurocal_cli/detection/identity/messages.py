@@ -9,7 +9,7 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.errors import NeurocalError
 
-__all__ = ["SYMMETRIC_BOARD", "NoBoardError", "ambiguity_message", "wrong_size_message"]
+__all__ = ["SYMMETRIC_BOARD", "NoBoardError", "ambiguity_message", "wrong_size"]
 
 SYMMETRIC_BOARD = (
     "the board looks the same after a turn, so its first corner depends on its orientation in the image; to "
@@ -19,11 +19,22 @@ SYMMETRIC_BOARD = (
 
 
 class NoBoardError(NeurocalError):
-    """An image does not show the board, or not enough of it to locate its points."""
+    """An image does not show the board, or not enough of it to locate its points.
+
+    Parameters
+    ----------
+    message : str
+    shown : (cols, rows), optional
+        Inner vertices of the board that it shows instead of the one that was asked for.
+    """
+
+    def __init__(self, message: str, shown: tuple[int, int] | None = None) -> None:
+        super().__init__(message)
+        self.shown = shown
 
 
-def wrong_size_message(board: Board, grid: Grid, ends: Sequence[End]) -> str:
-    """The message about a grid that has no place on the board."""
+def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
+    """The error about a grid that has no place on the board."""
     wanted = _sizes(board)
     shape = grid.shape
     if len(board.planes) == 1:
@@ -31,11 +42,14 @@ def wrong_size_message(board: Board, grid: Grid, ends: Sequence[End]) -> str:
         if (shape[0] < shape[1]) != (plane.cols < plane.rows):  # named as the user names them
             shape = shape[1], shape[0]
         if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends:
-            return f"the pattern continues beyond {wanted} inner vertices; give the size of the whole board"
+            return NoBoardError(
+                f"the pattern continues beyond {wanted} inner vertices; give the size of the whole board"
+            )
     have = "board has" if len(board.planes) == 1 else "planes of the board have"
-    return (
+    return NoBoardError(
         f"detected {_size(shape)} inner vertices, but the {have} {wanted}; give the size of the board in the "
-        "image"
+        "image",
+        shape,
     )
 
 

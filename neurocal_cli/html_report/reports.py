@@ -1,0 +1,227 @@
+"""The pages of a calibration, of a rig and of a zoom lens."""
+
+from __future__ import annotations
+
+from html import escape
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.geometry import Array
+from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map, scatter
+from neurocal_cli.html_report.page import definitions, figure, page, section, table, verdict_block
+from neurocal_cli.report import parameter_rows, printable
+from neurocal_cli.stereo.report import camera_rows, rig_rows
+from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.verdict.report import verdict_lines
+from neurocal_cli.zoom_lens.judgement import judge_lens
+from neurocal_cli.zoom_lens.report import lens_report
+from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
+
+__all__ = ["calibration_page", "lens_page", "rig_page"]
+
+_MOST_REJECTED = 200  # rows
+
+
+def calibration_page(calibration: Calibration, source: str, digest: str) -> str:
+    """The page of one camera.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    source : str
+        Name of its file.
+    digest : str
+        SHA-256 of the file.
+    """
+    size = _size(calibration)
+    head = f"{size}, {len(calibration.views)} views, {len(calibration.points)} points, distortion model "
+    parts = [
+        f'<p class="soft">{escape(head + calibration.distortion_model)}</p>',
+        verdict_block(calibration.verdict, _facts(calibration.verdict)),
+        *_camera_parts(calibration),
+        _repeat(_command(calibration), calibration, source, digest),
+    ]
+    return page(f"Calibration of {printable(calibration.camera_name)}", parts)
+
+
+def rig_page(rig: Rig, source: str, digest: str) -> str:
+    """The page of two cameras; see `calibration_page`."""
+    head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {printable(rig.unit)}"
+    pairs = [["pair", "left rms [px]", "right rms [px]"]]
+    for a, b in rig.pairs:
+        errors = rig.left.views[a].rmse_px, rig.right.views[b].rmse_px
+        pairs.append([printable(a if a == b else f"{a} / {b}"), *(f"{error:.4f}" for error in errors)])
+    left_out = [["pair", "reason"]]
+    left_out += [[printable(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
+    parts = [
+        f'<p class="soft">{escape(head)}</p>',
+        verdict_block(rig.verdict, _facts(rig.verdict)),
+        section("The right camera relative to the left one", table(rig_rows(rig))),
+        section("Both cameras", table(camera_rows(rig))),
+        section("Pairs", table(pairs, sortable=True) if len(pairs) > 1 else ""),
+        section("Pairs left out", table(left_out) if len(left_out) > 1 else ""),
+        _warnings(rig.warnings),
+    ]
+    for side, camera in (("Left camera", rig.left), ("Right camera", rig.right)):
+        parts.append(section(side, " "))
+        parts += _camera_parts(camera, parameters=False)
+    command = "neurocal stereo LEFT.csv RIGHT.csv" + _options(rig.left)
+    parts.append(_repeat(command, rig.left, source, digest))
+    return page("Calibration of two cameras", parts)
+
+
+def lens_page(lens: ZoomLens, source: str, digest: str) -> str:
+    """The page of a zoom lens; see `calibration_page`."""
+    verdict = judge_lens(lens)
+    parts = [
+        verdict_block(verdict, _facts(verdict)),
+        section("Summary", f'<div class="wide"><pre>{escape(lens_report(lens))}</pre></div>'),
+        section(
+            "How to repeat it",
+            definitions(
+                {
+                    "command": f"neurocal lens fit POINTS.csv --seed {lens.seed} -o LENS.yaml",
+                    "file": printable(source),
+                    "SHA-256 of the file": digest,
+                }
+            ),
+        ),
+    ]
+    return page("Calibration of a zoom lens", parts)
+
+
+def _camera_parts(calibration: Calibration, parameters: bool = True) -> list[str]:
+    """Sections on one camera: parameters, pictures, views, what was left out, warnings."""
+    parts = [section("Parameters", table(parameter_rows(calibration)))] if parameters else []
+    residuals = _residuals(calibration)
+    pixels = calibration.points.pixels
+    if len(residuals):
+        size = calibration.image_size or tuple((np.ceil(pixels.max(axis=0)) + 1).astype(int).tolist())
+        scale = enlargement(residuals, size)
+        names = list(calibration.views)
+        errors = [view.rmse_px for view in calibration.views.values()]
+        drawings = [
+            figure(
+                residual_map(pixels, residuals, size),
+                f"Residuals (projected minus observed) of all points, {scale:.3g} times enlarged. Where "
+                "there are no points the camera is extrapolated.",
+            ),
+            figure(
+                scatter(residuals),
+                "du and dv. Noise makes a round cloud about the middle; the circle is three times its rms.",
+            ),
+            figure(error_bars(names, errors, calibration.rmse_px), "Error of each view, in their order."),
+        ]
+        parts.append(section("Residuals", f'<div class="figures">{"".join(drawings)}</div>'))
+        parts += _view_parts(calibration, residuals, size, scale)
+    parts += [_rejected(calibration), _warnings(calibration.warnings)]
+    return parts
+
+
+def _residuals(calibration: Calibration) -> Array:
+    """(N, 2) projected minus observed pixels; nothing for points without a pose."""
+    points = calibration.points
+    if not len(points):
+        return np.zeros((0, 2))
+    views = [calibration.views[name].pose for name in points.view_names]
+    R, t = np.stack([pose.R for pose in views]), np.stack([pose.t for pose in views])
+    k = points.view_index
+    X = np.einsum("nij,nj->ni", R[k], points.world) + t[k]
+    return np.asarray(np.nan_to_num(calibration.camera.project(X)[0] - points.pixels))
+
+
+def _view_parts(calibration: Calibration, residuals: Array, size: tuple[int, int], scale: float) -> list[str]:
+    points = calibration.points
+    unit = printable(calibration.unit)
+    rows = [["view", "points", "rms [px]", "max [px]", f"distance [{unit}]", "tilt [deg]"]]
+    figures = []
+    for k, name in enumerate(points.view_names):
+        view, own = calibration.views[name], points.view_index == k
+        lengths = np.hypot(*residuals[own].T)
+        distance = float(np.linalg.norm(view.pose.to_camera(points.world[own].mean(axis=0))))
+        tilt = float(np.degrees(np.arccos(np.clip(abs(view.pose.R[2, 2]), 0, 1))))
+        rows.append(
+            [printable(name), str(int(own.sum())), f"{view.rmse_px:.4f}", f"{lengths.max():.4f}",
+             f"{distance:.5g}", f"{tilt:.1f}"]
+        )  # fmt: skip
+        drawing = residual_map(points.pixels[own], residuals[own], size, scale, bold=2.2)
+        figures.append(figure(drawing, f"{printable(name)}: {view.rmse_px:.3f} px"))
+    return [
+        section("Views", table(rows, sortable=True)),
+        section(
+            "Residuals of each view",
+            f'<p class="soft">All {scale:.3g} times enlarged; a click shows one large.</p>',
+            f'<div class="views">{"".join(figures)}</div>',
+        ),
+    ]
+
+
+def _rejected(calibration: Calibration) -> str:
+    rejected = calibration.rejected
+    rows = [["view", "point", "u", "v", "error [px]"]]
+    if rejected.points is not None:
+        points = rejected.points
+        for k in range(min(len(points), _MOST_REJECTED)):
+            name = points.view_names[points.view_index[k]]
+            label = "" if points.point is None else str(points.point[k])
+            u, v = points.pixels[k]
+            rows.append(
+                [printable(name), printable(label), f"{u:.2f}", f"{v:.2f}", f"{rejected.error_px[k]:.2f}"]
+            )
+    views = [["view", "reason"], *([printable(name), why] for name, why in rejected.views.items())]
+    return section(
+        "Left out",
+        table(views) if len(views) > 1 else "",
+        table(rows, sortable=True) if len(rows) > 1 else "",
+    )
+
+
+def _warnings(warnings: tuple[str, ...]) -> str:
+    entries = "".join(f"<li>{escape(warning)}</li>" for warning in warnings)
+    return section("Warnings", f"<ul>{entries}</ul>" if entries else "")
+
+
+def _facts(verdict: Verdict | None) -> str:
+    """What a verdict rests on, as its report has it."""
+    if verdict is None:
+        return ""
+    return "; ".join(
+        line.strip() for line in verdict_lines(verdict)[1:] if not line.startswith(("  reason:", "  advice:"))
+    )
+
+
+def _size(calibration: Calibration) -> str:
+    size = calibration.image_size
+    return "images of unknown size" if size is None else f"images of {size[0]} x {size[1]} px"
+
+
+def _options(calibration: Calibration) -> str:
+    options = f" --type {calibration.type}" if calibration.type != 1 else ""
+    if calibration.method in ("neuro", "linear", "nonlinear", "tsai"):
+        options += f" --method {calibration.method}"
+    if calibration.trainer in ("lm", "backprop"):
+        options += f" --trainer {calibration.trainer}"
+    if calibration.distortion_model != "none" or not calibration.lens_choice:
+        options += f" --distortion {calibration.distortion_model}"
+    if not calibration.intrinsics.skewed:
+        options += " --no-skew"
+    return f"{options} --seed {calibration.seed}"
+
+
+def _command(calibration: Calibration) -> str:
+    return f"neurocal calibrate POINTS.csv{_options(calibration)}"
+
+
+def _repeat(command: str, calibration: Calibration, source: str, digest: str) -> str:
+    entries = {
+        "command": command,
+        "how it ended": calibration.stop_reason,
+        "file": printable(source),
+        "SHA-256 of the file": digest,
+    }
+    text = (
+        "The same points, options and seed give the same file, byte for byte, with the same version. The "
+        "file holds its points; neurocal evaluate camera judges it again."
+    )
+    return section("How to repeat it", definitions(entries), f'<p class="soft">{text}</p>')

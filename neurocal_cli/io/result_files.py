@@ -1,0 +1,124 @@
+"""A calibration or a rig in the form that a file's name asks for: YAML, JSON, or OpenCV's XML.
+
+JSON holds the same tree as YAML. XML is `cv2.FileStorage`'s, which has no place for more than the cameras and
+the poses of views. A lean file holds the camera and the verdict alone: no points, no poses, no record of the
+network.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from neurocal_cli.calibration import Calibration, Rejected
+from neurocal_cli.io.calibration_yaml import format_calibration
+from neurocal_cli.io.writing import write_whole
+from neurocal_cli.points import Correspondences
+from neurocal_cli.stereo.rig import Rig
+
+if TYPE_CHECKING:
+    from neurocal_cli.io.exchange.camera_set import CameraSet
+
+__all__ = ["lean_calibration", "lean_rig", "write_result"]
+
+
+def write_result(
+    result: Calibration | Rig, path: str | Path, *, lean: bool = False, alpha: float | None = None
+) -> tuple[str, ...]:
+    """Write a calibration or a rig, whole or not at all; ``-`` is stdout.
+
+    Parameters
+    ----------
+    result : Calibration or Rig
+    path : str or Path
+        ``.json`` and ``.xml`` are what they say; all others are YAML.
+    lean : bool
+        Whether points, poses and the record of the network are left out.
+    alpha : float, optional
+        Of a rig's rectification, see `rectify`.
+
+    Returns
+    -------
+    losses : tuple of str
+        What the file cannot hold as it was: an XML file has no skew.
+
+    Raises
+    ------
+    InputError
+        An XML file of a camera that OpenCV has no distortion model for.
+    """
+    if lean:
+        result = lean_rig(result) if isinstance(result, Rig) else lean_calibration(result)
+    ending = os.path.splitext(str(path))[1].lower()
+    # Formats that nobody asked for are not loaded.
+    if ending == ".xml":
+        from neurocal_cli.io.exchange.dictionary import OPENCV
+        from neurocal_cli.io.exchange.fitting_in import fitted_in
+
+        fitted = fitted_in(_cameras(result), OPENCV, force=False)
+        write_whole(path, OPENCV.text(fitted.cameras, ending)[""])
+        return (*fitted.losses, *fitted.remarks)
+    if isinstance(result, Rig):
+        from neurocal_cli.io.rig_yaml import format_rig
+
+        text = format_rig(result, alpha)
+    else:
+        text = format_calibration(result)
+    write_whole(path, _as_json(text) if ending == ".json" else text)
+    return ()
+
+
+def lean_calibration(calibration: Calibration) -> Calibration:
+    """The camera with its accuracy and its verdict, without what it was found from."""
+    return replace(
+        calibration,
+        points=Correspondences.none(calibration.image_size, calibration.unit),
+        views={},
+        network=None,
+        rejected=Rejected(),
+        judgement=calibration.verdict,
+    )
+
+
+def lean_rig(rig: Rig) -> Rig:
+    """Both cameras and how they stand to each other, without what they were found from."""
+    return replace(
+        rig,
+        left=lean_calibration(rig.left),
+        right=lean_calibration(rig.right),
+        pairs=(),
+        left_out={},
+        judgement=rig.verdict,
+    )
+
+
+def _cameras(result: Calibration | Rig) -> CameraSet:
+    from neurocal_cli.io.exchange.camera_set import CameraSet
+
+    if isinstance(result, Rig):
+        poses = {name: view.pose for name, view in result.left.views.items()}
+        cameras = result.left.camera, result.right.camera
+        return CameraSet(cameras, (result.pose,), poses, result.unit, result, "neurocal")
+    poses = {name: view.pose for name, view in result.views.items()}
+    return CameraSet((result.camera,), (), poses, result.unit, result, "neurocal")
+
+
+def _as_json(text: str) -> str:
+    """The tree of a YAML text as JSON, one entry of the upper levels a line."""
+    from neurocal_cli.io.yaml_tree import parse_yaml
+
+    return _lines(parse_yaml(text, "the calibration"), 3) + "\n"
+
+
+def _lines(value: Any, depth: int, indent: str = "") -> str:
+    inner = indent + "  "
+    if depth and isinstance(value, dict) and value:
+        parts = [f"{inner}{json.dumps(key)}: {_lines(part, depth - 1, inner)}" for key, part in value.items()]
+        return "{\n" + ",\n".join(parts) + f"\n{indent}}}"
+    if depth and isinstance(value, list) and any(isinstance(part, (list, dict)) for part in value):
+        parts = [inner + json.dumps(part, ensure_ascii=False, allow_nan=False) for part in value]
+        return "[\n" + ",\n".join(parts) + f"\n{indent}]"
+    return json.dumps(value, ensure_ascii=False, allow_nan=False)

@@ -1,0 +1,160 @@
+"""Reports: whole pages that need nothing else, with the numbers of the result and true drawings."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.command_line import run
+from support.made_calibration import made_calibration
+from support.rigs import random_rig, sides
+
+from neurocal_cli import write_calibration, write_rig
+from neurocal_cli.calibration import Verdict
+from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map
+from neurocal_cli.io.result_files import write_result
+from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
+
+VOID = {"meta", "br"}
+
+
+class Page(HTMLParser):
+    """The elements of a page, its texts, and whether each element ends where it must."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str]] = []
+        self.text = ""
+        self.feed(text)
+        assert self.open == []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(name, value or "") for name, value in attrs]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += [(name, value or "") for name, value in attrs]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.fixture
+def camera_file(tmp_path: Path) -> Path:
+    judged = Verdict("usable", ("few views < 5",), ("take more",), {"held_out_px": 0.4})
+    write_calibration(replace(made_calibration(3), judgement=judged), tmp_path / "camera.yaml")
+    return tmp_path / "camera.yaml"
+
+
+def test_a_page_is_whole_and_loads_nothing(camera_file: Path, tmp_path: Path) -> None:
+    result = run("report", camera_file, "-o", tmp_path / "report.html")
+    assert (result.exit_code, result.stdout, result.stderr) == (0, "", "")
+    text = (tmp_path / "report.html").read_text()
+    page = Page(text)
+    assert not {"link", "img", "iframe", "object"} & set(page.tags)
+    assert [name for name, _ in page.attributes if name in ("src", "href", "onclick")] == []
+    assert "http" not in text.replace("http-equiv", "")
+    assert "default-src 'none'" in text
+    assert page.tags.count("h1") == 1
+    for shown in ("600.00", "view02", hashlib.sha256(camera_file.read_bytes()).hexdigest()):
+        assert shown in page.text
+    told = [page.text.index(word) for word in ("usable", "few views < 5", "take more", "Parameters")]
+    assert told == sorted(told)
+
+
+def test_names_cannot_become_html(tmp_path: Path) -> None:
+    text = Path(write(tmp_path)).read_text().replace("camera_name: camera", 'camera_name: "<b>&x</b>"')
+    (tmp_path / "evil.yaml").write_text(text)
+    result = run("report", tmp_path / "evil.yaml")
+    assert "&lt;b&gt;&amp;x&lt;/b&gt;" in result.stdout
+    assert "<b>&x" not in result.stdout
+
+
+def write(folder: Path) -> Path:
+    write_calibration(made_calibration(2), folder / "camera.yaml")
+    return folder / "camera.yaml"
+
+
+def test_the_same_file_gives_the_same_page(camera_file: Path) -> None:
+    assert run("report", camera_file).stdout == run("report", camera_file).stdout
+
+
+def test_a_rig_has_a_page(tmp_path: Path) -> None:
+    rig = calibrate_stereo(*sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1), skew=False)
+    write_rig(rig, tmp_path / "rig.yaml")
+    result = run("report", tmp_path / "rig.yaml")
+    assert result.exit_code == 0, result.stderr
+    page = Page(result.stdout)
+    for shown in ("Calibration of two cameras", "baseline", "Left camera", "Right camera", "neurocal stereo"):
+        assert shown in page.text
+
+
+def test_a_lean_file_and_a_json_file_have_pages(tmp_path: Path) -> None:
+    write_result(made_calibration(2), tmp_path / "lean.json", lean=True)
+    result = run("report", tmp_path / "lean.json")
+    assert result.exit_code == 0, result.stderr
+    assert "Residuals" not in Page(result.stdout).text
+
+
+def test_fifty_views_are_less_than_3_mb(tmp_path: Path) -> None:
+    write_calibration(made_calibration(50), tmp_path / "camera.yaml")
+    result = run("report", tmp_path / "camera.yaml")
+    assert len(result.stdout.encode()) < 3e6
+    assert Page(result.stdout).tags.count("figure") == 53
+
+
+def test_residuals_are_drawn_where_and_as_long_as_they_are() -> None:
+    pixels, residuals = np.array([[100.0, 50.0], [200.0, 80.0]]), np.array([[0.5, -0.25], [-0.1, 0.2]])
+    drawn = residual_map(pixels, residuals, (640, 480), 40.0)
+    numbers = re.findall(r"M([\d.]+) ([\d.]+)L([\d.]+) ([\d.]+)", drawn)
+    found = np.array(numbers, dtype=float)
+    assert np.abs(found[:, :2] - pixels).max() < 0.06
+    assert np.abs(found[:, 2:] - found[:, :2] - 40 * residuals).max() < 0.11
+    scale = enlargement(residuals, (640, 480))
+    assert str(scale)[0] in "125"
+    assert 0.015 * 640 < 3 * scale * np.sqrt(np.mean((residuals**2).sum(axis=1))) <= 0.04 * 640
+
+
+def test_bars_are_as_high_as_the_errors() -> None:
+    drawn = error_bars(["a", "b<"], [0.1, 0.4], 0.3)
+    heights = [float(h) for h in re.findall(r'height="([\d.]+)" class="bar"', drawn)]
+    assert heights[1] / heights[0] == pytest.approx(4, rel=0.01)
+    assert "b&lt;: 0.4 px" in drawn
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 1\n", "has no neurocal block"),
+        ("- 1\n", "is not a calibration"),
+        ("X,Y\n", "is not a calibration"),
+    ],
+)
+def test_another_file_is_refused(text: str, message: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text(text)
+    result = run("report", tmp_path / "file", "-o", tmp_path / "r.html")
+    assert result.exit_code == 1
+    assert message in result.stderr
+    assert not (tmp_path / "r.html").exists()
+
+
+@pytest.mark.slow
+def test_a_zoom_lens_has_a_page(tmp_path: Path) -> None:
+    zoom = Path(__file__).parents[1] / "sample_data" / "zoom.csv"
+    assert run("lens", "fit", zoom, "-o", tmp_path / "lens.yaml").exit_code == 0
+    result = run("report", tmp_path / "lens.yaml")
+    assert result.exit_code == 0, result.stderr
+    assert "Calibration of a zoom lens" in Page(result.stdout).text

@@ -1,0 +1,87 @@
+"""What makes the tool pleasant to use: order of views, early warnings, completion, narrow terminals."""
+
+from __future__ import annotations
+
+import io
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+from support.command_line import run
+
+from neurocal_cli.commands import tables
+from neurocal_cli.io.image_paths import find_images, natural_order
+from neurocal_cli.io.image_sizes import image_sizes
+
+SAMPLES = Path(__file__).parents[1] / "sample_data"
+
+
+def test_images_are_in_natural_order(tmp_path: Path) -> None:
+    names = ["left1.png", "left2.png", "left10.png", "right1.png"]
+    for name in names:
+        (tmp_path / name).touch()
+    paths = tuple(str(tmp_path / name) for name in names)
+    assert find_images([str(tmp_path)]) == paths
+    assert find_images([str(tmp_path / "*.png")]) == paths
+    assert find_images(sorted(paths)) == paths
+    # Any other order is the user's own.
+    assert find_images(paths[::-1]) == paths[::-1]
+
+
+@given(st.lists(st.text(max_size=8), max_size=8))
+def test_the_natural_order_is_an_order_of_any_names(names: list[str]) -> None:
+    ordered = sorted(names, key=natural_order)
+    assert sorted(ordered) == sorted(names)
+    assert [natural_order(name) for name in ordered] == sorted(map(natural_order, names))
+
+
+def test_another_board_in_most_images_is_named_once() -> None:
+    images = sorted(SAMPLES.glob("board0[12].png"))
+    result = run("detect", *images, "--cols", 10, "--rows", 7, "--square", 25, "--jobs", 1)
+    assert result.exit_code == 1
+    told = "warning: most images show 9 x 6 inner vertices, and 10 x 7 were asked for; count inner vertices"
+    assert result.stderr.count(told) == 1
+
+
+def test_images_of_different_sizes_are_named_before_the_work(tmp_path: Path) -> None:
+    for name, size in (("a.png", (30, 40)), ("b.jpg", (40, 30)), ("c.jpg", (60, 80)), ("d.png", (60, 80))):
+        cv2.imwrite(str(tmp_path / name), np.zeros(size, np.uint8))
+    (tmp_path / "e.png").write_bytes(b"\x89PNG")
+    found = list(image_sizes([*map(str, sorted(tmp_path.iterdir())), "-", "none.png"]))
+    assert found == [(40, 30), (40, 30), (80, 60), (80, 60), None, None, None]
+    result = run("detect", tmp_path, "--cols", 9, "--rows", 6, "--square", 25, "--jobs", 1)
+    assert result.stderr.startswith("note: the images have 2 sizes (2 of 40 x 30 px, 2 of 80 x 60 px)")
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_shell_can_complete(shell: str) -> None:
+    def completed(**environment: str) -> str:
+        return subprocess.run(
+            [sys.executable, "-m", "neurocal_cli"],
+            env=os.environ | environment,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+
+    assert "_NEUROCAL_COMPLETE" in completed(_NEUROCAL_COMPLETE=f"{shell}_source")
+    words = {"COMP_WORDS": "neurocal calib", "COMP_CWORD": "calib" if shell == "fish" else "1"}
+    assert "calibrate" in completed(_NEUROCAL_COMPLETE=f"{shell}_complete", **words)
+
+
+@pytest.mark.parametrize("width", [30, 60, 100])
+def test_tables_break_no_word_on_a_narrow_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    shown = io.StringIO()
+    monkeypatch.setattr(tables, "is_terminal", lambda stream: True)
+    monkeypatch.setattr("rich.console.Console", lambda: Console(file=shown, width=width))
+    words = ["correspondence", "reprojection", "cross-validation"]
+    tables.show("", [[words, ["1.2345", "0.0001", "12.000"]]])
+    for word in words:
+        assert word in shown.getvalue()

@@ -1,0 +1,115 @@
+"""Calibrations as YAML that OpenCV opens, as JSON and XML, and without what they were found from."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from support.command_line import run
+from support.made_calibration import made_calibration
+from support.rigs import random_rig, sides
+
+from neurocal_cli import Rig, read_calibration, read_rig, write_calibration, write_points, write_rig
+from neurocal_cli.io.calibration_yaml import format_calibration
+from neurocal_cli.io.result_files import write_result
+from neurocal_cli.io.rig_yaml import format_rig
+from neurocal_cli.io.yaml_tree import parse_yaml
+from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return calibrate_stereo(*sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1), skew=False)
+
+
+def test_opencv_opens_the_yaml_of_a_camera_and_of_a_rig(rig: Rig, tmp_path: Path) -> None:
+    cal = made_calibration(3)
+    write_calibration(cal, tmp_path / "camera.yaml")
+    storage = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_READ)
+    data = storage.getNode("camera_matrix").getNode("data")
+    assert [data.at(k).real() for k in range(9)] == cal.K.ravel().tolist()
+    rows = storage.getNode("neurocal").getNode("observations").getNode("rows")
+    assert rows.size() == len(cal.points)
+    assert rows.at(7).at(4).real() == cal.points.pixels[7, 0]
+    write_rig(rig, tmp_path / "rig.yaml")
+    storage = cv2.FileStorage(str(tmp_path / "rig.yaml"), cv2.FILE_STORAGE_READ)
+    t = storage.getNode("stereo").getNode("t")
+    assert [t.at(k).real() for k in range(3)] == rig.t.tolist()
+
+
+def test_files_of_former_versions_are_read(tmp_path: Path) -> None:
+    """Their rows begin in the column of their key."""
+    text = format_calibration(made_calibration(2))
+    assert "\n      - [" in text
+    former = text.replace("\n      - [", "\n    - [")
+    assert parse_yaml(former, "f") == parse_yaml(text, "f") == yaml.safe_load(text)
+    (tmp_path / "former.yaml").write_text(former)
+    assert len(read_calibration(tmp_path / "former.yaml").points) == 380
+
+
+def test_json_holds_the_same_tree_and_is_read_back(rig: Rig, tmp_path: Path) -> None:
+    cal = made_calibration(2)
+    write_calibration(cal, tmp_path / "camera.json")
+    assert json.loads((tmp_path / "camera.json").read_text()) == parse_yaml(format_calibration(cal), "f")
+    assert format_calibration(read_calibration(tmp_path / "camera.json")) == format_calibration(cal)
+    write_rig(rig, tmp_path / "rig.json")
+    assert format_rig(read_rig(tmp_path / "rig.json")) == format_rig(rig)
+    assert json.loads((tmp_path / "rig.json").read_text())["stereo"]["t"] == rig.t.tolist()
+
+
+def test_xml_is_opencv_s_and_says_what_it_cannot_hold(rig: Rig, tmp_path: Path) -> None:
+    told = write_result(made_calibration(2), tmp_path / "camera.xml")
+    assert "programs of OpenCV ignore skew" in told[0]
+    storage = cv2.FileStorage(str(tmp_path / "camera.xml"), cv2.FILE_STORAGE_READ)
+    assert storage.getNode("camera_matrix").mat()[0, 0] == pytest.approx(600, abs=1e-3)
+    assert storage.getNode("extrinsic_parameters").mat().shape == (2, 6)
+    write_rig(rig, tmp_path / "rig.xml")
+    storage = cv2.FileStorage(str(tmp_path / "rig.xml"), cv2.FILE_STORAGE_READ)
+    assert storage.getNode("T").mat().ravel().tolist() == rig.t.tolist()
+
+
+def test_a_lean_file_has_the_camera_and_its_accuracy(rig: Rig, tmp_path: Path) -> None:
+    cal = made_calibration(3)
+    write_result(cal, tmp_path / "lean.yaml", lean=True)
+    found = read_calibration(tmp_path / "lean.yaml")
+    assert found.K.tobytes() == cal.K.tobytes()
+    assert found.std == cal.std
+    assert found.rmse_px == cal.rmse_px
+    assert (len(found.points), found.views, found.network) == (0, {}, None)
+    assert found.image_size == cal.image_size
+    assert (tmp_path / "lean.yaml").stat().st_size < 4000
+    write_result(rig, tmp_path / "rig.yaml", lean=True)
+    lean = read_rig(tmp_path / "rig.yaml")
+    assert lean.t.tobytes() == rig.t.tobytes()
+    assert lean.std == rig.std
+    assert lean.verdict is not None
+    assert rig.verdict is not None
+    assert lean.verdict.word == rig.verdict.word
+    assert (tmp_path / "rig.yaml").stat().st_size < 12000
+
+
+def test_a_lean_file_of_500_views_loads_at_once(tmp_path: Path) -> None:
+    write_result(made_calibration(500), tmp_path / "lean.yaml", lean=True)
+    text = (tmp_path / "lean.yaml").read_text()
+    start = time.perf_counter()
+    assert yaml.safe_load(text)["neurocal"]["parameters"]["alpha_u"]["value"] == 600.0
+    assert time.perf_counter() - start < 1.0
+
+
+def test_the_commands_write_what_the_name_says(tmp_path: Path) -> None:
+    write_points(made_calibration(3).points, tmp_path / "points.csv")
+    words = ["calibrate", tmp_path / "points.csv", "--distortion", "none"]
+    result = run(*words, "--lean", "-o", tmp_path / "camera.json")
+    assert result.exit_code == 0, result.stderr
+    tree = json.loads((tmp_path / "camera.json").read_text())
+    assert tree["neurocal"]["views"] == []
+    assert tree["neurocal"]["verdict"]["word"] in ("good", "usable", "poor")
+    assert run("evaluate", "camera", tmp_path / "camera.json", tmp_path / "points.csv").exit_code == 0
+    result = run("evaluate", "camera", tmp_path / "camera.json")
+    assert result.exit_code == 1
+    assert "Error: " in result.stderr
