@@ -28,7 +28,7 @@ __all__ = ["LEAST_GAIN", "Found", "enough_views", "find_target"]
 _STEPS = 10
 _SETTLED = 0.02  # of the cameras' standard deviations
 _LARGEST = 0.02  # of the target's size: more is no target that happens to be bent
-_STRETCHED = 0.01  # prints are by a few thousandths; more is a square of another size along one side
+_STRETCHED = 0.02  # prints are by a few thousandths; more is a square of another size along one side
 _FEWEST, _FEWEST_OF_FOLDED = 3, 2  # different views of most points
 LEAST_GAIN = 10.0
 """Of the logarithm of the evidence, for a target to be found unasked: sizes for four parts, each at a level
