@@ -31,7 +31,7 @@ def error(calibration: Calibration, scene: Scene) -> float:
     return float(max(off.max(), turned))
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seed=SEED, type=st.sampled_from([1, 2, 3, 4]), skew=st.booleans())
 def test_linear_is_exact_on_solid_targets(seed: int, type: int, skew: bool) -> None:
     rng = np.random.default_rng(seed)
@@ -41,7 +41,7 @@ def test_linear_is_exact_on_solid_targets(seed: int, type: int, skew: bool) -> N
     assert error(calibrate(scene.points(), method="linear", skew=skew, **scene.given(type)), scene) < 1e-6
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seed=SEED, type=st.sampled_from([1, 2, 3, 4]), skew=st.booleans())
 def test_linear_is_exact_on_flat_boards(seed: int, type: int, skew: bool) -> None:
     rng = np.random.default_rng(seed)

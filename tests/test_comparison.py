@@ -116,7 +116,7 @@ def test_simulate_takes_several_sigmas_and_gives_the_same_bytes_again(tmp_path: 
         "0.5",
         "1",
         "--trials",
-        "3",
+        "1",
         "--random-starts",
         "0",
         "--seed",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from style import HERE
+from pathlib import Path
 
 from neurocal_cli.processes import usable_cores
 from neurocal_cli.simulation.noise import study_noise
@@ -11,6 +11,7 @@ from neurocal_cli.simulation.rates import study_rates
 from neurocal_cli.simulation.scenes import paper_scene
 from neurocal_cli.simulation.starts import study_starts
 
+HERE = Path(__file__).resolve().parent
 SIGMA = (0.1, 0.2, 0.5, 1.0, 2.0)
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai")
 

@@ -14,7 +14,7 @@ from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
 from neurocal_cli.commands.threads import compute_in_one_thread
-from neurocal_cli.errors import UsageError
+from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
 if TYPE_CHECKING:
     from neurocal_cli.simulation.scenes import SimulatedScene
@@ -272,7 +272,10 @@ def _compare(
         study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
         starts = None
         if random_starts:
-            starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
+            try:
+                starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
+            except DegenerateGeometryError as error:
+                note([f"no random starts: {error}"])
     if plot is not None:
         from neurocal_cli.io.writing import write_whole
         from neurocal_cli.simulation.plots import draw_simulation

@@ -31,6 +31,7 @@ __all__ = ["MethodErrors", "NoiseStudy", "cramer_rao", "parameter_names", "study
 
 _BLOCK = 5  # trials of a task, of one sigma
 _HALF_TURN = np.pi
+_SINGULAR = 1e-13  # smallest eigenvalue of a normal matrix of unit diagonal that rounding leaves of 0
 
 Progress = Callable[[str, float], None]
 
@@ -144,7 +145,7 @@ def study_noise(
     apart = {
         (a, b): _apart(noisy[:, :, chosen.index(a)], noisy[:, :, chosen.index(b)], np.array(sigma), whole)
         for a, b in (("neuro", "nonlinear"), ("neuro", "backprop"))
-        if a in chosen and b in chosen
+        if a in chosen and b in chosen and not (results[a].failed + results[b].failed >= trials).any()
     }
     return NoiseStudy(parameter_names(scene), fold.first(truth), np.array(sigma), trials, results, apart)
 
@@ -160,7 +161,8 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
     Returns
     -------
     (5 + K + 6 V,) array
-        Intrinsics, coefficients, each view's pose; 0 for what the method takes for given.
+        Intrinsics, coefficients, each view's pose; 0 for what the method takes for given; nan where the
+        points do not determine the rest.
     """
     camera, points = scene.camera, scene.points()
     problem = as_posed(method, problem_for(points, 1, distortion=Distortion(camera.model)))
@@ -179,6 +181,8 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
     entries[np.ix_(free, free)] = cov.entries
     _, std = parameter_covariance(camera.intrinsics, camera.model, entries, views.pixel_scale, problem.fixed)
     poses = pose_std(R, (R @ views.centre[..., None])[..., 0], views.scale, cov.poses)
+    if not cov.smallest > _SINGULAR:
+        std, poses = {name: value and np.nan for name, value in std.items()}, np.full_like(poses, np.nan)
     order = [list(views.names).index(name) for name in scene.poses]
     return np.concatenate([list(std.values()), poses[order].ravel()])
 

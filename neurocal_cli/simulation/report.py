@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.report import align, number_or_none
-from neurocal_cli.simulation.noise import NoiseStudy
+from neurocal_cli.simulation.noise import MethodErrors, NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
 from neurocal_cli.simulation.starts import StartStudy
 
@@ -100,15 +100,16 @@ def _ratios(study: NoiseStudy) -> Table:
 def _biases(study: NoiseStudy) -> Table:
     rows = [["parameter", *study.methods]]
     for p, name in enumerate(study.names):
-        row = []
-        for one in study.methods.values():
-            answers = study.trials - one.failed[-1]
-            spread = np.sqrt(max(one.rms[-1, p] ** 2 - one.bias[-1, p] ** 2, 0.0) / max(answers, 1))
-            row.append(
-                "given" if one.bound[p] == 0 else f"{one.bias[-1, p] / spread:+.1f}" if spread else "-"
-            )
-        rows.append([name, *row])
+        rows.append([name, *(_bias(one, p, study.trials) for one in study.methods.values())])
     return rows
+
+
+def _bias(one: MethodErrors, p: int, trials: int) -> str:
+    """Mean error over its standard error."""
+    if one.bound[p] == 0:
+        return "given"
+    spread = np.sqrt(max(one.rms[-1, p] ** 2 - one.bias[-1, p] ** 2, 0.0) / max(trials - one.failed[-1], 1))
+    return f"{one.bias[-1, p] / spread:+.1f}" if spread > 0 else "-"
 
 
 def _whole_bound(study: NoiseStudy) -> Any:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.baselines.least_squares import least_squares
 from neurocal_cli.baselines.nonlinear import descend, nonlinear
+from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.camera.distortion import Distortion
@@ -77,7 +78,7 @@ class StartStudy:
 
 def reached(rms: Array, best: float) -> NDArray[np.bool_]:
     """Whether rms errors [px] are those of the best minimum."""
-    return np.asarray(rms <= _SAME * best + _FLOOR)
+    return np.asarray(np.isfinite(rms) & (rms <= _SAME * best + _FLOOR))
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +111,14 @@ def study_starts(
     jobs : int
         Processes; the result is the same for any number.
     progress : callable, optional
+
+    Raises
+    ------
+    DegenerateGeometryError
+        The points do not determine a camera, so there is no minimum to reach.
     """
     problem = _problem(scene, sigma, seed)
+    check_points(problem)
     kinds = [kind for kind in STARTS if can_start(problem, kind)]
     tasks = [
         _Task(scene, sigma, kind, seed, range(first, min(first + _BLOCK, starts)))
