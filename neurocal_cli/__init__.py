@@ -3,7 +3,7 @@
 Data flow from the top to the bottom of this list, and nothing imports from further down:
 
 ====================================  ==================================================================
-errors, geometry, camera              the language: conventions, projection, distortion
+errors, geometry, camera, processes   the language: conventions, projection, distortion
 points, board, calibration            what goes in and what comes out
 least_squares                         steps, Schur complements and covariances of nonlinear least squares
 network, training                     the calibrating network and its trainers
@@ -15,7 +15,8 @@ baselines                             the methods that the paper compares the ne
 methods                               `calibrate`
 verdict, evaluation, report           what a result is worth
 stereo, zoom_lens, plots              two cameras; a camera whose zoom and focus move; pictures
-simulation                            synthetic images and zoom lenses with their exact truth; not installed
+comparison                            the network and the methods beside it, on the same points
+simulation                            synthetic points, images and zoom lenses with their exact truth
 io, detection                         files; points from images
 commands                              the command line
 ====================================  ==================================================================

@@ -120,10 +120,8 @@ class Plane:
         world = self.at(grid)
         if not self.measured:
             return world
-        from scipy.interpolate import RBFInterpolator
-
         known = np.array(self.measured)
-        return np.asarray(world + RBFInterpolator(known[:, :2], known[:, 2:] - self.at(known[:, :2]))(grid))
+        return world + _spline(known[:, :2], known[:, 2:] - self.at(known[:, :2]), np.asarray(grid))
 
     def vertices(self) -> Array:
         """World coordinates of the vertices, ``[r, c]``; (rows, cols, 3) array [world unit]."""
@@ -218,6 +216,13 @@ class Board:
             if plane.name == name:
                 return plane
         raise InputError(f"the board has no plane {name!r}; it has {[p.name for p in self.planes]}")
+
+
+def _spline(places: Array, values: Array, at: Array) -> Array:
+    """The thin-plate spline through values (n, 3) at places (n, 2), elsewhere (N, 2)."""
+    from scipy.interpolate import RBFInterpolator
+
+    return np.asarray(RBFInterpolator(places, values)(at))
 
 
 def _check_name(name: object) -> None:

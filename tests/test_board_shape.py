@@ -17,14 +17,14 @@ from neurocal_cli.verdict.assessment import gather_evidence
 
 def curled(by: float, seed: int, n: int = 14) -> Calibration:
     rng = np.random.default_rng([seed, 77])
-    return calibrate(photographed(poses(n, rng), rng, curl=by))
+    return calibrate(photographed(poses(n, rng), rng, curl=by), target="given")
 
 
 def stretched(by: float, seed: int, n: int = 14) -> Calibration:
     """The print is longer along X than its points say."""
     rng = np.random.default_rng([seed, 78])
     points = photographed(poses(n, rng), rng)
-    return calibrate(replace(points, world=points.world / [1 + by, 1, 1]))
+    return calibrate(replace(points, world=points.world / [1 + by, 1, 1]), target="given")
 
 
 @pytest.mark.parametrize("by", [0.003, -0.002])
@@ -82,7 +82,7 @@ def test_curls_of_all_sizes(by: float) -> None:
     ("seed", "says"), [(621, "stretched by 0.27 % along Y"), (593, "shrunk by 0.31 % along X")]
 )
 def test_a_stretch_that_makes_the_focal_length_wrong_is_the_reason(seed: int, says: str) -> None:
-    verdict = calibrate(scene(seed)[0]).verdict
+    verdict = calibrate(scene(seed)[0], target="given").verdict
     assert verdict is not None
     assert verdict.word != "good"
     assert says in verdict.reasons[0]
@@ -93,6 +93,6 @@ def test_solid_targets_and_single_views_have_no_such_shape() -> None:
 
 
 def test_a_curl_of_four_tenths_of_a_millimetre(real_files: RealFiles) -> None:
-    cal = calibrate(read_points(real_files("wrong_data/curl04.csv")[0]))
+    cal = calibrate(read_points(real_files("wrong_data/curl04.csv")[0]), target="given")
     assert cal.verdict.word == "usable"
     assert "it seems bent by 0.42 mm, which makes the focal length 0.7 % too short" in cal.verdict.reasons[0]

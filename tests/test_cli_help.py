@@ -58,8 +58,9 @@ def test_each_option_is_in_an_example(words: list[str], command: click.Command) 
 
 
 def _slow(words: list[str]) -> bool:
-    """Whether the examples take long: those that fit a zoom lens, and the longest lists."""
-    return words[:1] in ([], ["lens"], ["stereo"], ["calibrate"]) or words[1:] in (["stereo"], ["camera"])
+    """Whether the examples take long: zoom lenses, simulations, and the longest lists."""
+    slow = [], ["lens"], ["simulate"], ["stereo"], ["calibrate"]
+    return words[:1] in slow or words[1:] in (["stereo"], ["camera"])
 
 
 @pytest.mark.parametrize(

@@ -60,11 +60,11 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Installed:
 
 
 @pytest.mark.slow
-def test_what_only_tests_need_is_not_installed(installed: Installed) -> None:
+def test_all_of_the_package_is_installed_and_nothing_that_only_tests_need(installed: Installed) -> None:
     (package,) = installed.folder.glob("venv/lib/python*/site-packages/neurocal_cli")
     shipped = {path.relative_to(package) for path in package.rglob("*.py")}
     ours = {path.relative_to(ROOT / "neurocal_cli") for path in (ROOT / "neurocal_cli").rglob("*.py")}
-    assert shipped == {path for path in ours if path.parts[0] != "simulation"}
+    assert shipped == ours
     assert (package / "py.typed").is_file()
     assert (installed.folder / "venv" / "share" / "man" / "man1" / "neurocal.1").is_file()
     frozen = installed.run("pip", "freeze").stdout.lower().splitlines()

@@ -10,18 +10,21 @@ import numpy as np
 from neurocal_cli.baselines.found import Found
 from neurocal_cli.baselines.linear import linear
 from neurocal_cli.baselines.nonlinear import nonlinear
-from neurocal_cli.baselines.opencv import opencv
-from neurocal_cli.baselines.tsai import tsai
+from neurocal_cli.baselines.opencv import opencv, without_skew
+from neurocal_cli.baselines.tsai import tsai, with_known_centre
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.common_noise import measured
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import normal_blocks
+from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
+from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.calibration import Calibration, Rejected, StopReason
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.pipeline.result import calibration_of
 
-__all__ = ["BASELINES", "calibrate_by"]
+__all__ = ["BASELINES", "as_posed", "calibrate_by"]
 
 BASELINES: dict[str, Callable[[Problem], Found]] = {
     "linear": linear,
@@ -29,6 +32,13 @@ BASELINES: dict[str, Callable[[Problem], Found]] = {
     "tsai": tsai,
     "opencv": opencv,
 }
+
+_ASSUMING: dict[str, Callable[[Problem], Problem]] = {"tsai": with_known_centre, "opencv": without_skew}
+
+
+def as_posed(method: str, problem: Problem) -> Problem:
+    """The problem that a method solves: some take more for given than the user does."""
+    return _ASSUMING[method](problem) if method in _ASSUMING else problem
 
 
 def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibration:
@@ -55,7 +65,7 @@ def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibra
     InputError, DegenerateGeometryError
         Points that cannot give an answer, with the reason.
     """
-    found = BASELINES[method](problem)
+    found = BASELINES[method](as_posed(method, _unweighted(problem)))
     solution = _solution(found)
     calibration = calibration_of(solution, Rejected(), trainer="none", method=method, seed=0, name=name)
     warnings = (*found.remarks, *calibration.warnings)
@@ -77,9 +87,32 @@ def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibra
     )
 
 
+def _unweighted(problem: Problem) -> Problem:
+    """Without the covariances that `detect` measures: (3) has none, and they may not hold.
+
+    A sigma that somebody states counts.
+    """
+    covariance, views = problem.points.covariance, problem.views
+    if covariance is None or not measured(covariance):
+        return problem
+    plain = replace(views, weights=np.ones(len(views.index)), whitening=None, across=None)
+    return replace(problem, views=plain)
+
+
 def _solution(found: Found) -> Solution:
-    """The answer as a solution of the problem, with the normal matrices that belong to it."""
+    """The answer as a solution of the problem, with the normal matrices of points as they were measured."""
     problem, state = found.problem, found.state
+    residuals = point_residuals(problem.views, state) * problem.views.pixel_scale
+    order = problem.views.order
+    believed = weighed(problem.points, residuals if order is None else residuals[np.argsort(order)])
+    views = replace(
+        problem.views,
+        weights=believed.weights,
+        whitening=believed.whitening,
+        across=believed.across,
+        along=believed.along,
+    )
+    problem = replace(problem, views=views)
     normal, sensible = normal_blocks(problem.views.batches, state)
     if not (sensible.all() and np.isfinite(normal).all()):
         name = problem.views.names[int(np.argmin(sensible))]

@@ -122,7 +122,8 @@ def _refuse_mirrored(problem: Problem, groups: list[Group]) -> None:
         if not group.flat and mirrored.any():
             raise DegenerateGeometryError(
                 f"view {problem.views.names[group.views[int(np.argmax(mirrored))]]!r}: only a mirrored "
-                "camera could see these points; check the axes of X,Y,Z (right-handed?) and of u,v (down?)"
+                "camera could see these points; check the axes of X,Y,Z (right-handed?) and of u,v (v "
+                "downwards?)"
             )
 
 

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.baselines.found import Found, as_seen
-from neurocal_cli.baselines.least_squares import least_squares
+from neurocal_cli.baselines.least_squares import Parts, least_squares
 from neurocal_cli.baselines.linear import linear_state
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, residuals
@@ -22,7 +21,7 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import pinhole_coefficients
 from neurocal_cli.geometry import Array
 
-__all__ = ["descend", "nonlinear", "whitened_residuals"]
+__all__ = ["descend", "nonlinear", "view_of_residual", "whitened_residuals"]
 
 
 def nonlinear(problem: Problem) -> Found:
@@ -44,10 +43,10 @@ def descend(problem: Problem, start: CameraState) -> Found:
     free = problem.free_camera if problem.free_distortion else problem.free
     unknowns = _Unknowns(start, np.flatnonzero(free), problem.free_poses)
     error = whitened_residuals(problem.views)
-    sparsity = None
+    parts = None
     if problem.views.n_views > 1 and problem.free_poses:
-        sparsity = _sparsity(problem.views, len(unknowns.free))
-    least = least_squares(lambda x: error(unknowns.state(x)), unknowns.zero, sparsity)
+        parts = Parts.of_views(view_of_residual(problem.views), len(unknowns.free), 6, problem.views.n_views)
+    least = least_squares(lambda x: error(unknowns.state(x)), unknowns.zero, parts)
     return Found(problem, unknowns.state(least.x), True, least.iterations, least.converged)
 
 
@@ -80,13 +79,6 @@ def whitened_residuals(views: Views) -> Callable[[CameraState], Array]:
     return error
 
 
-def _sparsity(views: Views, n_camera: int) -> Any:
-    """Each residual depends on the camera and on the pose of its view."""
-    from scipy.sparse import csr_matrix, hstack
-
-    batches = views.batches
-    view = np.repeat(batches.view, 2 * batches.local.shape[2])
-    rows = np.repeat(np.arange(len(view)), 6)
-    columns = (6 * view[:, None] + np.arange(6)).ravel()
-    poses = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(len(view), 6 * views.n_views))
-    return hstack([csr_matrix(np.ones((len(view), n_camera))), poses]).tocsr()
+def view_of_residual(views: Views) -> NDArray[np.intp]:
+    """View of each residual of `whitened_residuals`."""
+    return np.repeat(views.batches.view, 2 * views.batches.local.shape[2])

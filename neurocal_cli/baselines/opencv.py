@@ -18,14 +18,26 @@ from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
-__all__ = ["opencv"]
+__all__ = ["opencv", "without_skew"]
 
 _EPOCHS, _EPSILON = 1000, 1e-14
 _COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6
 
 
+def without_skew(problem: Problem) -> Problem:
+    """The problem as OpenCV has it: with right angles given."""
+    free = problem.free.copy()
+    free[1] = False
+    return replace(problem, free=free, fixed=problem.fixed | {"theta"})
+
+
 def opencv(problem: Problem) -> Found:
     """Calibrate by ``cv2.calibrateCamera`` (types 1 and 2).
+
+    Parameters
+    ----------
+    problem : Problem
+        From `without_skew`.
 
     Raises
     ------
@@ -38,9 +50,6 @@ def opencv(problem: Problem) -> Found:
 
     if problem.type not in (1, 2) or problem.distortion.model == "fisheye":
         raise UsageError("OpenCV's calibrateCamera solves types 1 and 2, with the models none to rational")
-    free = problem.free.copy()
-    free[1] = False
-    problem = replace(problem, free=free, fixed=problem.fixed | {"theta"})
     check_points(problem)
     views, points = problem.views, problem.points
     order = np.arange(len(points)) if views.order is None else views.order

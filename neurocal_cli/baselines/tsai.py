@@ -24,16 +24,15 @@ large). Stage 2 does not mend that, and a wrong centre goes into everything.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.baselines.constrained_least_squares import smallest
 from neurocal_cli.baselines.found import Found, as_seen
-from neurocal_cli.baselines.least_squares import least_squares
+from neurocal_cli.baselines.least_squares import Least, Parts, least_squares
 from neurocal_cli.baselines.linear import whole_groups
-from neurocal_cli.baselines.nonlinear import whitened_residuals
+from neurocal_cli.baselines.nonlinear import view_of_residual, whitened_residuals
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
@@ -42,7 +41,7 @@ from neurocal_cli.camera.projection import normalised_points
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array, nearest_rotation
 
-__all__ = ["tsai"]
+__all__ = ["tsai", "with_known_centre"]
 
 _FEWEST = 5, 7  # points of a flat and of a solid view: one equation each
 _DISTORTIONS = ("none", "k1")
@@ -50,6 +49,11 @@ _DISTORTIONS = ("none", "k1")
 
 def tsai(problem: Problem) -> Found:
     """Calibrate by radial alignment.
+
+    Parameters
+    ----------
+    problem : Problem
+        From `with_known_centre`.
 
     Raises
     ------
@@ -68,16 +72,23 @@ def tsai(problem: Problem) -> Found:
             f"the method tsai estimates k1 alone; give distortion {' or '.join(_DISTORTIONS)}, or another "
             "method"
         )
-    problem, remarks = _with_centre(problem)
     check_points(problem)
+    remarks = () if problem.type == 2 else _remarks(problem)
     state, least = _camera_and_poses(problem)
     return Found(problem, state, False, least.iterations, least.converged, remarks)
 
 
-def _with_centre(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
-    """The problem with the image centre and the right angle given."""
+def with_known_centre(problem: Problem) -> Problem:
+    """The problem as Tsai has it: with the image centre and right angles given (types 1 and 2).
+
+    Raises
+    ------
+    UsageError
+        Type 1, and neither a centre nor an image size comes with the points.
+    """
+    if problem.type in (3, 4):
+        return problem
     entries, points = problem.entries.copy(), problem.points
-    remarks: tuple[str, ...] = ()
     if problem.type == 1:
         centre = points.image_center
         if centre is None and points.image_size is not None:
@@ -88,14 +99,17 @@ def _with_centre(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
                 "the points file"
             )
         entries[3:] = centre
-        remarks = (
-            f"the method tsai takes the image centre for known; ({centre[0]:g}, {centre[1]:g}) is used, and "
-            "the true centre may be tens of pixels away",
-        )
     free = np.array([True, False, True, False, False])
     entries[:3] = 0.0
-    fixed = frozenset({"u0", "v0", "theta"})
-    return replace(problem, entries=entries, free=free, fixed=fixed), remarks
+    return replace(problem, entries=entries, free=free, fixed=frozenset({"u0", "v0", "theta"}))
+
+
+def _remarks(problem: Problem) -> tuple[str, ...]:
+    u0, v0 = problem.entries[3:]
+    return (
+        f"the method tsai takes the image centre for known; ({u0:g}, {v0:g}) is used, and the true centre "
+        "may be tens of pixels away",
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +246,7 @@ def _poses_of_given_camera(problem: Problem) -> CameraState:
     return CameraState(entries[None], R, t)
 
 
-def _camera_and_poses(problem: Problem) -> tuple[CameraState, Any]:
+def _camera_and_poses(problem: Problem) -> tuple[CameraState, Least]:
     """Types 1 and 2: both stages."""
     views, centre = problem.views, problem.normalised_entries[3:]
     stages = _Stages(problem, *(views.pixels - centre).T)
@@ -249,6 +263,7 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Any]:
     V, free_s, free_k = views.n_views, known is None, model == "k1"
     start = np.concatenate([[np.log(f)], [0.0] * free_s, [0.0] * free_k, depth / f])
     error = whitened_residuals(views)
+    parts = Parts.of_views(view_of_residual(views), len(start) - V, 1, V)
 
     def state(p: Array) -> CameraState:
         f = np.exp(p[0])
@@ -258,15 +273,5 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Any]:
         entries = np.array([[aspect * f, 0.0, f, *centre]])
         return CameraState(entries, R, t, model, p[1 + free_s : 2 + free_s] if free_k else np.zeros(0))
 
-    least = least_squares(lambda p: error(state(p)), start, _sparsity(views, len(start) - V))
+    least = least_squares(lambda p: error(state(p)), start, parts)
     return state(least.x), least
-
-
-def _sparsity(views: Views, n_camera: int) -> Any:
-    """Each residual depends on the camera and on the t_z of its view."""
-    from scipy.sparse import csr_matrix, hstack
-
-    batches = views.batches
-    view = np.repeat(batches.view, 2 * batches.local.shape[2])
-    depths = csr_matrix((np.ones(len(view)), (np.arange(len(view)), view)), shape=(len(view), views.n_views))
-    return hstack([csr_matrix(np.ones((len(view), n_camera))), depths]).tocsr()

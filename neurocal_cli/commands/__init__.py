@@ -26,10 +26,12 @@ __all__ = ["neurocal"]
 _SUMMARIES = {
     "board": "Draw a chessboard target to print.",
     "calibrate": "Calibrate a camera from known points and their pixels.",
+    "compare": "Compare calibration methods on the same points.",
     "convert": "Convert cameras, rigs and points to the formats of other programs.",
     "detect": "Detect chessboards in images and measure points on them.",
     "evaluate": "Measure the error of a calibrated camera or stereo rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
+    "simulate": "Calibrate simulated cameras, and compare methods where the truth is known.",
     "rectify": "Rectify pairs of images and points of two cameras.",
     "report": "Show a calibration, a rig or a zoom lens as one HTML page.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",

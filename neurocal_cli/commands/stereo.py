@@ -121,7 +121,7 @@ def stereo(
           --left-intrinsics left.yaml --right-intrinsics right.yaml \\
           --lean -o rig.json
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
-          --no-skew --distortion k1 --outliers keep --image-size 640 480 \\
+          --no-skew --distortion k1 --outliers keep --target given --image-size 640 480 \\
           --method neuro --starts 40 --seed 1 | neurocal evaluate stereo -
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --type 2 --image-center 319.5 239.5 -o rig.yaml

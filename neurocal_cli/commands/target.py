@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
+
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, output_option
+from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import say
 from neurocal_cli.errors import InputError
@@ -20,8 +22,15 @@ __all__ = ["target"]
     cls=Argument,
     description="A calibration that `neurocal calibrate` wrote; - is standard input.",
 )
+@click.option(
+    "--plot",
+    metavar="FILE.png",
+    type=click.Path(writable=False, readable=False),
+    show_default="none",
+    help="Plot the heights of the board's points and their shifts to this .png, .pdf or .svg file.",
+)
 @output_option("BOARD.yaml", "the board")
-def target(camera: str, output: str) -> None:
+def target(camera: str, plot: str | None, output: str) -> None:
     """Write the board as it was found.
 
     No board is exactly as its file says: paper curls, and printers stretch. `neurocal calibrate --target
@@ -34,10 +43,11 @@ def target(camera: str, output: str) -> None:
     \b
     Examples:
       neurocal calibrate sample_data/bent.csv -o camera.yaml
-      neurocal target camera.yaml -o board.yaml
+      neurocal target camera.yaml -o board.yaml --plot board.png
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
     """  # noqa: D301 - as in the group
-    check_outputs((output,), (camera,))
+    check_plot(plot, output)
+    check_outputs((output, plot), (camera,))
 
     from neurocal_cli.io.board_yaml import write_board
     from neurocal_cli.io.calibration_yaml import read_calibration
@@ -50,5 +60,11 @@ def target(camera: str, output: str) -> None:
             f"{camera}: the target was taken as it was given, so there is nothing to write; calibrate with "
             "--target free to find it"
         )
+    if plot is not None:
+        from neurocal_cli.io.writing import write_whole
+        from neurocal_cli.target_plot import draw_target
+
+        kind = os.path.splitext(plot)[1][1:].lower()
+        write_whole(plot, draw_target(calibration.target, calibration.unit, kind))
     write_board(board_of(calibration.target, calibration.unit), output)
     say("\n".join(target_lines(calibration.target, calibration.unit)))

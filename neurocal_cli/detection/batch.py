@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -21,6 +16,7 @@ from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.io.images import Image, encode_png, read_image
+from neurocal_cli.processes import start_worker, usable_cores, work_through
 
 __all__ = ["DetectionOptions", "Outcome", "default_jobs", "detect_file", "detect_files", "keep_memory"]
 
@@ -78,9 +74,7 @@ class Outcome:
 
 def default_jobs(images: int) -> int:
     """Number of processes for a number of images."""
-    usable = getattr(os, "sched_getaffinity", None)
-    cores = len(usable(0)) if usable else os.cpu_count() or 1
-    return max(1, min(cores, images // _WORTH_A_PROCESS))
+    return max(1, min(usable_cores(), images // _WORTH_A_PROCESS))
 
 
 def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1) -> Iterator[Outcome]:
@@ -96,18 +90,7 @@ def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1)
     jobs = min(jobs, len(paths))
     if jobs <= 1:
         keep_memory()
-        for path in paths:
-            yield detect_file(path, options)
-        return
-    # Started afresh: a fork of a process whose libraries have threads may hang.
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, context, _start_worker)
-    try:
-        yield from pool.map(detect_file, paths, [options] * len(paths))
-    except BrokenProcessPool as error:
-        raise NeurocalError("a process was stopped, perhaps for lack of memory; use --jobs 1") from error
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+    yield from work_through(partial(detect_file, options=options), paths, jobs, _start_worker)
 
 
 def detect_file(path: str, options: DetectionOptions) -> Outcome:
@@ -165,16 +148,7 @@ def keep_memory() -> None:
 
 
 def _start_worker() -> None:
-    """Prepare a worker process: its parent handles interrupts, and it uses one core."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    """Prepare a worker process, which uses one core."""
+    start_worker()
     cv2.setNumThreads(1)
     keep_memory()
-
-
-def _end_with_parent() -> None:
-    """End when the parent was killed: a worker would wait for work for ever, and hold its pipes open."""
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os.kill(os.getpid(), signal.SIGTERM)

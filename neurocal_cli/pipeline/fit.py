@@ -53,8 +53,19 @@ def fit(problem: Problem, options: Options) -> Solution:
 
 
 @_quietly
-def fit_again(solution: Solution, points: Correspondences, options: Options) -> Solution:
-    """Adjust a solution to other points of the same views, or of some of them."""
+def fit_again(
+    solution: Solution, points: Correspondences, options: Options, *, only_from_here: bool = False
+) -> Solution:
+    """Adjust a solution to other points of the same views, or of some of them.
+
+    Parameters
+    ----------
+    solution : Solution
+    points : Correspondences
+    options : Options
+    only_from_here : bool
+        Whether no other start is tried, because the solution is near the answer.
+    """
     if options.distortion == "plumb-line":
         return _plumb_line_first(solution.problem.with_points(points), options)
     problem = solution.problem.with_points(points)
@@ -66,13 +77,15 @@ def fit_again(solution: Solution, points: Correspondences, options: Options) -> 
         problem.adjust(replace(solution.adjusted, state=start)),
         replace(record, agreed=record.agreed[place]),
     )
-    return _finished(again, options)
+    return _finished(again, options, only_from_here)
 
 
-def _finished(solution: Solution, options: Options) -> Solution:
+def _finished(solution: Solution, options: Options, only_from_here: bool = False) -> Solution:
     """With its distortion model, and weights that the residuals bear out."""
     chosen = options.distortion == "auto"
-    if chosen:
+    if chosen and only_from_here:
+        solution = select_model(solution)
+    elif chosen:
         solution = _with_selected_model(solution, options)
     solution = reweighted(solution)
     if not chosen or solution.problem.points.covariance is not None:  # weighed anew, it may have moved

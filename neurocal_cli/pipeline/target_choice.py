@@ -9,8 +9,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
+from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Rejected
@@ -21,10 +24,15 @@ from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
+from neurocal_cli.verdict.given_parameters import asked_for
+from neurocal_cli.verdict.stated_noise import stated_noise
+from neurocal_cli.verdict.view_groups import view_groups
 
 __all__ = ["with_target"]
 
 _ROUNDS = 3
+_WORTH = 0.8  # of the views' number, where some repeat a pose
+_TOLD_APART = 5.0  # standard deviations, as for the verdict
 
 
 def with_target(
@@ -49,22 +57,44 @@ def with_target(
     if choice == "given" or solution.refusal or options.distortion == "plumb-line":
         return solution, rejected
     found = _found(solution, choice, None)
-    if found is None or (choice == "auto" and found.target.evidence < LEAST_GAIN):
+    if found is None:
+        return solution, rejected
+    if choice == "auto" and (found.target.evidence < LEAST_GAIN or _other_reason(solution)):
         return solution, rejected
     best: tuple[Solution, Rejected] = solution, rejected
     for _ in range(_ROUNDS):
-        before = best[0].problem.distortion.model
-        again = _fitted_to(problem, found.target, best, options)
+        (new, adjusted), *_ = found.fits
+        start = replace(solution, problem=new, adjusted=adjusted)
+        again = _fitted_to(problem, found.target, (start, best[1]), options)
         if again is None:
             break
+        lens = new.distortion.model
         found = _found(again[0], choice, found.target)
         if found is None:
             break
         (new, adjusted), *_ = found.fits
         best = replace(again[0], problem=new, adjusted=adjusted, target=found.target), again[1]
-        if new.distortion.model == before:
+        if new.distortion.model == lens:
             break
     return best
+
+
+def _other_reason(solution: Solution) -> bool:
+    """Whether stated sigmas, given parameters, two cameras or a zoom that moves are why, not the target."""
+    problem, points = solution.problem, solution.problem.points
+    place = np.array([problem.views.names.index(name) for name in points.view_names])
+    predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
+    if any(grade for grade, *_ in stated_noise(points, predicted - points.pixels)):
+        return True
+    if not problem.free_poses:
+        return False
+    asked = asked_for(problem.views, solution.state, problem.fixed, problem.free_poses)
+    if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
+        return True
+    free = problem.free_camera
+    return bool(problem.free.any()) and (
+        view_groups(problem.views, solution.state, solution.adjusted.normal, free) is not None
+    )
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
@@ -74,6 +104,8 @@ def _found(solution: Solution, choice: str, known: Target | None) -> Found | Non
     plane = planes_of(given, point) if known is None else known.plane
     if not enough_views(label, repeated.n_poses, int(plane.max()) + 1):
         return None
+    if choice == "auto" and repeated.worth < _WORTH:
+        return None  # errors that copies of a view share look like the target's
     # Only a lens that nobody named may change.
     find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
     return find([(problem, solution.adjusted)], choice == "flat", known)
@@ -88,7 +120,8 @@ def _fitted_to(
         if len(rejected) or rejected.views:
             again, rejected = fit_robustly(problem.with_points(target.applied(problem.points)), options)
         else:
-            again = fit_again(solution, target.applied(problem.points), options)
+            points = target.applied(problem.points)
+            again = fit_again(solution, points, options, only_from_here=True)
     except DegenerateGeometryError:
         return None
     return None if again.refusal else (again, rejected)

@@ -36,6 +36,8 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     """
     if choice == "given" or any(camera.straight_lines is not None for camera in cameras):
         return None
+    if choice == "auto" and any(camera.type != 1 for camera in cameras):
+        return None  # what is given may be wrong, and a target would take the blame
     known = cameras[0].target
     given, label, point = distinct_points([camera.points for camera in cameras])
     plane = planes_of(given, point) if known is None else known.plane

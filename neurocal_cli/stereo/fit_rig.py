@@ -14,7 +14,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.adjust import AdjustedRig, adjust_rig
 from neurocal_cli.stereo.assessment import assess_rig
 from neurocal_cli.stereo.contradiction import contradiction, is_significant
-from neurocal_cli.stereo.pair_covariance import rig_covariance
+from neurocal_cli.stereo.pair_covariance import not_smaller, rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views
 from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, free_parameters, rig_problem
 from neurocal_cli.stereo.relative_poses import relative_poses
@@ -22,6 +22,7 @@ from neurocal_cli.stereo.reprojection import Columns
 from neurocal_cli.stereo.result import assemble_rig, non_monotonic_sides
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import sound_pairs
+from neurocal_cli.stereo.target_covariance import with_target_uncertainty
 
 __all__ = ["fit_rig", "poses_on_rig"]
 
@@ -74,6 +75,9 @@ def fit_rig(
     adjusted, free, warnings = _adjusted(problem, (left, right), sound.rig, refine_cameras)
     luck = sound.luck and not sound.left_out
     least = _covariance(problem, (left, right), adjusted, free, luck)
+    if left.target is not None and left.target is right.target:
+        uncertain = with_target_uncertainty(left.target, problem, adjusted, free)
+        least = uncertain if least is None or uncertain is None else not_smaller(least, uncertain)
     rig = assemble_rig(problem, (left, right), adjusted, free, sound.left_out, least)
     _refuse_one_place(rig)
     if sound.left_out:

@@ -19,6 +19,7 @@ from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.geometry import Array, nearest_similarity
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.information import Information, Sight, information_of
+from neurocal_cli.target_shape.left_out import holds_for_views_left_out
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, posterior
 from neurocal_cli.target_shape.prior import prior_of
 
@@ -27,6 +28,7 @@ __all__ = ["LEAST_GAIN", "Found", "enough_views", "find_target"]
 _STEPS = 10
 _SETTLED = 0.02  # of the cameras' standard deviations
 _LARGEST = 0.02  # of the target's size: more is no target that happens to be bent
+_STRETCHED = 0.01  # prints are by a few thousandths; more is a square of another size along one side
 _FEWEST, _FEWEST_OF_FOLDED = 3, 2  # different views of most points
 LEAST_GAIN = 10.0
 """Of the logarithm of the evidence, for a target to be found unasked: sizes for four parts, each at a level
@@ -117,12 +119,19 @@ class _Search:
             if settled:
                 break
         gain = found.evidence - evidence_of_given(info)
+        if not holds_for_views_left_out(
+            self._sights(), self.prior, self.offsets, found.sizes, found.variance
+        ):
+            return None
         self._align()
-        return Found(self._target(found, gain), tuple(self.fits), found.evidence)
+        target = self._target(found, gain)
+        return Found(target, tuple(self.fits), found.evidence) if target.stretch() < _STRETCHED else None
+
+    def _sights(self) -> list[Sight]:
+        return [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
 
     def _information(self) -> Information:
-        sights = [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
-        return information_of(sights, len(self.given)).turned(self.prior.axes)
+        return information_of(self._sights(), len(self.given)).turned(self.prior.axes)
 
     def _move(self, found: Posterior) -> bool:
         if not np.abs(found.offsets).max() < _LARGEST * self.prior.size:

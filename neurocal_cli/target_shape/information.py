@@ -13,12 +13,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.point_batches import batches_of
+from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
 
-__all__ = ["Information", "Sight", "information_of", "labelled"]
+__all__ = ["Information", "Sight", "by_world", "information_of", "labelled", "point_terms"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,46 +115,104 @@ def information_of(sights: Sequence[Sight], n_points: int) -> Information:
 
 def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
     """Add what one camera saw; its cost."""
-    views, state = sight.views, sight.state
-    batches, px2 = views.batches, views.pixel_scale**2
+    views = sight.views
+    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
     label = labelled(views, sight.label)
-    f = camera_columns(len(state.k))[np.flatnonzero(sight.free)]
-    columns = np.concatenate([f, np.arange(POSE.start, POSE.stop), [-1]])
-    width, n = 12 + len(state.k), batches.local.shape[2]
-    m, q = len(f), np.arange(len(f), len(f) + 6)
-    by_batch = np.empty((len(batches.view), m + 7, m + 7))
-    point = np.empty((len(batches.view), n, 3, 3 + m + 7))
+    terms = point_terms(views.batches, sight.state, views.scale, label, columns, len(found.point))
+    normal, px2 = terms.normal, views.pixel_scale**2
+    found.camera[own, own] += px2 * normal[:, columns[:, None], columns].sum(axis=0)
+    found.camera_right[own] += px2 * normal[:, columns, -1].sum(axis=0)
+    found.point[...] += px2 * terms.point
+    found.point_camera[:, :, own] += px2 * terms.point_camera
+    found.point_right[...] += px2 * terms.point_right
+    if sight.free_poses:
+        found.pose[poses] = px2 * normal[:, POSE, POSE]
+        found.pose_camera[poses, :, own] = px2 * normal[:, POSE, columns]
+        found.pose_right[poses] = px2 * normal[:, POSE, -1]
+        found.pose_point[poses] = px2 * terms.pose_point
+    return px2 * float(normal[:, -1, -1].sum())
+
+
+@dataclass(frozen=True, eq=False)
+class PointTerms:
+    """Sums of products with the derivatives by the points of the target, of one camera, normalised.
+
+    Attributes
+    ----------
+    normal : (V, 12 + K, 12 + K) array
+        As from `normal_blocks`.
+    point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
+        Points in the world's axes and unit.
+    pose_point : (V, 6, n, 3) array
+    """
+
+    normal: Array
+    point: Array
+    point_camera: Array
+    point_right: Array
+    pose_point: Array
+
+
+def point_terms(
+    batches: PointBatches,
+    state: CameraState,
+    scale: Array,
+    label: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    n_points: int,
+) -> PointTerms:
+    """Sum up what one camera saw of the points.
+
+    Parameters
+    ----------
+    batches : PointBatches
+    state : CameraState
+    scale : (V,) array
+        S2 of each view [world unit].
+    label : (T, n) int array
+        The target's point in each place of the batches, -1: none.
+    columns : (f,) int array
+        Of the camera's parameters that count.
+    n_points : int
+        Points of the target.
+    """
+    width, n, f, V = 12 + len(state.k), batches.local.shape[2], len(columns), batches.n_views
+    used = np.concatenate([columns, np.arange(POSE.start, POSE.stop), [-1]])
+    by_batch = np.empty((len(batches.view), width, width))
+    point = np.empty((len(batches.view), n, 3, f + 10))
     buffer = batches.memory(width)
     for chunk in batches.chunks():
         view = batches.view[chunk]
         part = buffer[: len(view)]
         derivatives(batches, chunk, state, part)
-        J = part[:, columns].reshape(len(view), m + 7, 2 * n)
+        J = part.reshape(len(view), width, 2 * n)
         np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
-        # d Xc = R dM / S2: the derivative by tau is that by the point in front of the camera.
-        turn = np.swapaxes(state.R[view] / views.scale[view][:, None, None], 1, 2)
-        by_point = (turn @ part[:, 8:11].reshape(len(view), 3, 2 * n)).reshape(len(view), 3, 2, n)
-        rows = np.concatenate([by_point, part[:, columns]], axis=1)
+        by_point = by_world(part, state, scale, view)
+        rows = np.concatenate([by_point, part[:, used]], axis=1)
         np.matmul(np.moveaxis(by_point, 3, 1), np.moveaxis(rows, 3, 1).swapaxes(2, 3), out=point[chunk])
-    normal = px2 * batches.sum_by_view(by_batch)
-    found.camera[own, own] += normal[:, :m, :m].sum(axis=0)
-    found.camera_right[own] += normal[:, :m, -1].sum(axis=0)
     view = np.broadcast_to(batches.view[:, None], label.shape)
     real = label >= 0
-    flat, point = label[real], px2 * point[real]
-    summed = _summed_by(flat, point.reshape(len(flat), -1), len(found.point)).reshape(-1, 3, 3 + m + 7)
-    found.point[...] += summed[:, :, :3]
-    found.point_camera[:, :, own] += summed[:, :, 3 : 3 + m]
-    found.point_right[...] += summed[:, :, -1]
-    if sight.free_poses:
-        found.pose[poses] = normal[:, q[:, None], q]
-        found.pose_camera[poses, :, own] = normal[:, q, :m]
-        found.pose_right[poses] = normal[:, q, -1]
-        cross = np.swapaxes(point[:, :, 3 + m : -1], 1, 2)
-        at = np.zeros((views.n_views * len(found.point), 6, 3))
-        np.add.at(at, view[real] * len(found.point) + flat, cross)
-        found.pose_point[poses] = np.swapaxes(at.reshape(views.n_views, -1, 6, 3), 1, 2)
-    return float(normal[:, -1, -1].sum())
+    flat, point = label[real], point[real]
+    summed = _summed_by(flat, point.reshape(len(flat), -1), n_points).reshape(-1, 3, f + 10)
+    cross = np.zeros((V * n_points, 6, 3))
+    np.add.at(cross, view[real] * n_points + flat, np.swapaxes(point[:, :, 3 + f : -1], 1, 2))
+    return PointTerms(
+        batches.sum_by_view(by_batch),
+        summed[:, :, :3],
+        summed[:, :, 3 : 3 + f],
+        summed[:, :, -1],
+        np.swapaxes(cross.reshape(V, n_points, 6, 3), 1, 2),
+    )
+
+
+def by_world(part: Array, state: CameraState, scale: Array, view: NDArray[np.intp]) -> Array:
+    """(T, 3, 2, n) derivatives by the world's coordinates, from those of `derivatives`.
+
+    d Xc = R dM / S2, and the derivative by tau is that by the point in front of the camera.
+    """
+    turn = np.swapaxes(state.R[view] / scale[view][:, None, None], 1, 2)
+    by_tau = part[:, POSE.start + 3 : POSE.stop]
+    return np.asarray((turn @ by_tau.reshape(len(view), 3, -1)).reshape(by_tau.shape))
 
 
 def labelled(views: Views, label: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -22,10 +22,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import unit_diagonal
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
 
-__all__ = ["Posterior", "evidence_of_given", "known_sizes", "posterior"]
+__all__ = ["Posterior", "cost_at", "evidence_of_given", "known_sizes", "posterior"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,19 +88,29 @@ _PASSES = 40
 def evidence_of_given(info: Information) -> float:
     """Logarithm of the evidence of the target as it is given."""
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
-    if len(info.pose):
-        root = np.linalg.inv(np.linalg.cholesky(info.pose))
-        rows = root @ np.concatenate([info.pose_camera, info.pose_right[..., None]], axis=2)
-        logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
-        flat = rows.reshape(-1, rows.shape[2])
-    else:
-        flat, logdet = np.zeros((0, len(info.camera) + 1)), 0.0
+    S, g, cost, logdet = _poses_eliminated(info)
+    cost -= float(g @ np.linalg.solve(S, g)) if len(g) else 0.0
+    return _log_evidence(spare, cost, logdet + (float(np.linalg.slogdet(S)[1]) if len(g) else 0.0))
+
+
+def cost_at(info: Information, offsets: Array) -> float:
+    """Squared error with these offsets (n, 3), at the best cameras and poses for them."""
+    S, g, cost, _ = _poses_eliminated(info.around_given(-offsets))
+    scaled, scale = unit_diagonal(S)
+    return cost - float((scale * g) @ np.linalg.pinv(scaled, hermitian=True) @ (scale * g))
+
+
+def _poses_eliminated(info: Information) -> tuple[Array, Array, float, float]:
+    """The cameras' matrix, right side and cost; the logarithm of the determinant of the poses' part."""
+    if not len(info.pose):
+        return info.camera, info.camera_right, info.cost, 0.0
+    root = np.linalg.inv(np.linalg.cholesky(info.pose))
+    rows = root @ np.concatenate([info.pose_camera, info.pose_right[..., None]], axis=2)
+    flat = rows.reshape(-1, rows.shape[2])
     S = info.camera - flat[:, :-1].T @ flat[:, :-1]
     g = info.camera_right - flat[:, :-1].T @ flat[:, -1]
-    step = np.linalg.solve(S, g) if len(g) else g
-    logdet += float(np.linalg.slogdet(S)[1]) if len(g) else 0.0
-    cost = info.cost - float(flat[:, -1] @ flat[:, -1]) - float(g @ step)
-    return _log_evidence(spare, cost, logdet)
+    logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+    return S, g, info.cost - float(flat[:, -1] @ flat[:, -1]), logdet
 
 
 def _log_evidence(spare: float, cost: float, logdet: float) -> float:
@@ -123,6 +134,7 @@ class _System:
         self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
         pose_basis = info.pose_point.reshape(self.P * 6, 3 * self.n) @ basis.reshape(3 * self.n, self.m)
         self.pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, 6, self.m)], axis=2)
+        self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
         self.points_first = 3 * self.n >= 6 * self.P
         if not self.points_first:
             self._eliminate_poses()
@@ -167,7 +179,9 @@ class _System:
         cost = float(self.dense[-1, -1] - self.dense[:dim, -1] @ x)
         var_single = np.diagonal(inverse)[s:].reshape(self.n, 3)
         with_offsets = self._with_offsets(inverse[:f, f:s], inverse[:f, s:].reshape(f, self.n, 3))
-        var = self._variance(inverse[f:s, f:s], inverse[f:s, s:].reshape(self.m, self.n, 3), var_single)
+        cross = inverse[f:s, s:].reshape(self.m, self.n, 3)
+        along_gauge = (inverse[s:, s:] @ self.gauge).reshape(self.n, 3, -1)
+        var = self._variance(inverse[f:s, f:s], cross, var_single, along_gauge)
         return _Solved(
             x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
             np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], with_offsets, var,
@@ -206,7 +220,9 @@ class _System:
         )
         logdet -= 2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
         cross = -spread.T.reshape(dim, n, 3)
-        var = self._variance(inverse[f:s, f:s], cross[f:s], var_single)
+        own = ((back @ root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
+        along_gauge = own + spread @ (follow.reshape(3 * n, dim).T @ self.gauge)
+        var = self._variance(inverse[f:s, f:s], cross[f:s], var_single, along_gauge.reshape(n, 3, -1))
         return _Solved(
             x[:f], x[f:s], e, cost, logdet, np.diagonal(inverse)[f:s], var_single,
             inverse[:f, :f], self._with_offsets(inverse[:f, f:s], cross[:f]), var,
@@ -216,12 +232,20 @@ class _System:
         """(f, n, 3) covariance between the cameras and the whole offsets."""
         return np.asarray(np.einsum("fm,nim->fni", smooth, self.prior.basis) + single)
 
-    def _variance(self, smooth: Array, cross: Array, single: Array) -> Array:
-        """(n, 3) variance of the whole offsets."""
-        basis = self.prior.basis
-        return np.asarray(
+    def _variance(self, smooth: Array, cross: Array, single: Array, single_gauge: Array) -> Array:
+        """(n, 3) variance of the whole offsets, without turns, shifts and a scale of all points together.
+
+        With G the orthonormal directions of these, it is the diagonal of (I - G G^T) C (I - G G^T).
+        """
+        basis, G = self.prior.basis, self.gauge.reshape(self.n, 3, -1)
+        diagonal = (
             ((basis @ smooth) * basis).sum(axis=2) + 2 * np.einsum("nim,mni->ni", basis, cross) + single
         )
+        by_smooth = np.einsum("nim,nig->mg", basis, G)
+        C_G = basis @ (smooth @ by_smooth + np.einsum("mni,nig->mg", cross, G))
+        C_G += np.einsum("mni,mg->nig", cross, by_smooth) + single_gauge
+        inner = np.einsum("nig,nih->gh", G, C_G)
+        return np.asarray(diagonal - 2 * (G * C_G).sum(axis=2) + ((G @ inner) * G).sum(axis=2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -373,7 +397,7 @@ class _Parts:
         for name, ratio in now.ratios.items():
             w, var, unit = self._coefficients(now, name)
             determined += w.size - (unit / ratio) ** 2 * float(var.sum())
-        along = solved.camera_offsets.reshape(f, -1)
+        along = solved.camera_offsets.reshape(f, 3 * n)
         followed = np.asarray(-np.linalg.solve(solved.camera_covariance, along) if f else along)
         noise = np.sqrt(now.variance)
         return Posterior(

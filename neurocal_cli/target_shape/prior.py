@@ -41,6 +41,8 @@ class Prior:
         Offsets along these axes [world unit] for each coefficient of 1.
     groups : dict of int array by name
         Coefficients of the same size.
+    gauge : (3 n, 7) array
+        Orthonormal directions that no photograph tells: shifts, turns and a scale of the whole target.
     size : float
         Of the target [world unit].
     """
@@ -48,6 +50,7 @@ class Prior:
     axes: Array
     basis: Array
     groups: dict[str, NDArray[np.intp]]
+    gauge: Array
     size: float
 
     def along_axes(self, world: Array) -> Array:
@@ -86,7 +89,16 @@ def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:
         new = np.arange(first, first + part.shape[2])
         groups[name] = np.concatenate([groups[name], new]) if name in groups else new
         first += part.shape[2]
-    return Prior(axes, size * np.concatenate([part for _, part in parts], axis=2), groups, size)
+    basis = size * np.concatenate([part for _, part in parts], axis=2)
+    return Prior(axes, basis, groups, _gauge(given, axes), size)
+
+
+def _gauge(given: Array, axes: Array) -> Array:
+    centred = given - given.mean(axis=0)
+    shifts = np.broadcast_to(np.eye(3), (len(given), 3, 3))
+    turns = np.stack([np.cross(unit, centred) for unit in np.eye(3)], axis=2)
+    world = np.concatenate([shifts, turns, centred[..., None]], axis=2)
+    return np.linalg.qr((np.swapaxes(axes, 1, 2) @ world).reshape(3 * len(given), 7))[0]
 
 
 def _axes(given: Array) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, camera_colu
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target
-from neurocal_cli.target_shape.information import Sight, information_of, labelled
+from neurocal_cli.target_shape.information import Sight, by_world, information_of, labelled
 from neurocal_cli.target_shape.posterior import known_sizes
 from neurocal_cli.target_shape.prior import prior_of
 
@@ -87,8 +87,7 @@ def _efficient(
         view = batches.view[chunk]
         part = buffer[: len(view)]
         derivatives(batches, chunk, state, part)
-        turn = np.swapaxes(state.R[view] / views.scale[view][:, None, None], 1, 2)
-        by_point = (turn @ part[:, 8:11].reshape(len(view), 3, 2 * n)).reshape(len(view), 3, 2, n)
+        by_point = by_world(part, state, views.scale, view)
         J = part.copy()
         J[:, columns] -= np.einsum("ftni,ticn->tfcn", followed[:, label[chunk]], by_point)
         J = J.reshape(len(view), width, 2 * n)

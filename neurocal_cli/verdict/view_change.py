@@ -33,6 +33,7 @@ __all__ = ["ViewChange", "in_sequence", "view_change"]
 # boards, whose views differ by more than noise, none is.
 _LINE = 3.5  # sigmas: one in 2000 for each
 _BY_POSE = 4.0  # sigmas: poses differ in six ways, and what a lens leaves differs with them
+_MOST_BY_POSE = 0.1  # of the focal length: no focus changes it by more
 _NEARER = 0.1  # of the farthest distance: less tells nothing of the focus
 _TURNED = 0.2  # rad
 _STEP = 4.5  # sigmas, of the largest of all steps
@@ -224,7 +225,10 @@ def _patterns(
 
     for name, values in lines.items():
         amount, sigmas = test.pattern((values - values.mean()) / max(float(np.ptp(values)), 1e-300))
-        if abs(sigmas := beyond_scatter(sigmas)) > (_LINE if values is place else _BY_POSE):
+        by_pose = name != "line"
+        if by_pose and abs(amount) > _MOST_BY_POSE:
+            continue
+        if abs(sigmas := beyond_scatter(sigmas)) > (_BY_POSE if by_pose else _LINE):
             yield name, everywhere, amount, sigmas
     amounts, all_sigmas = test.cumulative(order)
     k = int(np.argmax(np.abs(all_sigmas[1:-1]))) + 1

@@ -1,0 +1,343 @@
+"""``neurocal simulate``: known cameras calibrated again and again, with every error known."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from neurocal_cli.commands.method_names import MethodNames
+from neurocal_cli.commands.options import INPUT, Command, FiniteNumber, check_plot, json_option
+from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.progress import ProgressBar
+from neurocal_cli.commands.streams import check_one_stdin, note
+from neurocal_cli.commands.threads import compute_in_one_thread
+from neurocal_cli.errors import UsageError
+
+if TYPE_CHECKING:
+    from neurocal_cli.simulation.scenes import SimulatedScene
+
+__all__ = ["simulate"]
+
+_SIGMA = (0.1, 0.2, 0.5, 1.0, 2.0)
+_DEFAULT_METHODS = "neuro,nonlinear,linear,tsai"
+_FLAT_VIEWS = 10
+_STARTS_SIGMA = 0.5  # px
+
+
+class _Command(Command):
+    """A command that takes several values after --sigma, as in ``--sigma 0.5 1 2``."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        expanded: list[str] = []
+        after = False
+        for word in args:
+            if after and _is_number(word) and expanded[-1] != "--sigma":
+                expanded.append("--sigma")
+            elif not (after and _is_number(word)):
+                after = word == "--sigma"
+            expanded.append(word)
+        return super().parse_args(ctx, expanded)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+@click.command(cls=_Command)
+@click.option(
+    "--camera",
+    metavar="CAMERA.yaml",
+    type=INPUT,
+    show_default="the camera of the paper's Table 1",
+    help="The true camera: a neurocal, ROS or OpenCV file. A neurocal file also brings its points and poses.",
+)
+@click.option(
+    "--board",
+    metavar="BOARD.yaml",
+    type=INPUT,
+    show_default="two boards at a right angle, 440 points",
+    help="The target, as for detect; the points are its mid-points.",
+)
+@click.option(
+    "--views",
+    metavar="N",
+    type=click.IntRange(1, 1000),
+    show_default="1, and 10 of a flat board",
+    help="Number of random poses of the target. Without it, that of Table 1 or those of CAMERA.yaml.",
+)
+@click.option(
+    "--sigma",
+    metavar="PX...",
+    type=FiniteNumber(positive=True),
+    multiple=True,
+    default=_SIGMA,
+    show_default="0.1 0.2 0.5 1 2",
+    help="Standard deviations of the noise in u and in v.",
+)
+@click.option(
+    "--trials",
+    metavar="N",
+    type=click.IntRange(min=1),
+    default=50,
+    help="Number of trials at each sigma, as in the paper.",
+)
+@click.option(
+    "--methods",
+    metavar="M,...",
+    type=MethodNames(),
+    default=_DEFAULT_METHODS,
+    help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro with "
+    "the paper's trainer.",
+)
+@click.option(
+    "--random-starts",
+    metavar="N",
+    type=click.IntRange(min=0),
+    default=50,
+    help="Number of single random starts of the network and of plain Levenberg-Marquardt; 0 leaves them out.",
+)
+@click.option(
+    "--rates",
+    is_flag=True,
+    show_default="noise and random starts",
+    help="Study the two learning rates of backprop instead, on many data sets.",
+)
+@click.option(
+    "--data-sets",
+    metavar="N",
+    type=click.IntRange(min=1),
+    default=70,
+    help="With --rates: number of data sets.",
+)
+@click.option(
+    "--seed", metavar="S", type=click.IntRange(min=0), default=0, help="Seed of everything that is random."
+)
+@click.option(
+    "--jobs",
+    metavar="N",
+    type=click.IntRange(min=1),
+    show_default="the number of cores",
+    help="Number of processes; the results are the same for any number.",
+)
+@click.option(
+    "--save",
+    metavar="DIR",
+    type=click.Path(readable=False),
+    show_default="none",
+    help="Write the true camera, its exact points and noisy points of each sigma to this folder.",
+)
+@click.option(
+    "--images",
+    is_flag=True,
+    show_default="points only",
+    help="With --save: also write rendered images of the target, and the exact points that they show.",
+)
+@click.option(
+    "--plot",
+    metavar="FILE.png",
+    type=click.Path(writable=False, readable=False),
+    show_default="none",
+    help="Plot the errors over the noise and the random starts, or with --rates the rates, to this .png, "
+    ".pdf or .svg file.",
+)
+@json_option
+def simulate(
+    camera: str | None,
+    board: str | None,
+    views: int | None,
+    sigma: tuple[float, ...],
+    trials: int,
+    methods: tuple[str, ...],
+    random_starts: int,
+    rates: bool,
+    data_sets: int,
+    seed: int,
+    jobs: int | None,
+    save: str | None,
+    images: bool,
+    plot: str | None,
+    as_json: bool,
+) -> None:
+    """Calibrate simulated cameras, and compare methods where the truth is known.
+
+    A camera looks at a target, and noise is added to the exact pixels. Each method calibrates from the
+    same points. The command prints each method's error without noise; its rms error over many trials for
+    each noise level beside the Cramer-Rao bound, the smallest that any unbiased method can have; its mean
+    error; and how many single random starts reach the minimum of the reprojection error, of the network
+    and of plain Levenberg-Marquardt. Without options it repeats the paper's section 5.1.
+
+    A method that takes something for given is told the truth: tsai the image centre and right angles,
+    opencv right angles. Its bound is that of the fewer unknowns. Parameters of poses are averaged over
+    all views.
+
+    With --rates the paper's trainer learns from one random start on each of many varied data sets, with
+    each pair of a grid of learning rates.
+
+    \b
+    Examples:
+      neurocal simulate --trials 10 --sigma 0.2 1 --random-starts 10 --plot fig1.png
+      neurocal simulate --methods neuro,linear,opencv --random-starts 0 --json
+      neurocal calibrate sample_data/flat.csv --no-skew -o camera.yaml
+      neurocal simulate --camera camera.yaml --sigma 0.1 --trials 5 \\
+          --random-starts 0 --seed 1
+      echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
+      neurocal simulate --camera camera.yaml --board board.yaml --views 4 \\
+          --sigma 0.2 --trials 2 --random-starts 2 --save simulated --images --jobs 1
+      neurocal simulate --rates --data-sets 1
+    """  # noqa: D301 - as in the group
+    check_one_stdin(camera, board)
+    _check(rates, save, images, (camera, board, views))
+    if plot is not None:
+        check_plot(plot, "-")
+    check_outputs((plot,), (camera, board))
+    compute_in_one_thread()
+
+    from neurocal_cli.processes import usable_cores
+
+    processes = jobs or usable_cores()
+    if rates:
+        _rates(data_sets, seed, processes, plot, as_json)
+        return
+    scene, paper = _scene(camera, board, views, seed)
+    if save is not None:
+        _save(scene, save, sigma, seed, images)
+    _compare(scene, paper, sigma, trials, methods, random_starts, seed, processes, plot, as_json)
+
+
+def _check(rates: bool, save: str | None, images: bool, scene: tuple[object, ...]) -> None:
+    if images and save is None:
+        raise UsageError("--images needs a place to write to; give --save DIR")
+    if rates and (save is not None or any(part is not None for part in scene)):
+        raise UsageError("--rates makes its own data sets; leave out --camera, --board, --views and --save")
+    if save is not None and os.path.exists(save) and not os.path.isdir(save):
+        raise UsageError(f"--save {save} is a file; give a folder")
+
+
+def _scene(
+    camera_file: str | None, board_file: str | None, views: int | None, seed: int
+) -> tuple[SimulatedScene, bool]:
+    """The scene, and whether it is the paper's."""
+    import numpy as np
+
+    from neurocal_cli.errors import FormatError
+    from neurocal_cli.simulation import scenes
+
+    if camera_file is None and board_file is None and views is None:
+        return scenes.paper_scene(), True
+    camera, board = scenes.PAPER_CAMERA, scenes.PAPER_BOARD
+    if board_file is not None:
+        from neurocal_cli.io.board_yaml import read_board
+
+        board = read_board(board_file)
+    if camera_file is not None:
+        from neurocal_cli.io.calibration_yaml import read_calibration
+        from neurocal_cli.io.camera_files import read_intrinsics
+
+        if board_file is None and views is None and camera_file != "-":
+            try:
+                return scenes.calibrated_scene(read_calibration(camera_file)), False
+            except FormatError:
+                note([f"{camera_file} holds no points of its own; the paper's boards are used"])
+        camera = read_intrinsics(camera_file)
+    count = views or (_FLAT_VIEWS if len(board.planes) == 1 else 1)
+    poses = scenes.random_poses(camera, board, count, np.random.default_rng((seed, 2)))
+    return scenes.scene_of(camera, board, poses), False
+
+
+def _compare(
+    scene: SimulatedScene,
+    paper: bool,
+    sigma: tuple[float, ...],
+    trials: int,
+    methods: tuple[str, ...],
+    random_starts: int,
+    seed: int,
+    jobs: int,
+    plot: str | None,
+    as_json: bool,
+) -> None:
+    from neurocal_cli.simulation.noise import study_noise
+    from neurocal_cli.simulation.report import noise_json, simulation_tables, starts_json
+    from neurocal_cli.simulation.starts import study_starts
+
+    levels = tuple(sorted(set(sigma)))
+    with ProgressBar() as progress:
+        study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
+        starts = None
+        if random_starts:
+            starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
+    if plot is not None:
+        from neurocal_cli.io.writing import write_whole
+        from neurocal_cli.simulation.plots import draw_simulation
+
+        write_whole(plot, draw_simulation(study, starts, scene.unit, _kind(plot)))
+    if as_json:
+        found: dict[str, Any] = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
+        found |= noise_json(study)
+        if starts is not None:
+            found["random_starts"] = starts_json(starts)
+        click.echo(json.dumps(found, indent=2, allow_nan=False))
+    else:
+        _show(*simulation_tables(study, starts, paper))
+
+
+def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
+    from neurocal_cli.simulation.rates import study_rates
+    from neurocal_cli.simulation.report import rates_json, rates_tables
+
+    with ProgressBar() as progress:
+        study = study_rates(data_sets, seed, jobs, progress)
+    if plot is not None:
+        from neurocal_cli.io.writing import write_whole
+        from neurocal_cli.simulation.plots import draw_rates
+
+        write_whole(plot, draw_rates(study, _kind(plot)))
+    if as_json:
+        click.echo(json.dumps(rates_json(study), indent=2, allow_nan=False))
+    else:
+        _show(*rates_tables(study))
+
+
+def _show(tables: list[tuple[str, list[list[str]]]], below: list[str]) -> None:
+    from neurocal_cli.simulation.report import text_of
+
+    click.echo(text_of(tables, below))
+
+
+def _kind(plot: str) -> str:
+    return os.path.splitext(plot)[1][1:].lower()
+
+
+def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: int, images: bool) -> None:
+    """Write the truth and what follows from it; the noisy points are those of the first trial."""
+    import numpy as np
+
+    from neurocal_cli.io.board_yaml import write_board
+    from neurocal_cli.io.calibration_yaml import write_calibration
+    from neurocal_cli.io.points_csv import write_points
+    from neurocal_cli.simulation.truth import true_calibration
+
+    os.makedirs(folder, exist_ok=True)
+    write_calibration(true_calibration(scene), os.path.join(folder, "truth.yaml"))
+    write_points(scene.points(), os.path.join(folder, "exact.csv"))
+    for k, level in enumerate(sorted(set(sigma))):
+        points = scene.points(level, np.random.default_rng((seed, k, 0)))
+        write_points(points, os.path.join(folder, f"sigma_{level:g}.csv"))
+    if scene.board is not None:
+        write_board(scene.board, os.path.join(folder, "board.yaml"))
+    if images:
+        from neurocal_cli.io.images import encode_png
+        from neurocal_cli.io.writing import write_whole
+        from neurocal_cli.simulation.pictures import pictures, visible_points
+
+        drawn = list(pictures(scene, seed))
+        for one in drawn:
+            write_whole(os.path.join(folder, f"{one.name}.png"), encode_png(one.image))
+        write_points(visible_points(scene, drawn), os.path.join(folder, "visible.csv"))

@@ -1,0 +1,1 @@
+"""The network and the methods beside it, on the same points."""

@@ -1,0 +1,53 @@
+"""One call for every method, each with the distortion model nearest to the one that is asked for."""
+
+from __future__ import annotations
+
+from neurocal_cli.baselines.calibrate_by import calibrate_by
+from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.methods import calibrate
+from neurocal_cli.points import Correspondences
+
+__all__ = ["METHODS", "calibrate_with"]
+
+METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
+
+
+def calibrate_with(
+    method: str, points: Correspondences, model: str, skew: bool = True, seed: int = 0
+) -> Calibration:
+    """Calibrate a camera of which nothing is given (type 1) from all points by a method.
+
+    Parameters
+    ----------
+    method : str
+        One of `METHODS`; backprop is the network with the paper's trainer, opencv is `calibrateCamera`.
+    points : Correspondences
+    model : str
+        Distortion model; linear has none, and tsai k1 alone.
+    skew : bool
+    seed : int
+
+    Raises
+    ------
+    NeurocalError
+        The method cannot answer.
+    """
+    if method == "opencv":
+        return calibrate_by("opencv", problem_for(points, 1, skew=skew, distortion=Distortion(model)))
+    trainer = "backprop" if method == "backprop" else "lm"
+    if method == "linear":
+        model = "none"
+    elif method == "tsai" and model != "none":
+        model = "k1"
+    return calibrate(
+        points,
+        method="neuro" if method == "backprop" else method,
+        trainer=trainer,
+        distortion=model,
+        skew=skew,
+        outliers="keep",
+        seed=seed,
+        target="given",  # what the other methods do not find
+    )

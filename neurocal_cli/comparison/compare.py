@@ -1,0 +1,166 @@
+"""All methods on a user's own points: errors, time, parameters; for a pair the paper's Table 2 too."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.comparison.by_method import calibrate_with
+from neurocal_cli.errors import NeurocalError
+from neurocal_cli.methods import calibrate
+from neurocal_cli.points import Correspondences
+from neurocal_cli.stereo.evaluation import StereoEvaluation, evaluate_stereo
+
+__all__ = ["Compared", "Comparison", "compare"]
+
+_FOLDS = 5
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """What one method makes of one camera's points.
+
+    Attributes
+    ----------
+    calibration : Calibration or None
+        None where the method has no answer.
+    held_out_px : float [px]
+        Rms error on points that the fit did not see, in five folds; nan where a fold has no answer.
+    seconds : float
+        Of the calibration.
+    problem : str
+        Why there is no answer.
+    """
+
+    calibration: Calibration | None
+    held_out_px: float = np.nan
+    seconds: float = np.nan
+    problem: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """What `compare` finds.
+
+    Attributes
+    ----------
+    points : tuple of Correspondences
+        Of one camera or two, those that every method got.
+    cameras : tuple of dict of Compared by method
+    stereo : dict of StereoEvaluation by method, or None
+        Of two cameras, each calibrated alone as in the paper's section 5.2; for one camera None.
+    notes : tuple of str
+    """
+
+    points: tuple[Correspondences, ...]
+    cameras: tuple[dict[str, Compared], ...]
+    stereo: dict[str, StereoEvaluation] | None
+    notes: tuple[str, ...]
+
+
+def compare(
+    points: Sequence[Correspondences],
+    methods: Sequence[str],
+    distortion: str = "auto",
+    skew: bool = True,
+    outliers: str = "reject",
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Comparison:
+    """Calibrate one camera or two by every method.
+
+    Parameters
+    ----------
+    points : one or two of Correspondences
+        With two, their views are paired by name.
+    methods : sequence of str
+        Of `by_method.METHODS`.
+    distortion : str
+        auto: the model that the network's calibration chooses.
+    skew : bool
+    outliers : {"reject", "keep"}
+        reject: points that the network's calibration rejects are left out for all methods.
+    seed : int
+    progress : callable, optional
+
+    Raises
+    ------
+    NeurocalError
+        Points from which the network's calibration has no answer either.
+    """
+    report = progress or (lambda stage, share: None)
+    notes: list[str] = []
+    kept: list[Correspondences] = []
+    cameras: list[dict[str, Compared]] = []
+    steps, done = len(points) * (1 + len(methods)), 0
+    for one in points:
+        first = calibrate(one, distortion=distortion, skew=skew, outliers=outliers, seed=seed, target="given")
+        if first.n_rejected:
+            notes.append(f"{one.source}: {first.n_rejected} outliers are left out for all methods")
+        kept.append(first.points)
+        done += 1
+        rows: dict[str, Compared] = {}
+        for method in methods:
+            report(method, done / steps)
+            rows[method] = _compared(method, first.points, first.distortion_model, skew, seed)
+            done += 1
+        cameras.append(rows)
+    stereo = _stereo(cameras, methods, notes) if len(cameras) == 2 else None
+    return Comparison(tuple(kept), tuple(cameras), stereo, tuple(notes))
+
+
+def _compared(method: str, points: Correspondences, model: str, skew: bool, seed: int) -> Compared:
+    start = time.perf_counter()
+    try:
+        found = calibrate_with(method, points, model, skew, seed)
+    except NeurocalError as error:
+        return Compared(None, problem=str(error))
+    seconds = time.perf_counter() - start
+    return Compared(found, _held_out(method, points, model, skew, seed), seconds)
+
+
+def _held_out(method: str, points: Correspondences, model: str, skew: bool, seed: int) -> float:
+    """Rms error [px] of points of each view that the camera and the view's pose were found without."""
+    rng = np.random.default_rng(seed)
+    # Every fifth point of each view, in a random order of its points.
+    order = np.lexsort((rng.random(len(points)), points.view_index))
+    fold = np.empty(len(points), dtype=np.intp)
+    fold[order] = np.arange(len(points)) % _FOLDS
+    squares = 0.0
+    for k in range(_FOLDS):
+        try:
+            found = calibrate_with(method, points.select(fold != k), model, skew, seed)
+        except NeurocalError:
+            return np.nan
+        rest = points.select(fold == k)
+        squares += float((_residuals(found, rest) ** 2).sum())
+    return float(np.sqrt(squares / len(points)))
+
+
+def _residuals(calibration: Calibration, points: Correspondences) -> np.ndarray:
+    """(N, 2) predicted minus seen [px]."""
+    poses = [calibration.views[name].pose for name in points.view_names]
+    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+    inside = (R[points.view_index] @ points.world[..., None])[..., 0] + t[points.view_index]
+    return calibration.camera.project(inside)[0] - points.pixels
+
+
+def _stereo(
+    cameras: list[dict[str, Compared]], methods: Sequence[str], notes: list[str]
+) -> dict[str, StereoEvaluation]:
+    found = {}
+    for method in methods:
+        left, right = (camera[method].calibration for camera in cameras)
+        if left is None or right is None:
+            continue
+        try:
+            found[method] = evaluate_stereo(left, right)
+        except NeurocalError as error:
+            notes.append(f"{method}: {error}")
+    return found

@@ -1,0 +1,165 @@
+"""Comparisons as tables and as JSON."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.comparison.compare import Compared, Comparison
+from neurocal_cli.report import align, number_or_none, rounded
+
+__all__ = ["comparison_json", "comparison_report"]
+
+_MODELS = {"none": "no distortion"}
+_SIDES = "left", "right"
+
+
+def comparison_report(comparison: Comparison) -> str:
+    """Tables of errors and of parameters for each camera; of triangulated points for two."""
+    blocks: list[str] = []
+    for side, camera in enumerate(comparison.cameras):
+        points = comparison.points[side]
+        name = f"{_SIDES[side]} camera, " if len(comparison.cameras) == 2 else ""
+        blocks.append(_table(f"{name}{len(points)} points in {points.n_views} views", _errors(camera)))
+        blocks.append(_table(f"{name}parameters", _parameters(camera)))
+    if comparison.stereo is not None:
+        blocks.append(_table("both cameras, each calibrated alone", _triangulation(comparison)))
+    blocks.append("\n".join(_below(comparison)))
+    return "\n\n".join(block for block in blocks if block)
+
+
+def _table(title: str, rows: list[list[str]]) -> str:
+    return "\n".join([title, *align(rows)])
+
+
+def _errors(camera: dict[str, Compared]) -> list[list[str]]:
+    rows = [["method", "rms [px]", "held-out [px]", "time [ms]", "distortion"]]
+    for method, one in camera.items():
+        if one.calibration is None:
+            rows.append([method, "-", "-", "-", "-"])
+            continue
+        model = one.calibration.distortion_model
+        milliseconds = f"{1000 * one.seconds:.0f}"
+        rows.append(
+            [
+                method,
+                _px(one.calibration.rmse_px),
+                _px(one.held_out_px),
+                milliseconds,
+                _MODELS.get(model, model),
+            ]
+        )
+    return rows
+
+
+def _parameters(camera: dict[str, Compared]) -> list[list[str]]:
+    known = {method: one.calibration for method, one in camera.items() if one.calibration is not None}
+    names = [*INTRINSIC_NAMES]
+    for calibration in known.values():
+        names += [n for n in coefficient_names(calibration.distortion_model) if n not in names]
+    rows = [["parameter", *known]]
+    rows += [[name, *(_value(calibration, name) for calibration in known.values())] for name in names]
+    return rows
+
+
+def _value(calibration: Calibration, name: str) -> str:
+    values = _values(calibration)
+    if name not in values:
+        return "-"
+    if name in calibration.fixed:
+        return f"{values[name]:.6g} given"
+    value, std = rounded(values[name], calibration.std[name])
+    return f"{value} +- {std}"
+
+
+def _values(calibration: Calibration) -> dict[str, float]:
+    values = {name: float(getattr(calibration.intrinsics, name)) for name in INTRINSIC_NAMES}
+    names = coefficient_names(calibration.distortion_model)
+    return values | dict(zip(names, map(float, calibration.distortion), strict=True))
+
+
+def _triangulation(comparison: Comparison) -> list[list[str]]:
+    assert comparison.stereo is not None
+    unit = comparison.points[0].unit
+    rows = [
+        ["method", f"RMSE [{unit}]", "NSCE", f"baseline [{unit}]", f"through one rig: RMSE [{unit}]", "NSCE"]
+    ]
+    for method, one in comparison.stereo.items():
+        rig = ["-", "-"] if one.rig is None else [_px(one.rig.rmse), _px(one.rig.nsce)]
+        rows.append([method, _px(one.by_view.rmse), _px(one.by_view.nsce), f"{one.baseline:.2f}", *rig])
+    return rows
+
+
+def _below(comparison: Comparison) -> list[str]:
+    """Which method has the lowest errors, and why a method has none."""
+    lines = []
+    for side, camera in enumerate(comparison.cameras):
+        name = f"{_SIDES[side]} camera: " if len(comparison.cameras) == 2 else ""
+        errors = {method: one.held_out_px for method, one in camera.items()}
+        lines += _lowest(f"{name}lowest held-out error", errors, " px")
+        lines += [f"{name}{method}: {one.problem}" for method, one in camera.items() if one.problem]
+    if comparison.stereo is not None:
+        unit = comparison.points[0].unit
+        found = comparison.stereo
+        lines += _lowest(
+            "lowest RMSE", {method: one.by_view.rmse for method, one in found.items()}, f" {unit}"
+        )
+        lines += _lowest("lowest NSCE", {method: one.by_view.nsce for method, one in found.items()}, "")
+    return lines
+
+
+def _lowest(what: str, errors: dict[str, float], unit: str) -> list[str]:
+    """The best method, with those that no digit of the table tells from it."""
+    known = {method: error for method, error in errors.items() if math.isfinite(error)}
+    if not known:
+        return []
+    best = min(known.values())
+    winners = [method for method, error in known.items() if _px(error) == _px(best)]
+    return [f"{what}: {' and '.join(winners)}, {_px(best)}{unit}"]
+
+
+def _px(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "-"
+
+
+def comparison_json(comparison: Comparison) -> dict[str, Any]:
+    """The comparison as values that JSON can hold; a number that does not exist is None."""
+    found: dict[str, Any] = {
+        "n_points": [len(points) for points in comparison.points],
+        "cameras": [
+            {method: _camera_json(one) for method, one in camera.items()} for camera in comparison.cameras
+        ],
+    }
+    if comparison.stereo is not None:
+        found["unit"] = comparison.points[0].unit
+        found["stereo"] = {
+            method: {
+                "rmse": number_or_none(one.by_view.rmse),
+                "nsce": number_or_none(one.by_view.nsce),
+                "baseline": number_or_none(one.baseline),
+                "rig": None
+                if one.rig is None
+                else {"rmse": number_or_none(one.rig.rmse), "nsce": number_or_none(one.rig.nsce)},
+            }
+            for method, one in comparison.stereo.items()
+        }
+    return found
+
+
+def _camera_json(one: Compared) -> dict[str, Any]:
+    calibration = one.calibration
+    if calibration is None:
+        return {"problem": one.problem}
+    return {
+        "rmse_px": calibration.rmse_px,
+        "held_out_px": number_or_none(one.held_out_px),
+        "seconds": one.seconds,
+        "distortion_model": calibration.distortion_model,
+        "parameters": {
+            name: {"value": value, "std": number_or_none(calibration.std[name])}
+            for name, value in _values(calibration).items()
+        },
+    }

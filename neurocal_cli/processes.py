@@ -1,0 +1,77 @@
+"""Processes that share a work, each with one core; they end with the one that started them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from typing import TypeVar
+
+from neurocal_cli.errors import NeurocalError
+
+__all__ = ["start_worker", "usable_cores", "work_through"]
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+def usable_cores() -> int:
+    """Cores that this process may use."""
+    usable = getattr(os, "sched_getaffinity", None)
+    return len(usable(0)) if usable else os.cpu_count() or 1
+
+
+def work_through(
+    work: Callable[[Task], Result],
+    tasks: Sequence[Task],
+    jobs: int,
+    prepare: Callable[[], None] | None = None,
+) -> Iterator[Result]:
+    """Results of all tasks in their order, whatever the number of processes.
+
+    Parameters
+    ----------
+    work : callable
+        Of a module, so that another process finds it.
+    tasks : sequence
+    jobs : int
+        Processes; with 1 the work is done here.
+    prepare : callable, optional
+        Called in each process before its first task; `start_worker` by default.
+
+    Raises
+    ------
+    NeurocalError
+        A process was killed.
+    """
+    jobs = min(jobs, len(tasks))
+    if jobs <= 1:
+        yield from map(work, tasks)
+        return
+    # Started afresh: a fork of a process whose libraries have threads may hang.
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, context, prepare or start_worker)
+    try:
+        yield from pool.map(work, tasks)
+    except BrokenProcessPool as error:
+        raise NeurocalError("a process was stopped, perhaps for lack of memory; use --jobs 1") from error
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def start_worker() -> None:
+    """Prepare a worker process: its parent handles interrupts, and it ends with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End when the parent was killed: a worker would wait for work for ever, and hold its pipes open."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        parent.join()
+        os.kill(os.getpid(), signal.SIGTERM)

@@ -1,0 +1,263 @@
+"""Errors of calibration methods over noise, beside the Cramer-Rao bound (the paper's section 5.1 and Fig. 1).
+
+In every trial all methods get the same points. A method that takes something for given, as Tsai's does the
+image centre, is told the truth, and has a bound of its own, with fewer unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.baselines.calibrate_by import as_posed
+from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.parameter_uncertainty import parameter_covariance, pose_std
+from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
+from neurocal_cli.comparison.by_method import calibrate_with
+from neurocal_cli.errors import NeurocalError
+from neurocal_cli.geometry import Array
+from neurocal_cli.processes import work_through
+from neurocal_cli.simulation.scenes import SimulatedScene
+
+__all__ = ["MethodErrors", "NoiseStudy", "cramer_rao", "parameter_names", "study_noise"]
+
+_BLOCK = 5  # trials of a task, of one sigma
+_HALF_TURN = np.pi
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class MethodErrors:
+    """Errors of one method; P parameters, S standard deviations of the noise.
+
+    Attributes
+    ----------
+    exact : (P,) array
+        Error without noise.
+    rms, bias : (S, P) arrays
+        Root mean square and mean error; of poses over all views.
+    bound : (P,) array
+        Cramer-Rao bound for noise of 1 px, 0 for what the method takes for given.
+    failed : (S,) int array
+        Trials without an answer, which are in no mean.
+    """
+
+    exact: Array
+    rms: Array
+    bias: Array
+    bound: Array
+    failed: NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseStudy:
+    """What `study_noise` finds.
+
+    Attributes
+    ----------
+    names : tuple of P str
+    truth : (P,) array
+        Of the first view's pose.
+    sigma : (S,) array [px]
+    trials : int
+    methods : dict of MethodErrors by method
+    apart : dict of float by pair of methods
+        Largest difference of two methods' answers in any trial and parameter, over its bound.
+    """
+
+    names: tuple[str, ...]
+    truth: Array
+    sigma: Array
+    trials: int
+    methods: dict[str, MethodErrors]
+    apart: dict[tuple[str, str], float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    scene: SimulatedScene
+    methods: tuple[str, ...]
+    sigma: float
+    seeds: tuple[tuple[int, ...], ...]  # of each trial; none: without noise
+
+
+def study_noise(
+    scene: SimulatedScene,
+    sigma: Sequence[float],
+    trials: int,
+    methods: Sequence[str],
+    seed: int = 0,
+    jobs: int = 1,
+    progress: Progress | None = None,
+) -> NoiseStudy:
+    """Calibrate with each method, without noise and then in many trials with noise.
+
+    Parameters
+    ----------
+    scene : SimulatedScene
+    sigma : sequence of float [px]
+    trials : int
+        At each sigma.
+    methods : sequence of str
+        Of `comparison.by_method.METHODS`.
+    seed : int
+    jobs : int
+        Processes; the result is the same for any number.
+    progress : callable, optional
+    """
+    chosen = tuple(methods)
+    blocks = [
+        tuple((seed, k, trial) for trial in range(first, min(first + _BLOCK, trials)))
+        for k in range(len(sigma))
+        for first in range(0, trials, _BLOCK)
+    ]
+    tasks = [_Task(scene, chosen, 0.0, ())]
+    tasks += [_Task(scene, chosen, sigma[block[0][1]], block) for block in blocks]
+    found = []
+    for result in work_through(_errors, tasks, jobs):
+        found.append(result)
+        if progress is not None:
+            progress("noise trials", len(found) / len(tasks))
+    exact, noisy = found[0], np.concatenate(found[1:]).reshape(len(sigma), trials, len(chosen), -1)
+    fold = _Fold(scene)
+    results = {}
+    for m, method in enumerate(chosen):
+        errors = noisy[:, :, m]
+        results[method] = MethodErrors(
+            fold.worst(exact[0, m]),
+            fold.rms(errors),
+            fold.mean(errors),
+            fold.bound(cramer_rao(scene, method)),
+            np.isnan(errors[..., 0]).sum(axis=1),
+        )
+    truth = _parameters(scene.camera.intrinsics.values(), scene.camera.distortion.coefficients, scene)
+    whole = cramer_rao(scene, "neuro")
+    apart = {
+        (a, b): _apart(noisy[:, :, chosen.index(a)], noisy[:, :, chosen.index(b)], np.array(sigma), whole)
+        for a, b in (("neuro", "nonlinear"), ("neuro", "backprop"))
+        if a in chosen and b in chosen
+    }
+    return NoiseStudy(parameter_names(scene), fold.first(truth), np.array(sigma), trials, results, apart)
+
+
+def parameter_names(scene: SimulatedScene) -> tuple[str, ...]:
+    """Intrinsic parameters, distortion coefficients, and those of a pose."""
+    return *INTRINSIC_NAMES, *coefficient_names(scene.camera.model), *POSE_NAMES
+
+
+def cramer_rao(scene: SimulatedScene, method: str) -> Array:
+    """Smallest standard deviation of an unbiased estimate for noise of 1 px; from the normal matrix.
+
+    Returns
+    -------
+    (5 + K + 6 V,) array
+        Intrinsics, coefficients, each view's pose; 0 for what the method takes for given.
+    """
+    camera, points = scene.camera, scene.points()
+    problem = as_posed(method, problem_for(points, 1, distortion=Distortion(camera.model)))
+    views = problem.views
+    R = np.stack([scene.poses[name].R for name in views.names])
+    t = np.stack([scene.poses[name].t for name in views.names])
+    k = camera.distortion.coefficients if camera.model != "none" else np.zeros(0)
+    state = normalised(CameraState(np.array([camera.entries]), R, t, camera.model, k), views)
+    normal, _ = normal_blocks(views.batches, state)
+    spare = views.n_equations - problem.n_parameters
+    normal[:, -1, -1] = 0.0
+    normal[0, -1, -1] = spare / views.pixel_scale**2
+    free = problem.free_camera
+    cov = covariance(normal, free, True, views.n_equations)
+    entries = np.zeros((len(free),) * 2)
+    entries[np.ix_(free, free)] = cov.entries
+    _, std = parameter_covariance(camera.intrinsics, camera.model, entries, views.pixel_scale, problem.fixed)
+    poses = pose_std(R, (R @ views.centre[..., None])[..., 0], views.scale, cov.poses)
+    order = [list(views.names).index(name) for name in scene.poses]
+    return np.concatenate([list(std.values()), poses[order].ravel()])
+
+
+def _errors(task: _Task) -> Array:
+    """(T, M, 5 + K + 6 V) errors of each trial and method; nan where there is no answer."""
+    scene, model = task.scene, task.scene.camera.model
+    truth = _parameters(scene.camera.intrinsics.values(), scene.camera.distortion.coefficients, scene)
+    seeds = task.seeds or ((0,),)
+    errors = np.full((len(seeds), len(task.methods), len(truth)), np.nan)
+    for n, seed in enumerate(seeds):
+        points = scene.points(task.sigma, np.random.default_rng(seed) if task.seeds else None)
+        for m, method in enumerate(task.methods):
+            try:
+                found = calibrate_with(method, points, model, seed=seed[-1])
+            except NeurocalError:
+                continue
+            k = np.zeros(len(coefficient_names(model)))
+            k[: len(found.distortion)] = found.distortion
+            errors[n, m] = _parameters(found.intrinsics.values(), k, scene, found) - truth
+    poses = errors[..., -6 * len(scene.poses) :].reshape(*errors.shape[:2], -1, 6)
+    poses[..., :3] = (poses[..., :3] + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
+    return errors
+
+
+def _parameters(
+    intrinsics: Array, k: Array, scene: SimulatedScene, found: Calibration | None = None
+) -> Array:
+    poses = [pose if found is None else found.views[name].pose for name, pose in scene.poses.items()]
+    own = k if scene.camera.model != "none" else k[:0]
+    return np.concatenate([intrinsics, own, *(np.concatenate([pose.euler, pose.t]) for pose in poses)])
+
+
+def _apart(one: Array, two: Array, sigma: Array, bound: Array) -> float:
+    free = bound > 0
+    with np.errstate(invalid="ignore"):
+        difference = np.abs(one - two)[..., free] / (sigma[:, None, None] * bound[free])
+    return float(np.nanmax(difference, initial=0.0))
+
+
+class _Fold:
+    """From values of all views to one for each parameter of a pose."""
+
+    def __init__(self, scene: SimulatedScene) -> None:
+        self.n = 5 + len(coefficient_names(scene.camera.model))
+
+    def _split(self, values: Array) -> tuple[Array, Array]:
+        return values[..., : self.n], values[..., self.n :].reshape(*values.shape[:-1], -1, 6)
+
+    def first(self, values: Array) -> Array:
+        """Those of the first view."""
+        return values[..., : self.n + 6]
+
+    def worst(self, errors: Array) -> Array:
+        """The largest error of any view, with its sign."""
+        camera, poses = self._split(errors)
+        place = np.abs(poses).argmax(axis=-2)
+        return np.concatenate(
+            [camera, np.take_along_axis(poses, place[..., None, :], axis=-2)[..., 0, :]], -1
+        )
+
+    def rms(self, errors: Array) -> Array:
+        """(S, T, ...) to (S, P), over trials with an answer and views."""
+        camera, poses = self._split(errors)
+        return np.sqrt(np.concatenate([_mean(camera**2, (1,)), _mean(poses**2, (1, 2))], axis=-1))
+
+    def mean(self, errors: Array) -> Array:
+        """The same for the mean."""
+        camera, poses = self._split(errors)
+        return np.concatenate([_mean(camera, (1,)), _mean(poses, (1, 2))], axis=-1)
+
+    def bound(self, std: Array) -> Array:
+        """(5 + K + 6 V,) to (P,): rms over the views."""
+        camera, poses = self._split(std)
+        return np.concatenate([camera, np.sqrt((poses**2).mean(axis=0))])
+
+
+def _mean(values: Array, axes: tuple[int, ...]) -> Array:
+    """Mean without nan; nan where there is nothing else."""
+    known = np.isfinite(values)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(known, values, 0.0).sum(axis=axes) / known.sum(axis=axes))

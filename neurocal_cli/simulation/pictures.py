@@ -1,0 +1,76 @@
+"""Rendered images of a simulated scene, and where its points are in them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.points import Correspondences
+from neurocal_cli.simulation.rendering import Scene, Sides, Target, render
+from neurocal_cli.simulation.scenes import SimulatedScene
+
+__all__ = ["Picture", "pictures", "visible_points"]
+
+_MARGIN = 0.5  # squares of white paper around a board by itself
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """A rendered view.
+
+    Attributes
+    ----------
+    name : str
+        Of the view.
+    image : (height, width) uint8 array
+    visible : frozenset of str
+        Ids of the mid-points whose edges are in view.
+    """
+
+    name: str
+    image: NDArray[np.uint8]
+    visible: frozenset[str]
+
+
+def pictures(scene: SimulatedScene, seed: int = 0) -> Iterator[Picture]:
+    """Render every view of a scene, with the usual blur and noise.
+
+    Parameters
+    ----------
+    scene : SimulatedScene
+        Of a board.
+    seed : int
+        Of the noise.
+
+    Raises
+    ------
+    InputError
+        A scene whose target is no board.
+    """
+    if scene.board is None:
+        raise InputError("there is no board to render: the scene's points are those of a file; give a board")
+    planes = scene.board.planes
+    # The pattern of a plane among others goes as far as a fold may be; paper beyond it would cross it.
+    margin = Sides.all(_MARGIN if len(planes) == 1 else 0.0)
+    targets = tuple(Target(plane, margin=margin) for plane in planes)
+    for number, (name, pose) in enumerate(scene.poses.items()):
+        drawn = render(
+            Scene(scene.camera, pose, targets, unit=scene.unit), np.random.default_rng((seed, number))
+        )
+        seen = [np.array(one.midpoint_ids)[one.edges_visible] for one in drawn.truth.planes]
+        yield Picture(
+            name, drawn.image.astype(np.uint8, copy=False), frozenset(np.concatenate(seen).tolist())
+        )
+
+
+def visible_points(scene: SimulatedScene, rendered: list[Picture]) -> Correspondences:
+    """The exact points that the pictures show."""
+    shown = {one.name: one.visible for one in rendered}
+    points = scene.points()
+    assert scene.point is not None  # a board's points have ids
+    rows = [id_ in shown[name] for name, id_ in zip(scene.view, scene.point, strict=True)]
+    return replace(points.select(np.array(rows)), image_center=None)

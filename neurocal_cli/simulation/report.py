@@ -1,0 +1,213 @@
+"""What simulations found, as tables and as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.report import align, number_or_none
+from neurocal_cli.simulation.noise import NoiseStudy
+from neurocal_cli.simulation.rates import RateStudy
+from neurocal_cli.simulation.starts import StartStudy
+
+__all__ = ["FIG_1", "noise_json", "rates_json", "rates_tables", "simulation_tables", "starts_json", "text_of"]
+
+Table = list[list[str]]
+
+FIG_1 = ("alpha_v", "alpha_u", "t_z", "t_x")
+# The errors of the paper's Table 1, calibrated less true.
+_PRINTED = {
+    "t_x": 0.02, "t_y": 0.0, "t_z": 0.0, "R_x": 0.0, "R_y": -0.000027, "R_z": -0.00001,
+    "alpha_u": 0.001165, "alpha_v": 0.000605, "u0": -0.017553, "v0": -0.001267, "theta": 0.0,
+}  # fmt: skip
+_KINDS = {
+    "lm": "network, trained by lm",
+    "backprop": "network, trained by backprop",
+    "weights": "plain LM on (3) from the network's random weights",
+    "camera": "plain LM on (3) from a random camera",
+}
+
+
+def text_of(tables: Sequence[tuple[str, Table]], below: Sequence[str] = ()) -> str:
+    """Tables with their titles as aligned text, and lines below them."""
+    blocks = ["\n".join([title, *align(rows)]) for title, rows in tables]
+    return "\n\n".join([*blocks, *(["\n".join(below)] if below else [])])
+
+
+def simulation_tables(
+    study: NoiseStudy, starts: StartStudy | None, paper: bool
+) -> tuple[list[tuple[str, Table]], list[str]]:
+    """Tables of a study of noise, and of one of starts, and lines below them.
+
+    Parameters
+    ----------
+    study : NoiseStudy
+    starts : StartStudy, optional
+    paper : bool
+        Whether the scene is the paper's, whose printed errors are shown too.
+    """
+    tables = [("error without noise (Table 1)", _exact(study, paper))]
+    if study.trials:
+        tables += [
+            ("rms error over the noise (Fig. 1)", _fig_1(study)),
+            ("rms error of each parameter over its Cramer-Rao bound, at the largest sigma", _ratios(study)),
+            ("mean error of each parameter over its standard error, at the largest sigma", _biases(study)),
+        ]
+    if starts is not None:
+        tables.append(
+            (f"single random starts that reach the minimum (noise {starts.sigma:g} px)", _starts(starts))
+        )
+    return tables, _findings(study)
+
+
+def _exact(study: NoiseStudy, paper: bool) -> Table:
+    printed = ["as printed"] if paper else []
+    rows = [["parameter", "truth", *study.methods, *printed]]
+    for p, name in enumerate(study.names):
+        errors = [_error(one.exact[p]) for one in study.methods.values()]
+        rows.append([name, f"{study.truth[p]:.6g}", *errors, *([_error(_PRINTED[name])] if paper else [])])
+    return rows
+
+
+def _error(value: float) -> str:
+    return "-" if not np.isfinite(value) else "0" if value == 0 else f"{value:.1e}"
+
+
+def _fig_1(study: NoiseStudy) -> Table:
+    rows = [["parameter", "sigma [px]", "bound", *study.methods]]
+    bound = _whole_bound(study)
+    for name in FIG_1:
+        p = study.names.index(name)
+        for k, sigma in enumerate(study.sigma):
+            values = [_number(one.rms[k, p]) for one in study.methods.values()]
+            rows.append([name, f"{sigma:g}", _number(sigma * bound[p]), *values])
+    return rows
+
+
+def _ratios(study: NoiseStudy) -> Table:
+    rows = [["parameter", *study.methods]]
+    for p, name in enumerate(study.names):
+        ratios = [
+            "given" if one.bound[p] == 0 else _number(one.rms[-1, p] / (study.sigma[-1] * one.bound[p]))
+            for one in study.methods.values()
+        ]
+        rows.append([name, *ratios])
+    return rows
+
+
+def _biases(study: NoiseStudy) -> Table:
+    rows = [["parameter", *study.methods]]
+    for p, name in enumerate(study.names):
+        row = []
+        for one in study.methods.values():
+            answers = study.trials - one.failed[-1]
+            spread = np.sqrt(max(one.rms[-1, p] ** 2 - one.bias[-1, p] ** 2, 0.0) / max(answers, 1))
+            row.append(
+                "given" if one.bound[p] == 0 else f"{one.bias[-1, p] / spread:+.1f}" if spread else "-"
+            )
+        rows.append([name, *row])
+    return rows
+
+
+def _whole_bound(study: NoiseStudy) -> Any:
+    """Of the method that takes the least for given."""
+    return max((one.bound for one in study.methods.values()), key=lambda bound: int((bound > 0).sum()))
+
+
+def _starts(starts: StartStudy) -> Table:
+    rows = [["start", "reached", "of"]]
+    for kind, count in starts.reached.items():
+        rows.append([_KINDS[kind], str(count), str(len(starts.rms[kind]))])
+    return rows
+
+
+def _findings(study: NoiseStudy) -> list[str]:
+    lines = [
+        f"{a} and {b} differ by at most {apart:.1g} of the bound, in any parameter of any trial"
+        for (a, b), apart in study.apart.items()
+    ]
+    for method, one in study.methods.items():
+        if one.failed.any():
+            lines.append(
+                f"{method} gave no answer in {one.failed.sum()} of {study.trials * len(study.sigma)} trials"
+            )
+    return lines
+
+
+def rates_tables(study: RateStudy) -> tuple[list[tuple[str, Table]], list[str]]:
+    """Data sets on which one start converges, for each pair of rates; and lines below."""
+    head = ["weights \\ gamma", *(f"{rate:g}" for rate in study.rates_gamma)]
+    counts = [head]
+    epochs = [list(head)]
+    for a, rate in enumerate(study.rates_weights):
+        counts.append([f"{rate:g}", *map(str, study.converged[a])])
+        epochs.append([f"{rate:g}", *("-" if np.isnan(e) else f"{e:.0f}" for e in study.epochs[a])])
+    weights, gamma = study.default
+    below = [
+        f"calibrate --trainer backprop with its rates, {weights:g} and {gamma:g}, reaches the minimum on "
+        f"{study.calibrated} of {study.sets} data sets",
+        f"there, errors of alpha_u are {np.sqrt((study.alpha_u**2).mean()):.2f} reported standard deviations "
+        f"rms, {np.abs(study.alpha_u).max():.1f} at most",
+    ]
+    title = f"of {study.sets} data sets, those on which a single random start converges with these rates"
+    return [(title, counts), ("median epochs of these", epochs)], below
+
+
+def noise_json(study: NoiseStudy) -> dict[str, Any]:
+    """The whole study; a number that does not exist is None."""
+    return {
+        "trials": study.trials,
+        "sigma": study.sigma.tolist(),
+        "parameters": list(study.names),
+        "truth": _by_name(study, study.truth),
+        "methods": {
+            name: {
+                "error_without_noise": _by_name(study, one.exact),
+                "rms": {p: _numbers(one.rms[:, k]) for k, p in enumerate(study.names)},
+                "bias": {p: _numbers(one.bias[:, k]) for k, p in enumerate(study.names)},
+                "bound_for_1_px": _by_name(study, one.bound),
+                "failed": one.failed.tolist(),
+            }
+            for name, one in study.methods.items()
+        },
+        "largest_difference_over_bound": {f"{a}, {b}": value for (a, b), value in study.apart.items()},
+    }
+
+
+def starts_json(starts: StartStudy) -> dict[str, Any]:
+    """Counts and ends of single starts."""
+    return {
+        "sigma": starts.sigma,
+        "best_rmse_px": starts.best,
+        "starts": {kind: len(rms) for kind, rms in starts.rms.items()},
+        "reached": starts.reached,
+        "rmse_px": {kind: _numbers(rms) for kind, rms in starts.rms.items()},
+    }
+
+
+def rates_json(study: RateStudy) -> dict[str, Any]:
+    """The grid of rates."""
+    return {
+        "data_sets": study.sets,
+        "rates_weights": study.rates_weights.tolist(),
+        "rates_gamma": study.rates_gamma.tolist(),
+        "converged": study.converged.tolist(),
+        "median_epochs": [_numbers(row) for row in study.epochs],
+        "default": {"rate_weights": study.default[0], "rate_gamma": study.default[1]},
+        "calibrated": study.calibrated,
+        "alpha_u_errors_in_std": _numbers(study.alpha_u),
+    }
+
+
+def _by_name(study: NoiseStudy, values: Any) -> dict[str, float | None]:
+    return dict(zip(study.names, _numbers(values), strict=True))
+
+
+def _numbers(values: Any) -> list[float | None]:
+    return [number_or_none(float(value)) for value in values]
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}" if np.isfinite(value) else "-"

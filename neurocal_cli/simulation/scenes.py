@@ -1,0 +1,184 @@
+"""Cameras that look at targets, with everything known: the paper's (Table 1), a user's own, random ones."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.board import Board, Plane
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+
+__all__ = [
+    "PAPER_BOARD",
+    "PAPER_CAMERA",
+    "PAPER_POSE",
+    "SimulatedScene",
+    "calibrated_scene",
+    "paper_scene",
+    "random_poses",
+    "scene_of",
+]
+
+# Table 1. Its theta of 1.5708 is a right angle, rounded.
+PAPER_CAMERA = Camera(Intrinsics(556.0, 549.0, 172.0, 121.0), image_size=(352, 240))
+PAPER_POSE = Pose.from_euler(0.09, 0.80, -0.03, np.array([-27.0, -28.0, 701.0]))
+# 440 mid-points, as many as the paper's; it does not say where they are.
+PAPER_BOARD = Board(
+    (
+        Plane("wall", 11, 11, 17.0, (17, -75, 0), (1, 0, 0), (0, 1, 0)),
+        Plane("side", 11, 11, 17.0, (0, -75, -17), (0, 0, -1), (0, 1, 0)),
+    )
+)
+
+_TILT = 15.0, 45.0  # degrees
+_FILLED = 0.55, 0.9  # share of the image that the target spans
+_TRIES = 1000
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedScene:
+    """A camera, a target and the poses of its views.
+
+    Attributes
+    ----------
+    camera : Camera
+    poses : dict of Pose by view
+    world : (N, 3) array [world unit]
+    pixels : (N, 2) array [px]
+        Exact.
+    view : (N,) array of str
+    point : (N,) array of str, or None
+    unit : str
+    board : Board or None
+        Whose mid-points the points are.
+    """
+
+    camera: Camera
+    poses: Mapping[str, Pose]
+    world: Array
+    pixels: Array
+    view: NDArray[np.str_]
+    point: NDArray[np.str_] | None
+    unit: str
+    board: Board | None = None
+
+    def points(self, sigma: float = 0.0, rng: np.random.Generator | None = None) -> Correspondences:
+        """The points with Gaussian noise of a standard deviation [px] in u and in v.
+
+        They hold the true image centre, for the methods that have to be told.
+        """
+        noise = 0.0 if rng is None else sigma * rng.normal(size=self.pixels.shape)
+        K = self.camera.intrinsics
+        return Correspondences(
+            self.world, self.pixels + noise, self.view, self.camera.image_size, (K.u0, K.v0), self.point,
+            unit=self.unit, source="simulated points",
+        )  # fmt: skip
+
+
+def paper_scene() -> SimulatedScene:
+    """The paper's section 5.1: Table 1's camera and 440 points of two boards at a right angle."""
+    return scene_of(PAPER_CAMERA, PAPER_BOARD, {"view": PAPER_POSE})
+
+
+def scene_of(camera: Camera, board: Board, poses: Mapping[str, Pose]) -> SimulatedScene:
+    """All mid-points of a board, as a camera sees them in each pose.
+
+    Raises
+    ------
+    InputError
+        A pose in which the camera cannot see all of the board.
+    """
+    ids, world = zip(*(plane.midpoints() for plane in board.planes), strict=True)
+    labels, target = np.concatenate(ids), np.concatenate(world)
+    pixels = [_seen(camera, pose, target, name) for name, pose in poses.items()]
+    return SimulatedScene(
+        camera, dict(poses), np.tile(target, (len(poses), 1)), np.concatenate(pixels),
+        np.repeat(list(poses), len(target)), np.tile(labels, len(poses)), board.unit, board,
+    )  # fmt: skip
+
+
+def calibrated_scene(calibration: Calibration) -> SimulatedScene:
+    """What a calibrated camera would have seen without noise: its own points and poses.
+
+    Raises
+    ------
+    InputError
+        A calibration without points.
+    """
+    points, camera = calibration.points, calibration.camera
+    if not len(points):
+        raise InputError("the calibration holds no points; give a board to simulate with")
+    poses = {name: calibration.views[name].pose for name in points.view_names}
+    pixels = np.empty_like(points.pixels)
+    for k, (name, pose) in enumerate(poses.items()):
+        rows = points.view_index == k
+        pixels[rows] = _seen(camera, pose, points.world[rows], name)
+    labels = None if points.point is None else np.asarray(points.point)
+    view = np.array(points.view_names)[points.view_index]
+    return SimulatedScene(camera, poses, points.world, pixels, view, labels, points.unit)
+
+
+def _seen(camera: Camera, pose: Pose, world: Array, name: str) -> Array:
+    inside = pose.to_camera(world)
+    if not camera.sees(inside).all():
+        raise InputError(f"the camera cannot see all points in the pose of view {name!r}; give other poses")
+    return camera.project(inside)[0]
+
+
+def random_poses(camera: Camera, board: Board, count: int, rng: np.random.Generator) -> dict[str, Pose]:
+    """Poses that tilt a board by 15 to 45 degrees to all sides, all of it in the image.
+
+    Raises
+    ------
+    InputError
+        A camera without an image size, or one whose image does not hold the board at any distance.
+    """
+    if camera.image_size is None:
+        raise InputError("the camera has no image size, so that nothing can be put into its image")
+    corners = np.concatenate([plane.vertices().reshape(-1, 3) for plane in board.planes])
+    centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
+    facing = sum((plane.normal for plane in board.planes), np.zeros(3))
+    upright = _facing(facing / np.linalg.norm(facing))
+    return {
+        f"view{k + 1:02d}": _random_pose(camera, corners - centre, centre, upright, k / count, rng)
+        for k in range(count)
+    }
+
+
+def _facing(normal: Array) -> Array:
+    """Rotation that lets a target be seen from the front: its mean normal along the camera's z axis."""
+    x = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    x = x - (x @ normal) * normal
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(normal, x), normal])
+
+
+def _random_pose(
+    camera: Camera, corners: Array, centre: Array, upright: Array, turn: float, rng: np.random.Generator
+) -> Pose:
+    assert camera.image_size is not None
+    size = np.array(camera.image_size)
+    K = camera.intrinsics
+    axis = Pose.from_euler(0, 0, 2 * np.pi * (turn + 0.1 * rng.random()), np.zeros(3)).R
+    for _ in range(_TRIES):
+        lean = Pose.from_euler(np.radians(rng.uniform(*_TILT)), 0, rng.uniform(-0.3, 0.3), np.zeros(3)).R
+        R = axis @ lean @ axis.T @ upright
+        inside = corners @ R.T
+        extent = float((np.ptp(inside[:, :2], axis=0) * [K.alpha_u, K.alpha_v] / size).max())
+        z = extent / rng.uniform(*_FILLED)
+        off = rng.uniform(-0.15, 0.15, 2) * size / [K.alpha_u, K.alpha_v] * z
+        pose = Pose(R, np.array([*off, z]) - R @ centre)
+        seen = inside + np.array([*off, z])
+        if camera.sees(seen).all():
+            pixels = camera.project(seen)[0]
+            if (pixels > 0).all() and (pixels < size - 1).all():
+                return pose
+    raise InputError("no pose puts the whole board into the camera's image; give a smaller board")

@@ -1,0 +1,239 @@
+"""Single random starts: how often the network reaches the minimum of (3), and how often plain descent does.
+
+The paper's network begins at random weights, "while the Levenberg-Marquardt algorithm would fail without a
+good starting point" (section 5.1). Four kinds of start, each alone, without a second try:
+
+    lm, backprop      the network of each view from random weights in [-1, 1], by either trainer, then what
+                      follows from its product: the camera, and bundle adjustment
+    weights           Levenberg-Marquardt on (3) itself, from the same random weights: the twelve entries of
+                      P = W V (one solid view only)
+    camera            Levenberg-Marquardt on (3), from a random camera: a focal length of 0.5 to 20 half image
+                      widths, the centre in the middle half of the image, any rotation, the target seen
+                      anywhere in the image at a depth of 2 to 50 of its radii
+
+A start reaches the minimum where its rms error is within 0.1 % of the best of all that were tried.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.baselines.least_squares import least_squares
+from neurocal_cli.baselines.nonlinear import descend, nonlinear
+from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.errors import NeurocalError
+from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products, candidate_intrinsics
+from neurocal_cli.initialisation.given_poses import solve_given_poses
+from neurocal_cli.initialisation.options import options_for
+from neurocal_cli.initialisation.view_networks import begin_flat, train_networks
+from neurocal_cli.network import random_weights
+from neurocal_cli.processes import work_through
+from neurocal_cli.simulation.scenes import SimulatedScene
+
+__all__ = ["STARTS", "StartStudy", "can_start", "reached", "single_start", "study_starts"]
+
+STARTS = ("lm", "backprop", "weights", "camera")
+_SAME = 1.001  # times the best rms error
+_FLOOR = 1e-9  # normalised pixels: without noise the best error is rounding
+_FOCAL = 0.5, 20.0  # half image widths
+_DEPTH = 2.0, 50.0  # radii of the target
+_BLOCK = 10  # starts of a task
+_NOISE = 10**6  # of the seed; trials over noise have lower ones
+
+Progress = Callable[[str, float], None]
+
+
+@dataclass(frozen=True, eq=False)
+class StartStudy:
+    """Outcomes of single starts of each kind.
+
+    Attributes
+    ----------
+    rms : dict of (n,) arrays by kind [px]
+        Where each start ended; infinite where that is no camera.
+    best : float [px]
+        The lowest of all, and of the descent from the linear answer.
+    sigma : float [px]
+        Of the noise of the points.
+    """
+
+    rms: dict[str, Array]
+    best: float
+    sigma: float
+
+    @property
+    def reached(self) -> dict[str, int]:
+        """How many starts of each kind reached the minimum."""
+        return {kind: int(reached(rms, self.best).sum()) for kind, rms in self.rms.items()}
+
+
+def reached(rms: Array, best: float) -> NDArray[np.bool_]:
+    """Whether rms errors [px] are those of the best minimum."""
+    return np.asarray(rms <= _SAME * best + _FLOOR)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    scene: SimulatedScene
+    sigma: float
+    kind: str
+    seed: int
+    starts: range
+
+
+def study_starts(
+    scene: SimulatedScene,
+    sigma: float,
+    starts: int,
+    seed: int = 0,
+    jobs: int = 1,
+    progress: Progress | None = None,
+) -> StartStudy:
+    """Start the network, and plain descent, many times on one set of points.
+
+    Parameters
+    ----------
+    scene : SimulatedScene
+        Its distortion is left out: the starts are those of a pinhole.
+    sigma : float [px]
+    starts : int
+        Of each kind.
+    seed : int
+    jobs : int
+        Processes; the result is the same for any number.
+    progress : callable, optional
+    """
+    problem = _problem(scene, sigma, seed)
+    kinds = [kind for kind in STARTS if can_start(problem, kind)]
+    tasks = [
+        _Task(scene, sigma, kind, seed, range(first, min(first + _BLOCK, starts)))
+        for kind in kinds
+        for first in range(0, starts, _BLOCK)
+    ]
+    found: dict[str, list[float]] = {kind: [] for kind in kinds}
+    for n, (task, ends) in enumerate(zip(tasks, work_through(_ends, tasks, jobs), strict=True), start=1):
+        found[task.kind] += ends
+        if progress is not None:
+            progress("random starts", n / len(tasks))
+    rms = {kind: np.array(ends) for kind, ends in found.items()}
+    best = min(float(ends.min()) for ends in rms.values())
+    with suppress(NeurocalError):
+        best = min(best, _rms(problem, nonlinear(problem).state) * problem.views.pixel_scale)
+    return StartStudy(rms, best, sigma)
+
+
+def _problem(scene: SimulatedScene, sigma: float, seed: int) -> Problem:
+    pinhole = replace(scene, camera=replace(scene.camera, distortion=Distortion()))
+    inside = [pinhole.poses[name].to_camera(M) for name, M in zip(scene.view, scene.world, strict=True)]
+    pixels = pinhole.camera.project(np.array(inside))[0]
+    points = replace(pinhole, pixels=pixels).points(sigma, np.random.default_rng((seed, _NOISE)))
+    return problem_for(points, 1)
+
+
+def _ends(task: _Task) -> list[float]:
+    problem = _problem(task.scene, task.sigma, task.seed)
+    kind = STARTS.index(task.kind)
+    return [
+        single_start(problem, task.kind, np.random.default_rng((task.seed, _NOISE, kind, start)))
+        for start in task.starts
+    ]
+
+
+def can_start(problem: Problem, kind: str) -> bool:
+    """Whether a kind of start is possible: a free network needs 4 points of a plane, or 6 in space."""
+    flat = begin_flat(problem)
+    if kind == "weights":
+        return problem.type == 1 and problem.views.n_views == 1 and not flat.any()
+    return problem.type == 4 or bool((problem.views.distinct >= np.where(flat, 4, 6)).all())
+
+
+def single_start(problem: Problem, kind: str, rng: np.random.Generator) -> float:
+    """Rms error [px] at which one random start ends; infinite where that is no camera.
+
+    Parameters
+    ----------
+    problem : Problem
+        Without a distortion.
+    kind : str
+        One of `STARTS`.
+    rng : numpy.random.Generator
+    """
+    try:
+        with np.errstate(all="ignore"):
+            return _KINDS[kind](problem, rng) * problem.views.pixel_scale
+    except (NeurocalError, np.linalg.LinAlgError):
+        return np.inf
+
+
+def _network(trainer: str) -> Callable[[Problem, np.random.Generator], float]:
+    options = replace(options_for(trainer, 2, 0), starts=1)
+
+    def end(problem: Problem, rng: np.random.Generator) -> float:
+        if problem.type == 4:
+            return _rms(problem, solve_given_poses(problem, options, rng).state)
+        groups, _ = train_networks(problem, options, rng, np.ones(problem.views.n_views, dtype=bool))
+        entries = problem.normalised_entries[None]
+        if problem.type != 3:
+            entries = candidate_intrinsics(problem, groups, rng)[0]
+        return _rms(problem, problem.adjust(cameras_from_products(problem, groups, entries)).state)
+
+    return end
+
+
+def _from_weights(problem: Problem, rng: np.random.Generator) -> float:
+    """(3) as a function of P's entries, scale and all; from W V."""
+    views = problem.views
+    Z = np.column_stack([views.local, np.ones(len(views.local))])
+    W, V = random_weights(rng, 1, 4)
+
+    def error(entries: Array) -> Array:
+        o = Z @ entries.reshape(3, 4).T
+        return np.asarray((o[:, :2] / o[:, 2:] - views.pixels).ravel())
+
+    least = least_squares(error, (W @ V)[0].ravel())
+    depth = Z @ least.x.reshape(3, 4)[2]
+    if depth.min() * depth.max() <= 0:
+        return np.inf
+    return float(np.sqrt((error(least.x) ** 2).sum() / len(Z)))
+
+
+def _from_camera(problem: Problem, rng: np.random.Generator) -> float:
+    views = problem.views
+    V = views.n_views
+    random = np.array([0.0, 0.0, 0.0, *rng.uniform(-0.5, 0.5, 2)])
+    random[[0, 2]] = _FOCAL[0] * (_FOCAL[1] / _FOCAL[0]) ** rng.random()
+    entries = np.where(problem.free, random, problem.normalised_entries)
+    R, t = nearest_rotation(rng.uniform(-1, 1, (V, 3, 3))), np.zeros((V, 3))
+    radius = np.sqrt(np.maximum.reduceat((views.local**2).sum(axis=1), views.first))
+    t[:, 2] = radius * _DEPTH[0] * (_DEPTH[1] / _DEPTH[0]) ** rng.random(V)
+    seen = rng.uniform(-1, 1, (V, 2))
+    t[:, :2] = (seen - entries[3:]) / entries[[0, 2]] * t[:, 2:]
+    if problem.type == 4:
+        raise NeurocalError("with given poses (3) is linear, and any start will do")
+    found = descend(problem, CameraState(entries[None], R, t))
+    return _rms(problem, found.state)
+
+
+def _rms(problem: Problem, state: CameraState) -> float:
+    """Of the whitened residuals; infinite where points are behind the camera."""
+    views = problem.views
+    normal, sensible = normal_blocks(views.batches, state)
+    if not (sensible.all() and (state.entries[0, [0, 2]] > 0).all()):
+        return np.inf
+    return float(np.sqrt(normal[:, -1, -1].sum() / len(views.index)))
+
+
+_KINDS: dict[str, Callable[[Problem, np.random.Generator], float]] = {
+    "lm": _network("lm"),
+    "backprop": lambda problem, rng: _network("backprop")(problem, rng),
+    "weights": _from_weights,
+    "camera": _from_camera,
+}

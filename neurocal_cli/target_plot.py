@@ -1,0 +1,75 @@
+"""Picture of a target as it was found. matplotlib is imported only when a picture is asked for."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from neurocal_cli.plots import picture, style
+from neurocal_cli.target import Target
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_target"]
+
+_LONGEST = 0.12  # of the plane's size, for the longest arrow
+_LEVELS = 13
+_WIDTH, _HEIGHT = 5.5, 4.5  # inches of a panel
+
+
+def draw_target(target: Target, unit: str, kind: str = "png") -> bytes:
+    """Draw where the points of each plane are: height as contours, offsets in the plane as arrows.
+
+    Parameters
+    ----------
+    target : Target
+    unit : str
+    kind : {"png", "pdf", "svg"}
+
+    Returns
+    -------
+    picture : bytes
+
+    Raises
+    ------
+    NeurocalError
+        matplotlib is not installed.
+    """
+    planes = int(target.plane.max()) + 1
+
+    def draw(figure: Figure) -> None:
+        rows = figure.subplots(planes, 2, squeeze=False)
+        for plane, (height, arrows) in enumerate(rows):
+            _draw_plane(target, plane, unit, height, arrows)
+        figure.suptitle(f"The target as it was found, std {np.sqrt((target.std**2).mean()):.2g} {unit}")
+
+    return picture(draw, (2 * _WIDTH, planes * _HEIGHT), 0.12, kind)
+
+
+def _draw_plane(target: Target, plane: int, unit: str, height: Axes, arrows: Axes) -> None:
+    rows = target.plane == plane
+    given, offsets = target.given[rows], target.offsets[rows]
+    centred = given - given.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    axes *= np.where(axes[np.arange(3), np.abs(axes).argmax(axis=1)] < 0, -1.0, 1.0)[:, None]
+    x, y, _ = axes @ centred.T
+    dx, dy, dz = axes @ offsets.T
+    most = float(np.abs(dz).max()) or 1.0
+    drawn = height.tricontourf(x, y, dz, levels=np.linspace(-most, most, _LEVELS), cmap="RdBu_r")
+    height.figure.colorbar(drawn, ax=height, label=f"height [{unit}]")
+    height.plot(x, y, ".", color="0.3", markersize=2)
+    style(height, f"out of the plane: {np.ptp(dz):.2g} {unit} from end to end")
+    longest = float(np.hypot(dx, dy).max()) or 1.0
+    length = _LONGEST * float(np.ptp(x))
+    arrows.quiver(
+        x, y, dx, dy, color="#1f4e79", angles="xy", scale_units="xy", scale=longest / length, width=3e-3
+    )
+    style(arrows, f"in the plane: the longest arrow is {longest:.2g} {unit}")
+    for panel in (height, arrows):
+        panel.set_aspect("equal")
+        panel.margins(_LONGEST)
+        panel.invert_yaxis()
+        panel.set_xlabel(f"[{unit}]")

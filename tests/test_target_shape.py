@@ -1,0 +1,282 @@
+"""The target found with the camera: its equations, its sizes, and what it does to the camera."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.targets import SHAPES, board, offsets, photographed
+
+from neurocal_cli import calibrate
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
+from neurocal_cli.bundle_adjustment.reprojection import normal_blocks
+from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.geometry import nearest_similarity, rotation_step
+from neurocal_cli.initialisation.options import options_for
+from neurocal_cli.pipeline.fit import fit
+from neurocal_cli.points import Correspondences
+from neurocal_cli.target import distinct_points, planes_of
+from neurocal_cli.target_shape import posterior as posterior_module
+from neurocal_cli.target_shape.find import LEAST_GAIN, find_target, sight_of
+from neurocal_cli.target_shape.information import Information, information_of
+from neurocal_cli.target_shape.posterior import _System, known_sizes, posterior
+from neurocal_cli.target_shape.prior import Prior, prior_of
+
+PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
+SIZES = {"bend": 0.3, "stretch": 0.2, "warp": 0.1, "place": 0.05, "height": 0.04}
+
+
+def minimum(points: Correspondences) -> tuple[Problem, Adjusted]:
+    problem = problem_for(points, 1, distortion=Distortion("k1k2"), skew=False)
+    solution = fit(problem, options_for("lm", 20, 0))
+    return solution.problem, solution.adjusted
+
+
+def equations(points: Correspondences) -> tuple[Information, Prior]:
+    problem, adjusted = minimum(points)
+    given, label, ids = distinct_points([points])
+    prior = prior_of(given, planes_of(given, ids))
+    return information_of([sight_of(problem, adjusted, label)], len(given)).turned(prior.axes), prior
+
+
+def errors(calibration: Calibration, K: np.ndarray) -> np.ndarray:
+    found = np.array([getattr(calibration.intrinsics, name) for name in PARAMETERS])
+    return found - np.array([K[0, 0], K[1, 1], K[0, 2], K[1, 2]])
+
+
+def shape_error(calibration: Calibration, true: np.ndarray) -> float:
+    """Rms distance of the found points from the true ones, but for what no photograph tells."""
+    assert calibration.target is not None
+    order = calibration.target.places(board())
+    found = calibration.target.found[order]
+    s, R, t = nearest_similarity(found, true)
+    return float(np.sqrt(((s * found @ R.T + t - true) ** 2).sum(axis=1).mean()))
+
+
+def test_the_quadratic_is_that_of_the_squared_error() -> None:
+    points, _ = photographed("parabola", 1, 5)
+    problem, adjusted = minimum(points)
+    given, label, _ = distinct_points([points])
+    info = information_of([sight_of(problem, adjusted, label)], len(given))
+    rng = np.random.default_rng(0)
+    d = 1e-3 * rng.standard_normal(given.shape)
+    moved = problem.with_points(replace(points, world=points.world + d[label]))
+    state = normalised(in_pixels(problem, adjusted.state), moved.views)
+    normal, _ = normal_blocks(moved.views.batches, state)
+    cost = normal[:, -1, -1].sum() * moved.views.pixel_scale**2
+    promised = info.cost + (d * ((info.point @ d[..., None])[..., 0] - 2 * info.point_right)).sum()
+    assert abs(promised - cost) < 1e-3 * abs(info.cost - cost)
+
+
+def test_points_first_and_poses_first_solve_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    info, prior = equations(photographed("both", 2, 6, amount=0.1)[0])
+    one = known_sizes(info, prior, SIZES, 0.01)
+
+    class PosesFirst(_System):
+        def __init__(self, info: Information, prior: Prior) -> None:
+            super().__init__(info, prior)
+            assert self.points_first
+            self.points_first = False
+            self._eliminate_poses()
+
+    monkeypatch.setattr(posterior_module, "_System", PosesFirst)
+    other = known_sizes(info, prior, SIZES, 0.01)
+    for name in ("offsets", "camera_step", "camera", "followed", "std"):
+        a, b = getattr(one, name), getattr(other, name)
+        np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7 * np.abs(a).max(), err_msg=name)
+    assert one.evidence == pytest.approx(other.evidence, abs=1e-5)
+    assert one.determined == pytest.approx(other.determined, rel=1e-6)
+
+
+def test_the_posterior_is_that_of_the_whole_dense_system() -> None:
+    info, prior = equations(photographed("parabola", 3, 4)[0])
+    found = known_sizes(info, prior, SIZES, 0.04)
+    f, P, n = len(info.camera), len(info.pose), len(info.point)
+    H = np.zeros((f + 6 * P + 3 * n,) * 2)
+    c, q, d = slice(0, f), slice(f, f + 6 * P), slice(f + 6 * P, None)
+    H[c, c] = info.camera
+    H[q, c] = info.pose_camera.reshape(-1, f)
+    H[d, c] = info.point_camera.reshape(-1, f)
+    H[d, q] = info.pose_point.reshape(6 * P, 3 * n).T
+    for k in range(P):
+        at = slice(f + 6 * k, f + 6 * k + 6)
+        H[at, at] = info.pose[k]
+    covariance = np.zeros((3 * n, 3 * n))
+    for name, places in prior.groups.items():
+        basis = prior.basis.reshape(3 * n, -1)[:, places] * (SIZES[name] / prior.size)
+        covariance += basis @ basis.T
+    own = np.array([SIZES["place"], SIZES["place"], SIZES["height"]]) ** 2
+    covariance += np.diag(np.tile(own, n))
+    points = np.zeros((3 * n, 3 * n))
+    for k in range(n):
+        points[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = info.point[k]
+    H[d, d] = points + 0.04 * np.linalg.inv(covariance)
+    H = np.tril(H) + np.tril(H, -1).T
+    right = np.concatenate([info.camera_right, info.pose_right.ravel(), info.point_right.ravel()])
+    inverse = np.linalg.inv(H)
+    np.testing.assert_allclose(found.offsets.ravel(), (inverse @ right)[d], rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(found.camera, inverse[c, c], rtol=1e-5)
+
+
+def test_sizes_raise_the_evidence_to_its_maximum() -> None:
+    info, prior = equations(photographed("parabola", 4, 12)[0])
+    best = posterior(info, prior)
+    for name in best.sizes:
+        for times in (0.5, 2.0):
+            other = known_sizes(info, prior, best.sizes | {name: times * best.sizes[name]}, best.variance)
+            assert other.evidence < best.evidence + 0.1
+
+
+def test_a_similarity_is_found_back() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.standard_normal((20, 3))
+    R = rotation_step(np.array([[0.3, -0.2, 0.5]]))[0]
+    s, found, t = nearest_similarity(points, 1.7 * points @ R.T + [1, 2, 3])
+    assert s == pytest.approx(1.7)
+    np.testing.assert_allclose(found, R, atol=1e-12)
+    np.testing.assert_allclose(t, [1, 2, 3])
+
+
+@pytest.mark.parametrize(("shape", "amount"), [("parabola", 0.5), ("stretch", 0.0), ("both", 0.2)])
+def test_the_camera_and_the_board_are_found_together(shape: str, amount: float) -> None:
+    points, truth = photographed(shape, 6, amount=amount)
+    given, found = calibrate(points, target="given"), calibrate(points)
+    assert found.target is not None
+    z = errors(found, truth.K) / [found.std[name] for name in PARAMETERS]
+    assert np.abs(z).max() < 4
+    assert np.abs(errors(found, truth.K)).max() < 0.4 * np.abs(errors(given, truth.K)).max()
+    assert shape_error(found, truth.found) < 0.25 * shape_error_of_given(truth.found)
+    assert found.verdict is not None
+    assert found.verdict.word == "good"
+
+
+def shape_error_of_given(true: np.ndarray) -> float:
+    s, R, t = nearest_similarity(board(), true)
+    return float(np.sqrt(((s * board() @ R.T + t - true) ** 2).sum(axis=1).mean()))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_board_that_is_as_its_file_says_is_left_as_given(seed: int) -> None:
+    points, _ = photographed("flat", seed)
+    auto, given = calibrate(points), calibrate(points, target="given")
+    assert auto.target is None
+    assert (auto.K == given.K).all()
+
+
+def test_a_flat_target_stays_in_its_plane() -> None:
+    points, truth = photographed("in_plane", 7, amount=0.1)
+    found = calibrate(points, target="flat")
+    assert found.target is not None
+    assert np.abs(found.target.offsets[:, 2]).max() < 1e-3
+    assert shape_error(found, truth.found) < 0.4 * shape_error_of_given(truth.found)
+
+
+def test_two_views_of_a_flat_board_keep_the_given_target() -> None:
+    points, _ = photographed("parabola", 8, 2)
+    assert calibrate(points, target="free", skew=False).target is None
+
+
+def test_what_is_no_shape_is_not_taken_for_one() -> None:
+    points, _ = photographed("flat", 9)
+    order = np.random.default_rng(1).permutation(63)
+    shuffled = replace(points, world=np.tile(board()[order], (15, 1)))
+    with pytest.raises(DegenerateGeometryError, match="do not match"):
+        calibrate(shuffled)
+    swapped = np.arange(len(points))
+    swapped[10::63], swapped[11::63] = swapped[11::63].copy(), swapped[10::63].copy()
+    kept = calibrate(replace(points, world=points.world[swapped]), outliers="keep")
+    assert kept.target is None
+    assert kept.verdict is not None
+    assert kept.verdict.word == "poor"
+
+
+def test_a_wrong_square_is_not_taken_for_a_shape() -> None:
+    points, _ = photographed("flat", 10)
+    found = calibrate(replace(points, world=points.world * [1.0, 1.06, 1.0]))
+    assert found.target is None
+    assert found.verdict is not None
+    assert found.verdict.word != "good"
+
+
+def test_an_outlier_view_is_left_out_and_not_bent() -> None:
+    points, truth = photographed("parabola", 11)
+    pixels = points.pixels.copy()
+    pixels[:63] = pixels[:63][::-1]
+    pixels[63:66] += 40.0
+    found = calibrate(replace(points, pixels=pixels))
+    assert found.target is not None
+    assert np.abs(errors(found, truth.K) / [found.std[name] for name in PARAMETERS]).max() < 4
+    assert len(found.rejected) >= 3
+
+
+def test_a_target_that_was_found_is_a_target_to_begin_with() -> None:
+    points, truth = photographed("parabola", 12)
+    others, _ = photographed("parabola", 12)
+    first = calibrate(points)
+    assert first.target is not None
+    again = calibrate(others, target=first.target)
+    assert again.target is first.target
+    np.testing.assert_allclose(again.K, first.K, rtol=1e-3)
+    assert again.std["alpha_u"] > 0.5 * first.std["alpha_u"]
+    assert np.abs(errors(again, truth.K)).max() < 2
+
+
+def test_given_poses_find_the_target_as_well() -> None:
+    points, truth = photographed("out_of_plane", 13, amount=0.1)
+    camera = calibrate(points)
+    poses = {name: view.pose for name, view in camera.views.items()}
+    found = calibrate(points, type=4, extrinsics=poses, distortion="k1k2", target="free")
+    assert found.target is not None
+    assert np.abs(errors(found, truth.K)).max() < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_views", [5, 8, 15, 40])
+def test_clean_sets_keep_the_given_target(n_views: int) -> None:
+    found = 0
+    for seed in range(100, 200):
+        problem, adjusted = minimum(photographed("flat", seed, n_views)[0])
+        target = find_target([(problem, adjusted)])
+        found += target is not None and target.target.evidence > LEAST_GAIN
+    assert found <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("shape", "amount", "n_views"),
+    [
+        ("flat", 0.0, 15),
+        ("parabola", 0.5, 15),
+        ("parabola", 0.1, 8),
+        ("twist", 0.5, 15),
+        ("waves", 0.3, 15),
+        ("stretch", 0.0, 15),
+        ("in_plane", 0.02, 15),
+        ("in_plane", 0.1, 6),
+        ("out_of_plane", 0.1, 15),
+        ("out_of_plane", 0.3, 40),
+        ("both", 0.1, 15),
+        ("both", 0.3, 8),
+        ("flexing", 0.2, 15),
+    ],
+)
+def test_standard_deviations_hold(shape: str, amount: float, n_views: int) -> None:
+    assert shape in SHAPES
+    z = []
+    for seed in range(200, 300):
+        points, truth = photographed(shape, seed, n_views, amount)
+        found = calibrate(points, distortion="k1k2", skew=False)
+        z.append(errors(found, truth.K) / [found.std[name] for name in PARAMETERS])
+    assert 0.85 < np.sqrt(np.square(z).mean()) < 1.15
+
+
+def test_the_shapes_are_what_they_are_called() -> None:
+    rng = np.random.default_rng(0)
+    assert not offsets("flat", 1.0, rng).any()
+    assert np.ptp(offsets("parabola", 0.5, rng)[:, 2]) == pytest.approx(0.5, abs=0.35)
+    assert not offsets("in_plane", 0.1, rng)[:, 2].any()
