@@ -212,6 +212,8 @@ def _check_options(
     ):
         if value not in choices:
             raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
+    if method != "neuro" and target in ("flat", "free"):
+        raise UsageError(f"target {target} needs the method neuro, but the method is {method}; leave it out")
     if not isinstance(starts, (int, np.integer)) or starts < 2:
         raise UsageError("starts must be a whole number of at least 2, because two starts must agree")
     if not isinstance(seed, (int, np.integer)) or seed < 0:

@@ -159,6 +159,7 @@ FEW = table_1().points().select(np.arange(0, 440, 90))
         (FLAT.points(), {"method": "tsai", "distortion": "k1k2"}, "estimates k1 alone"),
         (FLAT.points(), {"method": "tsai", **FLAT.given(4)}, "estimates poses"),
         (replace(FLAT.points(), image_size=None), {"method": "tsai"}, "needs the image centre"),
+        (FLAT.points(), {"method": "linear", "target": "free"}, "target free needs the method neuro"),
         (FLAT.points(), {"method": "dlt"}, "method must be one of neuro, linear, nonlinear, tsai"),
         (
             Correspondences(table_1().world * [1, 1, -1], table_1().pixels),

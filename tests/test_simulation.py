@@ -18,7 +18,9 @@ from neurocal_cli.errors import InputError, NeurocalError
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.noise import NoiseStudy, cramer_rao, study_noise
 from neurocal_cli.simulation.pictures import pictures, visible_points
+from neurocal_cli.simulation.plots import draw_rates
 from neurocal_cli.simulation.rates import data_set, study_rates
+from neurocal_cli.simulation.report import rates_json, rates_tables
 from neurocal_cli.simulation.scenes import (
     PAPER_BOARD,
     PAPER_CAMERA,
@@ -197,6 +199,12 @@ def test_the_default_rates_converge_and_others_do_not() -> None:
     assert study.converged.ravel().tolist() == [12, 0]
     assert study.calibrated == 12
     assert np.isnan(study.epochs[1, 0])
+    pytest.importorskip("matplotlib")
+    assert draw_rates(study, "svg").startswith(b"<?xml")
+    tables, below = rates_tables(study)
+    assert tables[0][1][1:] == [["0.05", "12"], ["0.8", "0"]]
+    assert "12 of 12 data sets" in below[0]
+    assert rates_json(study)["median_epochs"][1] == [None]
 
 
 @pytest.mark.slow

@@ -97,6 +97,9 @@ def compare(
     error on points that were left out (a fifth of each view at a time), the time, and the parameters with
     their standard deviations.
 
+    The target is taken as it is given, also by the network. Measured directions of mid-points count for neuro
+    and backprop alone.
+
     With the points of a second camera, both cameras are calibrated by themselves, and the points that both
     see are triangulated, as in the paper's Table 2: the rms error in space, and NSCE, which is 1 where the
     error is that of rounding to whole pixels. The same is shown through one rig for all pairs of views.

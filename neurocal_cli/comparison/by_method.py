@@ -17,7 +17,7 @@ METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 def calibrate_with(
     method: str, points: Correspondences, model: str, skew: bool = True, seed: int = 0
 ) -> Calibration:
-    """Calibrate a camera of which nothing is given (type 1) from all points by a method.
+    """Calibrate a camera of which nothing is given (type 1) from all points by a method; the target is given.
 
     Parameters
     ----------

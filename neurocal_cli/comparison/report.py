@@ -118,7 +118,8 @@ def _lowest(what: str, errors: dict[str, float], unit: str) -> list[str]:
         return []
     best = min(known.values())
     winners = [method for method, error in known.items() if _px(error) == _px(best)]
-    return [f"{what}: {' and '.join(winners)}, {_px(best)}{unit}"]
+    names = " and ".join([", ".join(winners[:-1]), winners[-1]] if len(winners) > 1 else winners)
+    return [f"{what}: {names}, {_px(best)}{unit}"]
 
 
 def _px(value: float) -> str:

@@ -1,0 +1,27 @@
+"""The figures of the page of results, as the commands draw them."""
+
+from __future__ import annotations
+
+from style import HERE
+
+from neurocal_cli.processes import usable_cores
+from neurocal_cli.simulation.noise import study_noise
+from neurocal_cli.simulation.plots import draw_rates, draw_simulation
+from neurocal_cli.simulation.rates import study_rates
+from neurocal_cli.simulation.scenes import paper_scene
+from neurocal_cli.simulation.starts import study_starts
+
+SIGMA = (0.1, 0.2, 0.5, 1.0, 2.0)
+METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai")
+
+
+def main() -> None:
+    scene, jobs = paper_scene(), usable_cores()
+    errors = study_noise(scene, SIGMA, 50, METHODS, jobs=jobs)
+    starts = study_starts(scene, 0.5, 200, jobs=jobs)
+    (HERE / "fig1.png").write_bytes(draw_simulation(errors, starts, scene.unit))
+    (HERE / "rates.png").write_bytes(draw_rates(study_rates(70, jobs=jobs)))
+
+
+if __name__ == "__main__":
+    main()
