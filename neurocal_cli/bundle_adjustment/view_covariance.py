@@ -14,6 +14,7 @@ allows, and nowhere below the normal matrix's. Views that repeat a pose (`repeat
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -43,6 +44,7 @@ def counting_views(
     free_poses: bool,
     n_residuals: float,
     repeated: RepeatedPoses,
+    moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None,
 ) -> Covariance:
     """Covariances as far as views, not residuals, are independent.
 
@@ -53,6 +55,9 @@ def counting_views(
     normal, free, free_poses, n_residuals
         As for `covariance.covariance`.
     repeated : RepeatedPoses
+    moves_without : callable, optional
+        How far the free parameters move without the views of each pose, given each view's pose, where the
+        normal matrices do not tell.
 
     Returns
     -------
@@ -68,7 +73,8 @@ def counting_views(
     if not repeated.none:
         entries = _of_copies(q, repeated.variance, variance)
     if len(q.cost) >= _FEWEST and _contradict(q, repeated.variance, variance):
-        entries = _at_least(_jackknife(q), entries)
+        moves = None if moves_without is None else moves_without(repeated.group)
+        entries = _at_least(_jackknife(q.moves_without_each() if moves is None else moves), entries)
     if entries is found.entries or not np.isfinite(entries).all():
         return found
     return replace(found, entries=entries, poses=_followed(found, normal, free, free_poses, entries))
@@ -126,9 +132,8 @@ def _contradict(q: Quadratics, times: Array, variance: float) -> bool:
     return bool(statistic > exceeded_by_chance(mean**2 / spread, _CHANCE))
 
 
-def _jackknife(q: Quadratics) -> Array:
-    """(f, f), nan where views cannot be left out."""
-    moves = q.moves_without_each()
+def _jackknife(moves: Array) -> Array:
+    """(f, f) from the moves (P, f) without each pose; nan where views cannot be left out."""
     moves = moves - moves.mean(axis=0)
     return np.asarray((len(moves) - 1) / len(moves) * moves.T @ moves)
 

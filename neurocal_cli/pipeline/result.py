@@ -45,17 +45,18 @@ def calibration_of(
     errors = point_residuals(views, state)  # (N, 2), by view
     repeated = repeated_poses(views, state, errors)
     asked, n_equations = (problem.free_camera, problem.free_poses), views.n_equations
-    normal, shared = adjusted.normal, solution.shared
+    normal, shared, moves_without = adjusted.normal, solution.shared, None
     if solution.target is not None:
         uncertain = target_uncertainty(
             solution.target, views, state, *asked, problem.points.world[_order(views)]
         )
         normal, shared = uncertain.normal, uncertain.entries
         n_equations -= uncertain.determined
+        moves_without = uncertain.moves_without
     cov = covariance(normal, *asked, n_equations, shared)
     refuse_undetermined(problem, state, cov)
     if solution.shared is None:
-        cov = counting_views(cov, normal, *asked, n_equations, repeated)
+        cov = counting_views(cov, normal, *asked, n_equations, repeated, moves_without)
     A = problem.matrix(state.entries[0])
     intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     if problem.type != 3 and not problem.free[1]:

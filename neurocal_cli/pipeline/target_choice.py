@@ -57,9 +57,7 @@ def with_target(
     if choice == "given" or solution.refusal or options.distortion == "plumb-line":
         return solution, rejected
     found = _found(solution, choice, None)
-    if found is None:
-        return solution, rejected
-    if choice == "auto" and (found.target.evidence < LEAST_GAIN or _other_reason(solution)):
+    if found is None or (choice == "auto" and _other_reason(solution)):
         return solution, rejected
     best: tuple[Solution, Rejected] = solution, rejected
     for _ in range(_ROUNDS):
@@ -108,7 +106,8 @@ def _found(solution: Solution, choice: str, known: Target | None) -> Found | Non
         return None  # errors that copies of a view share look like the target's
     # Only a lens that nobody named may change.
     find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
-    return find([(problem, solution.adjusted)], choice == "flat", known)
+    least = LEAST_GAIN if choice == "auto" else -np.inf
+    return find([(problem, solution.adjusted)], choice == "flat", known, least)
 
 
 def _fitted_to(

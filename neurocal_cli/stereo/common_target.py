@@ -48,10 +48,10 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     except NeurocalError:
         return None
     chosen = known is None and all(camera.lens_choice for camera in cameras)
-    found = (find_lens_and_target if chosen else find_target)(fits, choice == "flat", known)
-    if found is None or (choice == "auto" and found.target.evidence < LEAST_GAIN):
-        return None
-    return found.target
+    found = (find_lens_and_target if chosen else find_target)(
+        fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf
+    )
+    return None if found is None else found.target
 
 
 def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:

@@ -26,9 +26,10 @@ from neurocal_cli.target_shape.prior import prior_of
 __all__ = ["LEAST_GAIN", "Found", "enough_views", "find_target"]
 
 _STEPS = 10
+_EARLY = 0.5  # of the gain, that the first step must promise
 _SETTLED = 0.02  # of the cameras' standard deviations
 _LARGEST = 0.02  # of the target's size: more is no target that happens to be bent
-_STRETCHED = 0.01  # prints are by a few thousandths; more is a square of another size along one side
+_STRETCHED = 0.02  # prints are by a few thousandths; more is a square of another size along one side
 _FEWEST, _FEWEST_OF_FOLDED = 3, 2  # different views of most points
 LEAST_GAIN = 10.0
 """Of the logarithm of the evidence, for a target to be found unasked: sizes for four parts, each at a level
@@ -63,7 +64,10 @@ def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -
 
 
 def find_target(
-    fits: Sequence[tuple[Problem, Adjusted]], flat: bool = False, known: Target | None = None
+    fits: Sequence[tuple[Problem, Adjusted]],
+    flat: bool = False,
+    known: Target | None = None,
+    least_gain: float = -np.inf,
 ) -> Found | None:
     """Find where the points of a target really are.
 
@@ -75,6 +79,8 @@ def find_target(
         Whether the points stay in their planes.
     known : Target, optional
         Where the points of the fits are already, and where to begin.
+    least_gain : float
+        Of the logarithm of the evidence: a target that raises it by less is not looked for to the end.
 
     Returns
     -------
@@ -84,7 +90,7 @@ def find_target(
     search = _Search(fits, flat, known)
     try:
         with np.errstate(all="ignore"):
-            return search.run()
+            return search.run(least_gain)
     except np.linalg.LinAlgError:
         return None
 
@@ -108,10 +114,12 @@ class _Search:
         found = np.zeros_like(self.given) if known is None else known.offsets
         self.offsets = self.prior.along_axes(found)
 
-    def run(self) -> Found | None:
-        for _ in range(_STEPS):
+    def run(self, least_gain: float) -> Found | None:
+        for step in range(_STEPS):
             info = self._information().around_given(self.offsets)
             found = posterior(info, self.prior, self.sizes, self.flat)
+            if step == 0 and found.evidence - evidence_of_given(info) < _EARLY * least_gain:
+                return None
             std = np.sqrt(found.variance * np.diagonal(found.camera))
             settled = bool((np.abs(found.camera_step) < _SETTLED * std).all())
             if not self._move(found):
@@ -119,7 +127,7 @@ class _Search:
             if settled:
                 break
         gain = found.evidence - evidence_of_given(info)
-        if not holds_for_views_left_out(
+        if gain < least_gain or not holds_for_views_left_out(
             self._sights(), self.prior, self.offsets, found.sizes, found.variance
         ):
             return None

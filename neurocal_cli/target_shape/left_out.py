@@ -1,8 +1,8 @@
 """Whether a target that was found explains views that it was not found from.
 
 The evidence takes errors for independent noise of the stated size. Where they are not, as with a view whose
-stated sigma is far too small, offsets of the target can follow the errors of a few views. Half of the views
-tell: the offsets that one half gives must lower the squared error of the other one.
+stated sigma is far too small, offsets of the target can follow the errors of a few views. Views left out
+tell: the offsets that the other views give must lower their squared error.
 """
 
 from __future__ import annotations
@@ -11,21 +11,23 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.target_shape.information import Sight, information_of
+from neurocal_cli.target_shape.information import Information, Sight, information_of
 from neurocal_cli.target_shape.posterior import cost_at, known_sizes
 from neurocal_cli.target_shape.prior import Prior
 
 __all__ = ["holds_for_views_left_out"]
 
-_FEWEST = 4  # views, of which halves determine a camera
+_FEWEST = 4  # views, so that the others determine a camera
+_FOLDS = 5
 
 
 def holds_for_views_left_out(
     sights: Sequence[Sight], prior: Prior, offsets: Array, sizes: Mapping[str, float], variance: float
 ) -> bool:
-    """See whether the offsets of each half of the views suit the other half; True where nobody can tell.
+    """See whether the offsets of the other views suit those left out; True where nobody can tell.
 
     Parameters
     ----------
@@ -38,26 +40,32 @@ def holds_for_views_left_out(
     variance : float [px^2]
         Of the noise.
     """
+    n_views = max(sight.views.n_views for sight in sights)
     if sum(sight.views.n_views for sight in sights) < _FEWEST:
         return True
-    halves = [[half for sight in sights if (half := _half(sight, k)) is not None] for k in (0, 1)]
-    infos = [information_of(half, len(offsets)).turned(prior.axes).around_given(offsets) for half in halves]
+
+    def information(folds: NDArray[np.intp]) -> Information:
+        some = [_of(sight, np.isin(np.arange(sight.views.n_views) % n_folds, folds)) for sight in sights]
+        return information_of(some, len(offsets)).turned(prior.axes).around_given(offsets)
+
+    n_folds = min(n_views, _FOLDS)
     found = given = 0.0
-    for mine, other in (infos, infos[::-1]):
+    for fold in range(n_folds):
+        others = information(np.delete(np.arange(n_folds), fold))
+        out = information(np.array([fold]))
         try:
-            told = known_sizes(mine, prior, sizes, variance).offsets
+            told = known_sizes(others, prior, sizes, variance).offsets
         except np.linalg.LinAlgError:
             return True
-        found += cost_at(other, told)
-        given += cost_at(other, np.zeros_like(told))
+        found += cost_at(out, told)
+        given += cost_at(out, np.zeros_like(told))
     return found < given
 
 
-def _half(sight: Sight, first: int) -> Sight | None:
-    """Every other view of a camera."""
-    some = np.arange(first, sight.views.n_views, 2)
-    if not some.size:
-        return None
-    state = replace(sight.state, R=sight.state.R[some], t=sight.state.t[some])
-    label = sight.label[np.isin(sight.views.index, some)]
-    return replace(sight, views=sight.views.subset(some), state=state, label=label)
+def _of(sight: Sight, some: NDArray[np.bool_]) -> Sight:
+    """Some views of a camera."""
+    which = np.flatnonzero(some)
+    state = replace(sight.state, R=sight.state.R[which], t=sight.state.t[which])
+    return replace(
+        sight, views=sight.views.subset(which), state=state, label=sight.label[some[sight.views.index]]
+    )

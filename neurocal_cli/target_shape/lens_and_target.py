@@ -26,10 +26,13 @@ _SIMPLER = -1.0
 
 
 def find_lens_and_target(
-    fits: Sequence[tuple[Problem, Adjusted]], flat: bool = False, known: Target | None = None
+    fits: Sequence[tuple[Problem, Adjusted]],
+    flat: bool = False,
+    known: Target | None = None,
+    least_gain: float = -np.inf,
 ) -> Found | None:
     """Find where the points of a target really are, and which lens sees them there; see `find_target`."""
-    best = find_target(fits, flat, known)
+    best = find_target(fits, flat, known, least_gain)
     if best is None:
         return None
     for step, least in ((1, _RICHER), (-1, _SIMPLER)):

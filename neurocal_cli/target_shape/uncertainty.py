@@ -9,7 +9,8 @@ of which sums over views have the information that is left.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,9 +21,14 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.information import Sight, by_world, information_of, labelled
 from neurocal_cli.target_shape.posterior import known_sizes
-from neurocal_cli.target_shape.prior import prior_of
+from neurocal_cli.target_shape.prior import Prior, prior_of
 
 __all__ = ["TargetUncertainty", "target_uncertainty"]
+
+
+_MOST_POSES = (
+    24  # that are left out one by one, each with a target of its own; among more, one matters little
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +48,40 @@ class TargetUncertainty:
     entries: Array
     normal: Array
     determined: float
+    _sight: Sight
+    _offsets: Array
+    _prior: Prior
+    _sizes: Mapping[str, float]
+    _variance: float
+
+    def moves_without(self, group: NDArray[np.intp]) -> Array | None:
+        """(P, f) how far the camera's parameters move where the views of one pose are left out.
+
+        The target is found anew without them, in one step. None where the poses are many, and the efficient
+        scores tell the same.
+
+        Parameters
+        ----------
+        group : (V,) int array
+            Pose of each view.
+        """
+        n_poses = int(group.max()) + 1
+        if n_poses > _MOST_POSES:
+            return None
+        try:
+            return np.stack([self._step(np.flatnonzero(group != pose)) for pose in range(n_poses)])
+        except np.linalg.LinAlgError:
+            return None
+
+    def _step(self, kept: NDArray[np.intp]) -> Array:
+        sight = self._sight
+        state = replace(sight.state, R=sight.state.R[kept], t=sight.state.t[kept])
+        label = sight.label[np.isin(sight.views.index, kept)]
+        some = replace(sight, views=sight.views.subset(kept), state=state, label=label)
+        info = information_of([some], len(self._offsets)).turned(self._prior.axes)
+        return known_sizes(
+            info.around_given(self._offsets), self._prior, self._sizes, self._variance
+        ).camera_step
 
 
 def target_uncertainty(
@@ -68,11 +108,14 @@ def target_uncertainty(
     info = information_of([sight], len(target.given)).turned(prior.axes)
     offsets = prior.along_axes(target.offsets)
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
-    found = known_sizes(info.around_given(offsets), prior, target.sizes, info.cost / spare)
+    variance = info.cost / spare
+    found = known_sizes(info.around_given(offsets), prior, target.sizes, variance)
     followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
     followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # points of no target: -1
     normal = _efficient(views, state, np.flatnonzero(free), labelled(views, label), followed)
-    return TargetUncertainty(found.variance * found.camera, normal, found.determined)
+    return TargetUncertainty(
+        found.variance * found.camera, normal, found.determined, sight, offsets, prior, target.sizes, variance
+    )
 
 
 def _efficient(
