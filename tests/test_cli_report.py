@@ -15,7 +15,7 @@ from support.made_calibration import made_calibration
 from support.rigs import random_rig, sides
 
 from neurocal_cli import write_calibration, write_rig
-from neurocal_cli.calibration import Verdict
+from neurocal_cli.calibration import Rejected, Verdict
 from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map
 from neurocal_cli.io.result_files import write_result
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
@@ -75,17 +75,34 @@ def test_a_page_is_whole_and_loads_nothing(camera_file: Path, tmp_path: Path) ->
     assert told == sorted(told)
 
 
-def test_names_cannot_become_html(tmp_path: Path) -> None:
-    text = Path(write(tmp_path)).read_text().replace("camera_name: camera", 'camera_name: "<b>&x</b>"')
-    (tmp_path / "evil.yaml").write_text(text)
+def test_no_text_of_a_file_can_become_html(tmp_path: Path) -> None:
+    evil = '"<script>alert(1)</script>'
+    calibration = made_calibration(2)
+    judged = Verdict(evil, (evil,), (evil,), {"held_out_px": 0.4})
+    points = calibration.points
+    ids = np.array([f"{evil}{k}" for k in range(len(points))])
+    views = {name: f"{evil} {name}" for name in points.view_names}
+    labels = np.array([views[name] for name in points.view])
+    rejected = Rejected(
+        replace(points.select(slice(0, 3)), point=ids[:3], view=labels[:3]), np.ones(3), {evil: evil}
+    )
+    hostile = replace(
+        calibration,
+        points=replace(points, point=ids, view=labels, unit=evil),
+        views={views[name]: view for name, view in calibration.views.items()},
+        network=None,
+        camera_name=evil,
+        warnings=(evil,),
+        stop_reason=evil,
+        rejected=rejected,
+        judgement=judged,
+    )
+    write_calibration(hostile, tmp_path / "evil.yaml")
     result = run("report", tmp_path / "evil.yaml")
-    assert "&lt;b&gt;&amp;x&lt;/b&gt;" in result.stdout
-    assert "<b>&x" not in result.stdout
-
-
-def write(folder: Path) -> Path:
-    write_calibration(made_calibration(2), folder / "camera.yaml")
-    return folder / "camera.yaml"
+    assert result.exit_code == 0, result.stderr
+    page = Page(result.stdout)
+    assert page.tags.count("script") == 1
+    assert page.text.count("alert(1)") > 10
 
 
 def test_the_same_file_gives_the_same_page(camera_file: Path) -> None:

@@ -18,7 +18,13 @@ LIBRARY = [name for name in MODULES if not name.startswith("commands/") and name
 HOMES = {
     "click": ("commands/",),
     "rich": ("commands/",),
-    "matplotlib": ("plots.py", "target_plot.py", "simulation/plots.py", "zoom_lens/plots.py"),
+    "matplotlib": (
+        "plots.py",
+        "target_plot.py",
+        "simulation/plots.py",
+        "planning/plots.py",
+        "zoom_lens/plots.py",
+    ),
     "yaml": ("io/",),
     "cv2": (
         "baselines/opencv.py",
@@ -49,7 +55,7 @@ LEVELS = (
     {"plots"},
     {"target_plot"},
     {"zoom_lens"},
-    {"html_report"},
+    {"html_report", "planning"},
     {"simulation"},
     {"io"},
     {"detection"},

@@ -24,6 +24,7 @@ __all__ = ["neurocal"]
 # Each command is the function of this name in the module of this name; None: hidden. The summaries
 # stand here as well as in the commands' help, so that ``neurocal --help`` loads none of them.
 _SUMMARIES = {
+    "advise": "Advise which views of the target to photograph next.",
     "board": "Draw a chessboard target to print.",
     "calibrate": "Calibrate a camera from known points and their pixels.",
     "compare": "Compare calibration methods on the same points.",

@@ -122,9 +122,8 @@ def verdict_block(verdict: Verdict | None, facts: str) -> str:
     for title, entries in (("Reasons", verdict.reasons), ("Advice", verdict.advice)):
         if entries:
             lists += f"<p>{title}</p><ul>{''.join(f'<li>{escape(entry)}</li>' for entry in entries)}</ul>"
-    return (
-        f'<div class="verdict {verdict.word}"><b>{verdict.word}</b> <span>{escape(facts)}</span>{lists}</div>'
-    )
+    word = escape(verdict.word)  # of a file that anybody may have written
+    return f'<div class="verdict {word}"><b>{word}</b> <span>{escape(facts)}</span>{lists}</div>'
 
 
 def definitions(entries: Mapping[str, str]) -> str:

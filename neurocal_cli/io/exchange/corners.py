@@ -171,9 +171,11 @@ def _stack(field: Field, width: int) -> Array:
     """Points of each view, (V, N, width); places on a board may lack Z."""
     value = field.value
     if isinstance(value, dict):  # an OpenCV matrix, of one channel or several
-        value = np.reshape(
-            field["data"].array(-1, unknown=True), (field["rows"].integer(), field["cols"].integer(), -1)
-        )
+        data = field["data"].array(-1, unknown=True)
+        rows, cols = field["rows"].integer(1), field["cols"].integer(1)
+        if len(data) % (rows * cols):
+            field.fail(f"{rows} x {cols} points")
+        value = data.reshape(rows, cols, -1)
     try:
         array = np.array(value, dtype=float)
     except (TypeError, ValueError):

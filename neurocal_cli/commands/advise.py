@@ -1,0 +1,74 @@
+"""``neurocal advise``: which views to photograph next."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import click
+
+from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, json_option
+from neurocal_cli.commands.places import check_outputs
+
+__all__ = ["advise"]
+
+
+@click.command(cls=Command)
+@click.argument(
+    "calibration",
+    metavar="CAMERA.yaml",
+    type=INPUT,
+    cls=Argument,
+    description="A calibration that neurocal wrote; - is standard input.",
+)
+@click.option(
+    "--next",
+    "count",
+    metavar="N",
+    type=click.IntRange(1, 20),
+    default=3,
+    help="Number of views to advise.",
+)
+@click.option(
+    "--plot",
+    metavar="FILE",
+    type=click.Path(writable=False, readable=False),
+    show_default="none",
+    help="Draw the outlines of these views to this .png, .pdf or .svg file.",
+)
+@json_option
+def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> None:
+    """Advise which views of the target to photograph next.
+
+    About 900 views in which the camera would see the whole target are weighed: 25 positions in the image,
+    3 distances, 17 tilts and 2 turns. Each time the view is chosen that lowers the uncertainty of the camera
+    most, given those before it. The number behind each view is the uncertainty that is left.
+
+    The uncertainty is the largest standard deviation of a projected pixel, all over the image, for points at
+    half to ten times the distance of the views. A change of the camera that a motion of its frame makes up
+    for does not count. Systematic errors, such as a wrong distortion model, are not part of it; see the
+    verdict of neurocal evaluate camera.
+
+    \b
+    Examples:
+      neurocal calibrate sample_data/flat.csv -o camera.yaml
+      neurocal advise camera.yaml --next 2
+      neurocal advise camera.yaml --plot next.png --json
+    """  # noqa: D301 - as in the group
+    check_plot(plot, "-")
+    check_outputs((plot,), (calibration,))
+    from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.planning.advice import advise as weigh
+    from neurocal_cli.planning.report import advice_json, advice_lines
+
+    known = read_calibration(calibration)
+    advice = weigh(known, count)
+    if plot is not None:
+        from neurocal_cli.io.writing import write_whole
+        from neurocal_cli.planning.plots import draw_advice
+
+        write_whole(plot, draw_advice(advice, known, os.path.splitext(plot)[1][1:].lower()))
+    if as_json:
+        click.echo(json.dumps(advice_json(advice), indent=2, allow_nan=False))
+    else:
+        click.echo("\n".join(advice_lines(advice)))

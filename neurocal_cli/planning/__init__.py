@@ -1,0 +1,1 @@
+"""Which views to photograph next."""

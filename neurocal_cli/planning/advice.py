@@ -1,0 +1,221 @@
+"""The views that lower the uncertainty of a camera most, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
+from neurocal_cli.verdict.projection_uncertainty import image_grid
+
+__all__ = ["Advice", "Candidate", "advise", "candidates", "uncertainty_with"]
+
+_ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
+_POSITIONS = (0.15, 0.325, 0.5, 0.675, 0.85)  # of the image's width and height
+_WIDTHS = (0.3, 0.5, 0.75)  # of the image's width, that the target takes
+_TILTS = ((0.0, 0.0), *((tilt, way) for tilt in (25.0, 45.0) for way in range(0, 360, 45)))  # degrees
+_ROLLS = (0.0, 90.0)  # degrees
+_FROM_TO = np.array([0.5, 1.0, 2.0, 10.0])  # times the views' distance: where the camera is to be accurate
+_FLAT = 1e-6  # of the target's size
+_LEAST_SIGMA = 1e-4  # px; a perfect fit has no noise to compare with
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A view that could be taken.
+
+    Attributes
+    ----------
+    pose : Pose
+    position : (2,) array
+        Where the middle of the target is, as shares of the image's width and height.
+    width : float
+        Share of the image's width that the target takes, seen frontally.
+    tilt, way : float [degrees]
+        By how much the target is tilted, and which side comes nearer: 0 the right one, 90 the lower one.
+    roll : float [degrees]
+        By how much it is turned in its plane, clockwise.
+    outline : (n, 2) array [px]
+        Corners of the target in the image.
+    """
+
+    pose: Pose
+    position: Array
+    width: float
+    tilt: float
+    way: float
+    roll: float
+    outline: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Advice:
+    """Views to take next, in this order.
+
+    Attributes
+    ----------
+    views : tuple of Candidate
+    before : float [px]
+        Largest standard deviation of a projected pixel now.
+    after : tuple of float [px]
+        The same after each of the views.
+    image_size : (width, height) [px]
+    """
+
+    views: tuple[Candidate, ...]
+    before: float
+    after: tuple[float, ...]
+    image_size: tuple[int, int]
+
+
+def advise(calibration: Calibration, count: int = 3) -> Advice:
+    """Choose views: each time the one that lowers the worst uncertainty most, given those before it.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With its points, of images of known size.
+    count : int
+        How many views.
+
+    Raises
+    ------
+    InputError
+        No points, no image size, no free parameter, or no view that the camera could see whole.
+    """
+    known, places, free, sigma = _state(calibration)
+    camera, world = calibration.camera, _target(calibration)
+    options = candidates(calibration)
+    if not options:
+        raise InputError(
+            "the camera can see the target whole in no view; check the image size and the target"
+        )
+    told = [view_information(camera, free, option.pose, world) for option in options]
+    before = worst_std(known, places, sigma)
+    chosen, after = [], []
+    for _ in range(count):
+        values = [worst_std(known + view, places, sigma) for view in told]
+        best = int(np.argmin(values))
+        known = known + told[best]
+        chosen.append(options[best])
+        after.append(values[best])
+    assert camera.image_size is not None
+    return Advice(tuple(chosen), before, tuple(after), camera.image_size)
+
+
+def uncertainty_with(calibration: Calibration, views: Sequence[Candidate]) -> tuple[float, float]:
+    """Worst standard deviation of a projected pixel now, and with some more views [px]; see `advise`."""
+    known, places, free, sigma = _state(calibration)
+    camera, world = calibration.camera, _target(calibration)
+    before = worst_std(known, places, sigma)
+    for view in views:
+        known = known + view_information(camera, free, view.pose, world)
+    return before, worst_std(known, places, sigma)
+
+
+def _state(calibration: Calibration) -> tuple[Array, Array, NDArray[np.bool_], float]:
+    """What the views tell that were taken, where it is judged, what is free, and the noise [px]."""
+    points, camera = calibration.points, calibration.camera
+    if not len(points) or not calibration.views:
+        raise InputError("the calibration holds no points; give a file that was not written with --lean")
+    if camera.image_size is None:
+        raise InputError("the size of the images is unknown; calibrate with --image-size W H")
+    names = (*_ORDER, *coefficient_names(calibration.distortion_model))
+    free = np.array([name not in calibration.fixed for name in names])
+    if not camera.intrinsics.skewed:
+        free[1] = False
+    if not free.any():
+        raise InputError(
+            "all parameters of the camera are given; there is nothing to be learnt from more views"
+        )
+    known, depths = np.zeros((int(free.sum()), int(free.sum()))), []
+    for k, name in enumerate(points.view_names):
+        pose, own = calibration.views[name].pose, points.world[points.view_index == k]
+        known += view_information(camera, free, pose, own)
+        depths.append(float(np.median(pose.to_camera(own)[:, 2])))
+    places = pixel_changes(camera, free, image_grid(camera.image_size), _FROM_TO * np.median(depths))
+    rms = calibration.rmse_px if np.isfinite(calibration.rmse_px) else 0.0
+    return known, places, free, max(rms / np.sqrt(2.0), _LEAST_SIGMA)
+
+
+def _target(calibration: Calibration) -> Array:
+    """(n, 3) the target's points, once each."""
+    return np.asarray(np.unique(calibration.points.world, axis=0))
+
+
+def candidates(calibration: Calibration) -> list[Candidate]:
+    """Views in which the whole target is in the image: all positions, three sizes, tilts and two turns."""
+    camera, world = calibration.camera, _target(calibration)
+    assert camera.image_size is not None
+    size = np.array(camera.image_size, dtype=float)
+    middle = 0.5 * (world.min(axis=0) + world.max(axis=0))
+    frontal = _frontal(calibration, world - middle)
+    corners = _outline(world - middle, frontal)
+    extent = np.ptp((world - middle) @ frontal.T, axis=0)[:2]
+    turns = [(*tilt, roll) for tilt in _TILTS for roll in _ROLLS]
+    R = np.array([_tilted(tilt, way) @ _rolled(roll) @ frontal for tilt, way, roll in turns])
+    # Where the corners of a flat target are in the image, all of it is.
+    flat = np.ptp((world - middle) @ frontal[2]) <= _FLAT * extent.max()
+    checked = corners if flat else world - middle
+    found = []
+    for share in [(a, b) for b in _POSITIONS for a in _POSITIONS]:
+        ray = camera.unproject((np.array(share) * (size - 1))[None])[0]
+        if not (np.isfinite(ray).all() and ray[2] > 0):
+            continue
+        for width in _WIDTHS:
+            depth = camera.A[0, 0] * float(extent.max()) / (width * size[0])
+            centre = depth * ray / ray[2]
+            points = checked @ np.swapaxes(R, 1, 2) + centre  # (turns, n, 3)
+            pixels = camera.project(points)[0]
+            with np.errstate(invalid="ignore"):
+                whole = ((pixels >= 0) & (pixels <= size - 1)).all(axis=(1, 2)) & camera.sees(points).all(
+                    axis=1
+                )
+            for k in np.flatnonzero(whole).tolist():
+                pose = Pose(R[k], centre - R[k] @ middle)
+                outline = camera.project(corners @ R[k].T + centre)[0]
+                found.append(Candidate(pose, np.array(share), width, *turns[k], outline))
+    return found
+
+
+def _frontal(calibration: Calibration, centred: Array) -> Array:
+    """The rotation in which the camera sees the target frontally, upright as its views do on the mean."""
+    mean = nearest_rotation(np.mean([view.pose.R for view in calibration.views.values()], axis=0))
+    _, spread, axes = np.linalg.svd(centred, full_matrices=False)
+    if spread[2] > _FLAT * spread[0]:
+        return np.asarray(mean)
+    normal = axes[2] if mean[2] @ axes[2] > 0 else -axes[2]  # away from the camera
+    right = mean[0] - (mean[0] @ normal) * normal
+    if np.linalg.norm(right) < 1e-6:
+        right = axes[0]
+    right = right / np.linalg.norm(right)
+    return np.array([right, np.cross(normal, right), normal])
+
+
+def _outline(centred: Array, frontal: Array) -> Array:
+    """(n, 3) the target's points that make its outline, seen frontally, in order."""
+    from scipy.spatial import ConvexHull
+
+    flat = (centred @ frontal.T)[:, :2]
+    return np.asarray(centred[ConvexHull(flat, qhull_options="QJ").vertices])
+
+
+def _tilted(tilt: float, way: float) -> Array:
+    """Turn that brings the side in a direction of the image nearer; degrees."""
+    a, b = np.radians(tilt), np.radians(way)
+    axis = np.array([-np.sin(b), np.cos(b), 0.0])
+    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.asarray(np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K)
+
+
+def _rolled(roll: float) -> Array:
+    c, s = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -1,0 +1,128 @@
+"""Views that are worth taking: three advised ones beside three random ones, and what the command says."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.command_line import run
+from support.distorted import bent_set
+from support.made_calibration import made_calibration
+
+from neurocal_cli import Calibration, Camera, Intrinsics, Pose, calibrate, write_calibration
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.errors import InputError
+from neurocal_cli.io.result_files import lean_calibration
+from neurocal_cli.planning.advice import advise, candidates, uncertainty_with
+from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
+from neurocal_cli.planning.report import advice_lines
+
+MODELS = ("none", "k1", "k1k2", "plumb_bob", "fisheye")
+
+
+def learnt(seed: int) -> Calibration:
+    """A simulated set of flat boards, calibrated."""
+    model = MODELS[seed % len(MODELS)]
+    scene, _ = bent_set(model, seed)
+    points = scene.points(0.3, np.random.default_rng(seed))
+    return calibrate(points, distortion=model, skew=False, outliers="keep")
+
+
+def advised_over_random(seed: int) -> float:
+    """By how much three advised views lower the uncertainty, over what three random ones do on the mean."""
+    calibration = learnt(seed)
+    advice = advise(calibration, 3)
+    options, rng = candidates(calibration), np.random.default_rng(seed)
+    gains = []
+    for _ in range(20):
+        views = [options[k] for k in rng.choice(len(options), 3, replace=False)]
+        before, after = uncertainty_with(calibration, views)
+        gains.append(before - after)
+    assert before == pytest.approx(advice.before)
+    return (advice.before - advice.after[-1]) / float(np.mean(gains))
+
+
+def test_advised_views_are_twice_as_good_as_random_ones() -> None:
+    assert advised_over_random(1) > 2
+
+
+@pytest.mark.slow
+def test_advised_views_are_twice_as_good_as_random_ones_in_a_hundred_sets() -> None:
+    ratios = np.array([advised_over_random(seed) for seed in range(100)])
+    assert np.median(ratios) > 2
+    assert (ratios > 1).all()
+
+
+def test_the_uncertainty_is_that_of_many_calibrations() -> None:
+    """The worst std, with a motion of the frame taken out, is the scatter of repeated least squares."""
+    camera = Camera(Intrinsics(600, 600, 320, 240), Distortion("k1", [-0.2]), (640, 480))
+    free = np.array([True, False, True, True, True, True])
+    rng = np.random.default_rng(0)
+    world = np.stack([*np.meshgrid(np.arange(6) * 30.0, np.arange(5) * 30.0), np.zeros((5, 6))], -1).reshape(
+        -1, 3
+    )
+    normal = np.zeros((5, 5))
+    for _ in range(6):
+        pose = Pose.from_euler(*rng.uniform(-0.6, 0.6, 3), np.array([*rng.uniform(-150, 0, 2), 500.0]))
+        normal += view_information(camera, free, pose, world)
+    pixels = np.array([[0.0, 0.0], [639, 0], [0, 479], [639, 479], [320, 240]])
+    J = pixel_changes(camera, free, pixels, np.array([250.0, 500.0, 5000.0]))
+    scale = np.sqrt(np.diagonal(normal))
+    L = np.linalg.cholesky(normal / np.outer(scale, scale))
+    drawn = np.linalg.solve(L.T, rng.standard_normal((5, 20000))).T / scale
+    moved = np.einsum("gif,nf->ngi", J, drawn)
+    scatter = np.sqrt((moved**2).sum(axis=2).mean(axis=0)).max()
+    assert worst_std(normal, J, 0.3) == pytest.approx(0.3 * scatter, rel=0.03)
+
+
+def test_each_view_helps_and_shows_the_whole_target() -> None:
+    calibration = learnt(3)
+    advice = advise(calibration, 4)
+    assert all(np.diff([advice.before, *advice.after]) < 0)
+    world = np.unique(calibration.points.world, axis=0)
+    for view in advice.views:
+        pixels, in_front = calibration.camera.project(view.pose.to_camera(world))
+        assert in_front.all()
+        assert (pixels >= 0).all()
+        assert (pixels <= np.array(calibration.image_size) - 1).all()
+        # The middle is where the text says, and the side that it names is nearer.
+        middle = calibration.camera.project(view.pose.to_camera(world.mean(axis=0)[None]))[0][0]
+        assert np.abs(middle / calibration.image_size - view.position).max() < 0.12
+        if view.tilt:
+            points = view.pose.to_camera(world)
+            way = np.radians(view.way)
+            along = (points[:, :2] - points[:, :2].mean(axis=0)) @ [np.cos(way), np.sin(way)]
+            assert np.corrcoef(along, points[:, 2])[0, 1] < 0
+
+
+def test_a_target_that_is_not_flat_can_be_advised_as_well() -> None:
+    advice = advise(replace(made_calibration(2), rmse_px=0.4), 1)
+    assert advice.after[0] < advice.before
+    assert len(advice_lines(advice)) == 2
+
+
+def test_the_command_tells_and_draws(tmp_path: Path) -> None:
+    write_calibration(made_calibration(2), tmp_path / "camera.yaml")
+    result = run("advise", tmp_path / "camera.yaml", "--next", 2, "--plot", tmp_path / "next.svg")
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout.splitlines()[1].startswith("1. target ")
+    assert (tmp_path / "next.svg").read_text().count("then") >= 2
+    result = run("advise", tmp_path / "camera.yaml", "--next", 2, "--json")
+    tree = json.loads(result.stdout)
+    assert len(tree["views"]) == 2
+    assert tree["views"][1]["worst_px"] < tree["views"][0]["worst_px"] < tree["worst_px"]
+
+
+def test_what_cannot_be_advised_is_refused() -> None:
+    calibration = made_calibration(2)
+    nothing = replace(calibration.points, image_size=None)
+    for given, message in (
+        (lean_calibration(calibration), "holds no points"),
+        (replace(calibration, points=nothing), "the size of the images is unknown"),
+        (replace(calibration, fixed=frozenset(calibration.std)), "all parameters of the camera are given"),
+    ):
+        with pytest.raises(InputError, match=message):
+            advise(given)
