@@ -79,6 +79,7 @@ def lean_calibration(calibration: Calibration) -> Calibration:
         views={},
         network=None,
         rejected=Rejected(),
+        target=None,
         judgement=calibration.verdict,
     )
 
