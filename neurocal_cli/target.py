@@ -73,6 +73,31 @@ class Target:
         world = np.where((place >= 0)[:, None], self.found[place], points.world)
         return points if (place < 0).all() else replace(points, world=world)
 
+    def as_given(self, points: Correspondences) -> Correspondences:
+        """The inverse of `applied`."""
+        place = self.rows_of(points.world)
+        world = np.where((place >= 0)[:, None], self.given[place], points.world)
+        return points if (place < 0).all() else replace(points, world=world)
+
+    def joined(self, other: Target) -> Target:
+        """One target from two that were found apart: their mean where both have a point."""
+        place = self.places(other.given)
+        both, new = np.flatnonzero(place >= 0), np.flatnonzero(place < 0)
+        found, std = self.found.copy(), self.std.copy()
+        found[place[both]] = 0.5 * (self.found[place[both]] + other.found[both])
+        std[place[both]] = 0.5 * np.hypot(self.std[place[both]], other.std[both])
+        point = None
+        if self.point is not None and other.point is not None:
+            point = np.concatenate([self.point, other.point[new]])
+        return replace(
+            self,
+            given=np.concatenate([self.given, other.given[new]]),
+            found=np.concatenate([found, other.found[new]]),
+            std=np.concatenate([std, other.std[new]]),
+            plane=np.concatenate([self.plane, other.plane[new]]),
+            point=point,
+        )
+
     def bend(self) -> float:
         """Most by which a plane's points lie above and below their mean plane, together [world unit]."""
         worst = 0.0

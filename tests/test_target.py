@@ -11,6 +11,7 @@ import pytest
 from support.command_line import run
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
+from support.targets import photographed_pair
 
 from neurocal_cli import Board, calibrate
 from neurocal_cli.board import Plane
@@ -21,6 +22,9 @@ from neurocal_cli.io.board_yaml import format_board, parse_board
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
 from neurocal_cli.io.points_csv import read_points
 from neurocal_cli.io.rig_yaml import read_rig
+from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
+from neurocal_cli.stereo.common_target import on_one_target
+from neurocal_cli.stereo.evaluation import evaluate_stereo
 from neurocal_cli.target import board_of, planes_of
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_data" / "bent.csv"
@@ -136,6 +140,32 @@ def test_points_without_ids_are_no_board() -> None:
     assert found is not None
     with pytest.raises(InputError, match="no ids"):
         board_of(found, "mm")
+
+
+def test_two_cameras_find_one_target() -> None:
+    left, right = photographed_pair(3)
+    rig = calibrate_stereo(left, right, distortion="none", skew=False)
+    assert rig.left.target is not None
+    assert rig.left.target is rig.right.target
+    assert abs(rig.baseline - 120) < 4 * rig.std["baseline"] < 0.5
+    given = calibrate_stereo(left, right, distortion="none", skew=False, target="given")
+    assert rig.rmse_px < 0.5 * given.rmse_px
+
+
+def test_cameras_that_were_calibrated_apart_are_put_on_one_target() -> None:
+    """By the points' given places, whether they have ids or not."""
+    left, right = (calibrate(points, distortion="none", skew=False) for points in photographed_pair(4))
+    assert left.target is not None
+    assert right.target is not None
+    one, other = on_one_target(left, right)
+    assert one.target is other.target
+    assert np.abs(one.points.world - left.points.world).max() < 0.05
+    found = evaluate_stereo(left, right)
+    assert found.by_view.rmse < 0.15  # 0.11 by the noise alone
+    again = evaluate_stereo(one, other)
+    assert again.by_view.rmse == pytest.approx(found.by_view.rmse)
+    mixed = evaluate_stereo(left, calibrate(photographed_pair(4)[1], target="given", skew=False))
+    assert mixed.n_points == found.n_points
 
 
 @pytest.mark.parametrize("kind", slow_but(("midpoints",), ("midpoints", "vertices")))

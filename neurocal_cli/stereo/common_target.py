@@ -17,7 +17,7 @@ from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 
-__all__ = ["common_target"]
+__all__ = ["common_target", "on_one_target"]
 
 
 def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
@@ -52,6 +52,25 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
         fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf
     )
     return None if found is None else found.target
+
+
+def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, Calibration]:
+    """Two cameras that were calibrated apart, with the points of both on one target.
+
+    Each may have found the target by itself. Then the mean of both is that of both.
+    """
+    if left.target is right.target:
+        return left, right
+    first, second = left.target or right.target, right.target or left.target
+    assert first is not None
+    assert second is not None
+    target = first if first is second else first.joined(second)
+
+    def on_it(camera: Calibration) -> Calibration:
+        points = camera.points if camera.target is None else camera.target.as_given(camera.points)
+        return replace(camera, points=target.applied(points), target=target)
+
+    return on_it(left), on_it(right)
 
 
 def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:

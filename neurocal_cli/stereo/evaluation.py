@@ -18,6 +18,7 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.assessment import assess_rig
+from neurocal_cli.stereo.common_target import on_one_target
 from neurocal_cli.stereo.fit_rig import fit_rig, poses_on_rig
 from neurocal_cli.stereo.pairing import Pairs, ViewPairs, pair_points, pair_views
 from neurocal_cli.stereo.rig import Rig
@@ -97,6 +98,7 @@ def evaluate_stereo(
     """
     warnings: list[str] = []
     judgement: Verdict | Callable[[], Verdict | None] | None = None
+    left, right = on_one_target(left, right)
     try:
         rig = fit_rig(left, right)
         warnings += rig.warnings
@@ -133,6 +135,9 @@ class _Evaluator:
     ) -> None:
         self.judgement = judgement
         self.cameras, self.rig, self.method, self.warnings = cameras, rig, method, warnings
+        target = cameras[0].target
+        if points is not None and target is not None:
+            points = target.applied(points[0]), target.applied(points[1])
         self.points = points or (cameras[0].points, cameras[1].points)
         if points is not None:
             for camera, given in zip(cameras, points, strict=True):
@@ -175,7 +180,14 @@ class _Evaluator:
         for side, (camera, points) in enumerate(zip(self.cameras, self.points, strict=True)):
             names = {pair[side] for pair in self.new}
             rows = np.array([name in names for name in points.view_names])[points.view_index]
-            fit = calibrate(points.select(rows), type=3, intrinsics=camera, seed=camera.seed, outliers="keep")
+            fit = calibrate(
+                points.select(rows),
+                type=3,
+                intrinsics=camera,
+                seed=camera.seed,
+                outliers="keep",
+                target="given",
+            )
             self.warnings += [f"fitting the poses of new views: {text}" for text in fit.warnings]
             if not fit.converged:
                 self.warnings.append(f"the poses of new views did not converge: {fit.stop_reason}")

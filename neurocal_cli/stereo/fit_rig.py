@@ -13,6 +13,7 @@ from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError,
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.adjust import AdjustedRig, adjust_rig
 from neurocal_cli.stereo.assessment import assess_rig
+from neurocal_cli.stereo.common_target import on_one_target
 from neurocal_cli.stereo.contradiction import contradiction, is_significant
 from neurocal_cli.stereo.pair_covariance import not_smaller, rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views
@@ -63,6 +64,7 @@ def fit_rig(
     """
     if outliers not in ("reject", "keep"):
         raise UsageError(f"outliers must be reject or keep, not {outliers!r}")
+    left, right = on_one_target(left, right)
     views = pair_views(left.points.view_names, right.points.view_names)
     pair_points(left.points, right.points, views)
     sound = sound_pairs(left, right, views)

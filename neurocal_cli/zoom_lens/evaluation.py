@@ -145,7 +145,9 @@ def _poses(lens: ZoomLens, points: LensPoints, local: Array, theta: float) -> Co
         )
         part = points.points.select(points.point_setting == s)
         try:
-            fit = calibrate(part, type=3, intrinsics=camera, distortion="none", outliers="keep")
+            fit = calibrate(
+                part, type=3, intrinsics=camera, distortion="none", outliers="keep", target="given"
+            )
         except NeurocalError as error:
             where = describe(points.controls, points.settings[s])
             raise InputError(f"at {where}: {error}") from error

@@ -99,12 +99,16 @@ def calibrate_each(
 
 def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Calibration:
     """One setting; without distortion where its points do not determine it."""
+
+    def calibrated(model: str) -> Calibration:
+        return calibrate(points, distortion=model, outliers="keep", target="given", skew=skew, seed=seed)
+
     try:
-        return calibrate(points, distortion=model, outliers="keep", skew=skew, seed=seed)
+        return calibrated(model)
     except DegenerateGeometryError:
         if model == "none":
             raise
-        return calibrate(points, distortion="none", outliers="keep", skew=skew, seed=seed)
+        return calibrated("none")
 
 
 def _refuse_failures(lens: LensPoints, good: NDArray[np.bool_], reasons: dict[int, str]) -> None:

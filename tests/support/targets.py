@@ -53,6 +53,27 @@ def offsets(shape: str, amount: float, rng: np.random.Generator) -> Array:
     return d
 
 
+def photographed_pair(seed: int, sigma: float = 0.05) -> tuple[Correspondences, Correspondences]:
+    """Twelve views of a board that is bent by 0.5 mm, by two cameras 120 mm apart."""
+    rng = np.random.default_rng(seed)
+    K = np.array([[1100.0, 0, 640.0], [0, 1100.0, 480.0], [0, 0, 1.0]])
+    given = board()
+    true = given + offsets("parabola", 0.5, rng)
+    pixels: tuple[list[Array], list[Array]] = ([], [])
+    while len(pixels[0]) < 12:
+        R = rotation_step(np.append(rng.uniform(-0.6, 0.6, 2), rng.uniform(-3, 3))[None])[0]
+        centre = np.append(rng.uniform(-60, 60, 2) + np.array([60, 0]), rng.uniform(380, 520))
+        X = (true - given.mean(axis=0)) @ R.T + centre
+        seen = [(x / x[:, 2:]) @ K[:2].T for x in (X, X - [120.0, 0, 0])]
+        if all((uv > 5).all() and (uv < np.array(SIZE) - 5).all() for uv in seen):
+            for some, uv in zip(pixels, seen, strict=True):
+                some.append(uv + sigma * rng.standard_normal(uv.shape))
+    names = np.repeat([f"v{n:02d}" for n in range(12)], len(given))
+    world = np.tile(given, (12, 1))
+    left, right = (Correspondences(world, np.concatenate(some), names, SIZE) for some in pixels)
+    return left, right
+
+
 def photographed(
     shape: str,
     seed: int,
