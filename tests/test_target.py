@@ -165,7 +165,7 @@ def test_cameras_that_were_calibrated_apart_are_put_on_one_target() -> None:
     again = evaluate_stereo(one, other)
     assert again.by_view.rmse == pytest.approx(found.by_view.rmse)
     mixed = evaluate_stereo(left, calibrate(photographed_pair(4)[1], target="given", skew=False))
-    assert mixed.n_points == found.n_points
+    assert mixed.by_view.n_points == found.by_view.n_points
 
 
 @pytest.mark.parametrize("kind", slow_but(("midpoints",), ("midpoints", "vertices")))
