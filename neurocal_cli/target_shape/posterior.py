@@ -83,6 +83,7 @@ _SETTLED = 0.03  # relative change of the sizes
 _NO_GAIN = 0.02  # of the logarithm of the evidence
 _HALVINGS = 6
 _PASSES = 40
+_NO_COST = 1e-300  # what rounding leaves may be negative
 
 
 def evidence_of_given(info: Information) -> float:
@@ -115,7 +116,8 @@ def _poses_eliminated(info: Information) -> tuple[Array, Array, float, float]:
 
 def _log_evidence(spare: float, cost: float, logdet: float) -> float:
     """Of a quadratic with this minimum and determinant; a priori the noise has a variance as 1 / sigma^2."""
-    return math.lgamma(0.5 * spare) - 0.5 * spare * math.log(math.pi * cost) - 0.5 * logdet
+    least = max(cost, _NO_COST)
+    return math.lgamma(0.5 * spare) - 0.5 * spare * math.log(math.pi * least) - 0.5 * logdet
 
 
 class _System:
