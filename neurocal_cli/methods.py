@@ -37,6 +37,10 @@ OUTLIERS = ("reject", "keep")
 
 _STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
+_NOT_FOUND = (
+    "the target stays as given, because these points do not tell another one; it takes three different views "
+    "of most points, and offsets below 2 % of the target's size"
+)
 _MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor distortion
 
 
@@ -152,6 +156,8 @@ def calibrate(
             solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
         )
         _refuse_misfit(found)
+        if choice in ("flat", "free") and found.target is None:
+            found = replace(found, warnings=(*found.warnings, _NOT_FOUND))
         return replace(found, judgement=assess)
     except DegenerateGeometryError as error:
         text, copies = str(error), repeated_views(points)

@@ -178,7 +178,10 @@ def test_a_flat_target_stays_in_its_plane() -> None:
 
 def test_two_views_of_a_flat_board_keep_the_given_target() -> None:
     points, _ = photographed("parabola", 8, 2)
-    assert calibrate(points, target="free", skew=False).target is None
+    found = calibrate(points, target="free", skew=False)
+    assert found.target is None
+    assert "stays as given" in found.warnings[-1]
+    assert not calibrate(points, skew=False).warnings
 
 
 def test_what_is_no_shape_is_not_taken_for_one() -> None:
