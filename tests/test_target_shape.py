@@ -24,8 +24,9 @@ from neurocal_cli.target import distinct_points, planes_of
 from neurocal_cli.target_shape import posterior as posterior_module
 from neurocal_cli.target_shape.find import LEAST_GAIN, find_target, sight_of
 from neurocal_cli.target_shape.information import Information, information_of
-from neurocal_cli.target_shape.posterior import _System, known_sizes, posterior
+from neurocal_cli.target_shape.posterior import known_sizes, posterior
 from neurocal_cli.target_shape.prior import Prior, prior_of
+from neurocal_cli.target_shape.system import System
 
 PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 SIZES = {"bend": 0.3, "stretch": 0.2, "warp": 0.1, "place": 0.05, "height": 0.04}
@@ -77,14 +78,14 @@ def test_points_first_and_poses_first_solve_the_same(monkeypatch: pytest.MonkeyP
     info, prior = equations(photographed("both", 2, 6, amount=0.1)[0])
     one = known_sizes(info, prior, SIZES, 0.01)
 
-    class PosesFirst(_System):
+    class PosesFirst(System):
         def __init__(self, info: Information, prior: Prior) -> None:
             super().__init__(info, prior)
             assert self.points_first
             self.points_first = False
             self._eliminate_poses()
 
-    monkeypatch.setattr(posterior_module, "_System", PosesFirst)
+    monkeypatch.setattr(posterior_module, "System", PosesFirst)
     other = known_sizes(info, prior, SIZES, 0.01)
     for name in ("offsets", "camera_step", "camera", "followed", "std"):
         a, b = getattr(one, name), getattr(other, name)
@@ -178,10 +179,10 @@ def test_a_flat_target_stays_in_its_plane() -> None:
 
 def test_two_views_of_a_flat_board_keep_the_given_target() -> None:
     points, _ = photographed("parabola", 8, 2)
-    found = calibrate(points, target="free", skew=False)
+    found = calibrate(points, target="free", skew=False, distortion="k1k2")
     assert found.target is None
     assert "stays as given" in found.warnings[-1]
-    assert not calibrate(points, skew=False).warnings
+    assert not calibrate(points, skew=False, distortion="k1k2").warnings
 
 
 def test_what_is_no_shape_is_not_taken_for_one() -> None:

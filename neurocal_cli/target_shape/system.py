@@ -1,0 +1,198 @@
+"""The normal equations of cameras, poses and offsets, solved at given precisions of the offsets' parts.
+
+Whichever of poses and points has more unknowns is eliminated first, block by block. What is left is dense, so
+the cost grows linearly with the views, or with the points.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.target_shape.information import Information
+from neurocal_cli.target_shape.prior import Prior
+
+__all__ = ["Solved", "System"]
+
+
+class System:
+    """The quadratic with its parts: what does not depend on the precisions is computed once.
+
+    Parameters
+    ----------
+    info : Information
+        Around the given target, offsets along each point's axes.
+    prior : Prior
+    """
+
+    def __init__(self, info: Information, prior: Prior) -> None:
+        self.info, self.prior = info, prior
+        self.n, self.P = len(info.point), len(info.pose)
+        self.f, self.m = len(info.camera), prior.basis.shape[2]
+        basis = prior.basis
+        by_basis = info.point @ basis  # (n, 3, m)
+        across = np.einsum("nif,nim->fm", info.point_camera, basis)
+        inner = np.einsum("nim,nik->mk", basis, by_basis)
+        self.shared = np.block([[info.camera, across], [across.T, inner]])
+        self.right = np.concatenate([info.camera_right, np.einsum("nim,ni->m", basis, info.point_right)])
+        self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
+        pose_basis = info.pose_point.reshape(self.P * 6, 3 * self.n) @ basis.reshape(3 * self.n, self.m)
+        self.pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, 6, self.m)], axis=2)
+        self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
+        self.points_first = 3 * self.n >= 6 * self.P
+        if not self.points_first:
+            self._eliminate_poses()
+
+    @property
+    def s(self) -> int:
+        """Number of the cameras' parameters and the smooth coefficients."""
+        return self.f + self.m
+
+    def _eliminate_poses(self) -> None:
+        info, s = self.info, self.s
+        root = np.linalg.inv(np.linalg.cholesky(info.pose))
+        columns = [self.pose_shared, info.pose_point.reshape(self.P, 6, -1), info.pose_right[..., None]]
+        rows = root @ np.concatenate(columns, axis=2)
+        flat = rows.reshape(6 * self.P, -1)
+        dim = s + 3 * self.n
+        M = np.zeros((dim + 1, dim + 1))
+        M[:s, :s] = self.shared
+        M[:s, s:dim] = self.point_shared.reshape(3 * self.n, s).T
+        M[s:dim, :s] = M[:s, s:dim].T
+        for i in range(3):
+            for j in range(3):
+                at = s + 3 * np.arange(self.n)
+                M[at + i, at + j] = info.point[:, i, j]
+        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.point_right.reshape(-1), info.cost
+        M[-1, :dim] = M[:dim, -1]
+        self.dense = M - flat.T @ flat
+        self.logdet_poses = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+
+    def solve(self, smooth: Array, single: Array) -> Solved:
+        """At given precisions (m,) of the smooth parts and (3,) of a point by itself."""
+        return self._points_first(smooth, single) if self.points_first else self._poses_first(smooth, single)
+
+    def _poses_first(self, smooth: Array, single: Array) -> Solved:
+        s, f = self.s, self.f
+        dim = s + 3 * self.n
+        M = self.dense[:dim, :dim].copy()
+        at = np.arange(dim)
+        M[at[f:s], at[f:s]] += smooth
+        M[at[s:], at[s:]] += np.tile(single, self.n)
+        inverse, logdet = _inverse(M)
+        x = inverse @ self.dense[:dim, -1]
+        cost = float(self.dense[-1, -1] - self.dense[:dim, -1] @ x)
+        var_single = np.diagonal(inverse)[s:].reshape(self.n, 3)
+        with_offsets = self._with_offsets(inverse[:f, f:s], inverse[:f, s:].reshape(f, self.n, 3))
+        cross = inverse[f:s, s:].reshape(self.m, self.n, 3)
+        along_gauge = (inverse[s:, s:] @ self.gauge).reshape(self.n, 3, -1)
+        var = self._variance(inverse[f:s, f:s], cross, var_single, along_gauge)
+        return Solved(
+            x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
+            np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], with_offsets, var,
+        )  # fmt: skip
+
+    def _points_first(self, smooth: Array, single: Array) -> Solved:
+        info, s, f, n, P = self.info, self.s, self.f, self.n, self.P
+        root = np.linalg.inv(np.linalg.cholesky(info.point + np.diag(single)))  # (n, 3, 3)
+        poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, 6 * P, 3).swapaxes(1, 2)
+        rows = root @ np.concatenate([self.point_shared, poses, info.point_right[..., None]], axis=2)
+        flat = rows.reshape(3 * n, -1)
+        dim = s + 6 * P
+        M = np.zeros((dim + 1, dim + 1))
+        M[:s, :s] = self.shared
+        at = np.arange(f, s)
+        M[at, at] += smooth
+        M[:s, s:dim] = self.pose_shared.reshape(6 * P, s).T
+        M[s:dim, :s] = M[:s, s:dim].T
+        at = s + 6 * np.arange(P)
+        for i in range(6):
+            for j in range(6):
+                M[at + i, at + j] = info.pose[:, i, j]
+        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.pose_right.reshape(-1), info.cost
+        M[-1, :dim] = M[:dim, -1]
+        M -= flat.T @ flat
+        inverse, logdet = _inverse(M[:dim, :dim])
+        x = inverse @ M[:dim, -1]
+        cost = float(M[-1, -1] - M[:dim, -1] @ x)
+        # The points' own: how they follow all the others.
+        back = np.swapaxes(root, 1, 2)
+        e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
+        follow = back @ rows[:, :, :-1]  # (n, 3, dim)
+        spread = follow.reshape(3 * n, dim) @ inverse  # (3 n, dim)
+        var_single = np.diagonal(back @ root, axis1=1, axis2=2) + (
+            (spread * follow.reshape(3 * n, dim)).sum(axis=1).reshape(n, 3)
+        )
+        logdet -= 2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        cross = -spread.T.reshape(dim, n, 3)
+        own = ((back @ root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
+        along_gauge = own + spread @ (follow.reshape(3 * n, dim).T @ self.gauge)
+        var = self._variance(inverse[f:s, f:s], cross[f:s], var_single, along_gauge.reshape(n, 3, -1))
+        return Solved(
+            x[:f], x[f:s], e, cost, logdet, np.diagonal(inverse)[f:s], var_single,
+            inverse[:f, :f], self._with_offsets(inverse[:f, f:s], cross[:f]), var,
+        )  # fmt: skip
+
+    def _with_offsets(self, smooth: Array, single: Array) -> Array:
+        """(f, n, 3) covariance between the cameras and the whole offsets."""
+        return np.asarray(np.einsum("fm,nim->fni", smooth, self.prior.basis) + single)
+
+    def _variance(self, smooth: Array, cross: Array, single: Array, single_gauge: Array) -> Array:
+        """(n, 3) variance of the whole offsets, without turns, shifts and a scale of all points together.
+
+        With G the orthonormal directions of these, it is the diagonal of (I - G G^T) C (I - G G^T).
+        """
+        basis, G = self.prior.basis, self.gauge.reshape(self.n, 3, -1)
+        diagonal = (
+            ((basis @ smooth) * basis).sum(axis=2) + 2 * np.einsum("nim,mni->ni", basis, cross) + single
+        )
+        by_smooth = np.einsum("nim,nig->mg", basis, G)
+        C_G = basis @ (smooth @ by_smooth + np.einsum("mni,nig->mg", cross, G))
+        C_G += np.einsum("mni,mg->nig", cross, by_smooth) + single_gauge
+        inner = np.einsum("nig,nih->gh", G, C_G)
+        return np.asarray(diagonal - 2 * (G * C_G).sum(axis=2) + ((G @ inner) * G).sum(axis=2))
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The minimum of the quadratic, and blocks of the inverse of its matrix.
+
+    Attributes
+    ----------
+    camera : (f,) array
+        Step of the cameras.
+    smooth : (m,) array
+        Coefficients of the smooth parts.
+    single : (n, 3) array
+        What each point is off by itself.
+    cost : float
+    logdet : float
+        Logarithm of the determinant of the whole matrix.
+    smooth_variance, single_variance : (m,), (n, 3) array
+    camera_covariance : (f, f) array
+    camera_offsets : (f, n, 3) array
+        Covariance of the cameras and the whole offsets.
+    offset_variance : (n, 3) array
+        Of the whole offsets, without what no photograph tells.
+    """
+
+    camera: Array
+    smooth: Array
+    single: Array
+    cost: float
+    logdet: float
+    smooth_variance: Array
+    single_variance: Array
+    camera_covariance: Array
+    camera_offsets: Array
+    offset_variance: Array
+
+
+def _inverse(M: Array) -> tuple[Array, float]:
+    scale = 1.0 / np.sqrt(np.diagonal(M))
+    scaled = M * scale[:, None] * scale
+    root = np.linalg.inv(np.linalg.cholesky(scaled))
+    logdet = -2 * float(np.log(np.diagonal(root)).sum() + np.log(scale).sum())
+    return (root.T @ root) * scale[:, None] * scale, logdet
