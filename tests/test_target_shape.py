@@ -21,6 +21,7 @@ from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.pipeline.fit import fit
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import distinct_points, planes_of
+from neurocal_cli.target_shape import find as find_module
 from neurocal_cli.target_shape import posterior as posterior_module
 from neurocal_cli.target_shape.find import LEAST_GAIN, find_target, sight_of
 from neurocal_cli.target_shape.information import Information, information_of
@@ -228,6 +229,21 @@ def test_a_target_that_was_found_is_a_target_to_begin_with() -> None:
     np.testing.assert_allclose(again.K, first.K, rtol=1e-3)
     assert again.std["alpha_u"] > 0.5 * first.std["alpha_u"]
     assert np.abs(errors(again, truth.K)).max() < 2
+
+
+def test_some_of_many_views_tell_the_target_of_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    points, truth = photographed("parabola", 14, 20)
+    fit = minimum(points)
+    whole = find_target([fit])
+    monkeypatch.setattr(find_module, "_DENSE", 60)
+    some = find_target([fit])
+    assert whole is not None
+    assert some is not None
+    ((problem, adjusted),) = some.fits
+    assert problem.views.n_views == 20
+    assert np.abs(some.target.found - whole.target.found).max() < 0.1
+    alpha = problem.matrix(adjusted.state.entries[0])[0, 0]
+    assert alpha == pytest.approx(truth.K[0, 0], abs=3)
 
 
 def test_given_poses_find_the_target_as_well() -> None:

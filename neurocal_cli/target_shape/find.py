@@ -26,6 +26,9 @@ from neurocal_cli.target_shape.prior import prior_of
 __all__ = ["LEAST_GAIN", "Found", "enough_views", "find_target"]
 
 _STEPS = 10
+# Unknowns of the dense system. From more on some views are taken; of far more no target is looked for
+
+_DENSE, _MOST_DENSE = 600, 3000
 _FEWEST_SPARE = 10  # equations beyond the cameras' and the poses' unknowns
 _EXACT = 1e-6  # px: rounding, which tells nothing of a target
 _EARLY = 0.5  # of the gain, that the first step must promise
@@ -89,12 +92,43 @@ def find_target(
     Found or None
         None where the points do not determine a target, or ask for one that is no print of the given one.
     """
-    search = _Search(fits, flat, known)
+    n_points = len(distinct_points([problem.points for problem, _ in fits])[0])
+    n_views = sum(problem.views.n_views for problem, _ in fits)
+    many = min(3 * n_points, 6 * n_views) > _DENSE
+    if many and min(3 * n_points, 6 * n_views) > _MOST_DENSE:
+        return None
+    some = [_some_views(*fit, _DENSE // (6 * len(fits))) for fit in fits] if many else fits
     try:
         with np.errstate(all="ignore"):
-            return search.run(least_gain)
+            found = _Search(some, flat, known).run(least_gain)
     except np.linalg.LinAlgError:
         return None
+    return found if found is None or not many else _of_all_views(found, fits, known)
+
+
+def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Problem, Adjusted]:
+    """A part of the views, evenly among all: what so many views do not tell of a target is small."""
+    views = problem.views
+    if views.n_views <= most:
+        return problem, adjusted
+    which = np.unique(np.linspace(0, views.n_views - 1, most).astype(np.intp))
+    names = {views.names[k] for k in which}
+    rows = np.array([name in names for name in problem.points.view_names])[problem.points.view_index]
+    known = in_pixels(problem, adjusted.state)
+    points = problem.points.select(rows)
+    place = [views.names.index(name) for name in points.view_names]
+    state = replace(known, R=known.R[place], t=known.t[place])
+    return _at(replace(problem, points=points), adjusted, state, points.world)
+
+
+def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known: Target | None) -> Found:
+    """All views on a target that some of them told."""
+    moved = []
+    for problem, adjusted in fits:
+        points = problem.points if known is None else known.as_given(problem.points)
+        world = found.target.applied(points).world
+        moved.append(_at(problem, adjusted, in_pixels(problem, adjusted.state), world))
+    return replace(found, fits=tuple(moved))
 
 
 class _Search:
