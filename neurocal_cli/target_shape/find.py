@@ -26,8 +26,7 @@ from neurocal_cli.target_shape.prior import prior_of
 __all__ = ["LEAST_GAIN", "Found", "enough_views", "find_target"]
 
 _STEPS = 10
-# Unknowns of the dense system. From more on some views are taken; of far more no target is looked for
-
+# Unknowns of the dense system. From more on some views are taken; of far more no target is looked for.
 _DENSE, _MOST_DENSE = 600, 3000
 _FEWEST_SPARE = 10  # equations beyond the cameras' and the poses' unknowns
 _EXACT = 1e-6  # px: rounding, which tells nothing of a target
