@@ -44,6 +44,7 @@ SLOW_PAGES = {
     for page in (
         "bad-calibration",
         "fisheye",
+        "other-programs",
         "pipelines",
         "ros",
         "surveyed-points",
