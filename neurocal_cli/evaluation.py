@@ -77,6 +77,8 @@ class CameraEvaluation:
         Fitted views that have the name of a view of the calibration but not its pose.
     fit : Calibration or None
         The fitted views, with the camera given.
+    on_target : bool
+        Whether points were taken where the calibration found them on its target, not where they were given.
     """
 
     residuals: Array
@@ -92,6 +94,7 @@ class CameraEvaluation:
     warnings: tuple[str, ...] = ()
     renamed: tuple[str, ...] = ()
     fit: Calibration | None = None
+    on_target: bool = False
 
     @property
     def fitted_views(self) -> tuple[str, ...]:
@@ -133,15 +136,16 @@ def evaluate_camera(
     renamed: tuple[str, ...] = ()
     fit: Calibration | None = None
     seed = 0
+    given = points
     if isinstance(calibration, Calibration):
-        given, points = points, calibration.points if points is None else points
+        points = calibration.points if points is None else points
         if not len(points):
             raise InputError("the calibration has no points of its own; give the points to evaluate it on")
         _refuse_another_size(calibration, points)
         seed = calibration.seed
         poses = {name: view.pose for name, view in calibration.views.items()}
         if given is not None and calibration.target is not None:
-            points = calibration.target.applied(points)
+            points = calibration.target.applied(given)
         if given is not None:
             renamed = _other_images(calibration, points)
             poses = {name: pose for name, pose in poses.items() if name not in renamed}
@@ -161,7 +165,9 @@ def evaluate_camera(
         warnings.append(
             f"{n_behind} of {len(points)} points lie behind the camera and are left out of all averages"
         )
-    return replace(_measure(residuals, points, fitted, tuple(warnings)), renamed=renamed, fit=fit)
+    on_target = given is not None and points is not given
+    measured = _measure(residuals, points, fitted, tuple(warnings))
+    return replace(measured, renamed=renamed, fit=fit, on_target=on_target)
 
 
 def _refuse_another_size(calibration: Calibration, points: Correspondences) -> None:

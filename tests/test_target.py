@@ -65,7 +65,10 @@ def test_a_damaged_target_is_refused(tmp_path: Path) -> None:
 
 def test_points_as_given_are_evaluated_where_they_were_found() -> None:
     given = read_points(str(SAMPLE))
-    assert evaluate_camera(bent(), given).rmse_px == pytest.approx(bent().rmse_px, rel=1e-9)
+    evaluation = evaluate_camera(bent(), given)
+    assert evaluation.rmse_px == pytest.approx(bent().rmse_px, rel=1e-9)
+    assert evaluation.on_target
+    assert not evaluate_camera(bent()).on_target
     others = replace(given, view=np.char.add("new", np.asarray(given.view).astype(str)))
     assert evaluate_camera(bent(), others).rmse_px < 1.05 * bent().rmse_px
 
@@ -126,6 +129,12 @@ def test_the_command_writes_the_board_and_its_picture(tmp_path: Path) -> None:
     assert "points:" in (tmp_path / "board.yaml").read_text(encoding="utf-8")
 
 
+def test_points_taken_where_they_were_found_are_told(tmp_path: Path) -> None:
+    write_calibration(bent(), tmp_path / "c.yaml")
+    assert "where the calibration found them" in run("evaluate", "camera", tmp_path / "c.yaml", SAMPLE).stderr
+    assert "found them" not in run("evaluate", "camera", tmp_path / "c.yaml").stderr
+
+
 def test_a_target_as_given_is_nothing_to_write(tmp_path: Path) -> None:
     camera = run("calibrate", SAMPLE, "--target", "given", "-o", tmp_path / "c.yaml")
     assert camera.exit_code == 0, camera.stderr
@@ -150,6 +159,12 @@ def test_two_cameras_find_one_target() -> None:
     assert abs(rig.baseline - 120) < 4 * rig.std["baseline"] < 0.5
     given = calibrate_stereo(left, right, distortion="none", skew=False, target="given")
     assert rig.rmse_px < 0.5 * given.rmse_px
+
+
+def test_other_methods_take_the_target_as_given() -> None:
+    left, right = photographed_pair(5)
+    rig = calibrate_stereo(left, right, method="linear", skew=False)
+    assert rig.left.target is None
 
 
 def test_cameras_that_were_calibrated_apart_are_put_on_one_target() -> None:

@@ -7,7 +7,7 @@ import os
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, json_option
+from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, json_option, plot_option
 from neurocal_cli.commands.places import check_outputs
 
 __all__ = ["advise"]
@@ -29,13 +29,7 @@ __all__ = ["advise"]
     default=3,
     help="Number of views to advise.",
 )
-@click.option(
-    "--plot",
-    metavar="FILE",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Draw the outlines of these views to this .png, .pdf or .svg file.",
-)
+@plot_option("the outlines of these views")
 @json_option
 def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> None:
     """Advise which views of the target to photograph next.

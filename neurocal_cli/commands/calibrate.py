@@ -36,7 +36,7 @@ _NOT_CONVERGED = 3
 @click.option(
     "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
 )
-@plot_option
+@plot_option("the residuals and the learning curve")
 @lean_option
 @output_option("CAMERA.yaml", "the calibration")
 @click.pass_context

@@ -131,6 +131,8 @@ def _tell(evaluation: CameraEvaluation) -> None:
         if names:
             some = ", ".join(names[:5]) + (", ..." if len(names) > 5 else "")
             note([f"{some}: {why}; the pose is fitted with the intrinsic parameters fixed"])
+    if evaluation.on_target:
+        note(["the points are taken where the calibration found them, not where their file has them"])
     warn(evaluation.warnings)
 
 

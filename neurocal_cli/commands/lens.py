@@ -14,8 +14,10 @@ from neurocal_cli.commands.options import (
     Argument,
     Command,
     FiniteNumber,
+    check_plot,
     json_option,
     output_option,
+    plot_option,
 )
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
@@ -31,7 +33,6 @@ __all__ = ["lens"]
 F = TypeVar("F", bound=Callable[..., Any])
 
 _NOT_CONVERGED = 3
-_PICTURES = (".png", ".pdf", ".svg")
 _MOST_UNITS = 20
 
 _LENS = click.argument(
@@ -41,16 +42,6 @@ _LENS = click.argument(
     cls=Argument,
     description="A lens that `neurocal lens fit` wrote; - is standard input.",
 )
-
-
-def _plot_option(what: str) -> Callable[[F], F]:
-    return click.option(
-        "--plot",
-        metavar="FILE.png",
-        type=click.Path(writable=False, readable=False),
-        show_default="none",
-        help=f"Plot {what} to this .png, .pdf or .svg file.",
-    )
 
 
 @click.group()
@@ -129,7 +120,7 @@ def lens() -> None:
     default=0,
     help="Seed of the random weights. The same seed gives the same output.",
 )
-@_plot_option("each parameter over the settings, with its uncertainty, and the errors")
+@plot_option("each parameter over the settings, with its uncertainty, and the errors")
 @output_option("LENS.yaml", "the lens")
 @click.pass_context
 def fit(
@@ -172,7 +163,7 @@ def fit(
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     check_one_stdin(*points)
-    _check_plot(plot, output)
+    check_plot(plot, output)
     check_outputs((output, plot), points)
     learnt = _learn(points, distortion, training, camera, hidden, outliers, no_skew, seed)
     _write(learnt, output, plot)
@@ -216,20 +207,6 @@ def _learn(
             topologies=topologies,
             progress=progress,
         )
-
-
-def _check_plot(plot: str | None, output: str | None) -> None:
-    if plot is None:
-        return
-    if not plot.lower().endswith(_PICTURES):
-        raise UsageError(
-            f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
-        )
-    if output not in (None, "-") and os.path.realpath(str(output)) == os.path.realpath(plot):
-        raise UsageError("-o and --plot name the same file; give two different files")
-    from neurocal_cli.plots import check_available
-
-    check_available()
 
 
 def _write(learnt: ZoomLens, output: str, plot: str | None) -> None:
@@ -311,7 +288,7 @@ def camera(
     description="A CSV file of points at any settings, with the columns zoom and/or focus; - is standard "
     "input.",
 )
-@_plot_option("the error over the settings, and the errors of the baseline models")
+@plot_option("the error over the settings, and the errors of the baseline models")
 @json_option
 def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> None:
     """Measure the reprojection error of a zoom lens.
@@ -334,7 +311,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     check_one_stdin(lens_file, points)
-    _check_plot(plot, None)
+    check_plot(plot, None)
     check_outputs((plot,), (lens_file, points))
     from neurocal_cli.io.lens_points import read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens

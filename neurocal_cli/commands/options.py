@@ -123,18 +123,18 @@ def lean_option(f: F) -> F:
     )(f)
 
 
-def plot_option(f: F) -> F:
-    """Add ``--plot``, a picture of the errors; see `check_plot`."""
+def plot_option(what: str) -> Callable[[F], F]:
+    """Add ``--plot``, a picture of something; see `check_plot`."""
     return click.option(
         "--plot",
         metavar="FILE.png",
         type=click.Path(writable=False, readable=False),
         show_default="none",
-        help="Plot the residuals and the learning curve to this .png, .pdf or .svg file.",
-    )(f)
+        help=f"Plot {what} to this .png, .pdf or .svg file.",
+    )
 
 
-def check_plot(plot: str | None, output: str) -> None:
+def check_plot(plot: str | None, output: str | None = None) -> None:
     """Refuse a picture that cannot be drawn, before any work is done.
 
     Raises
@@ -150,7 +150,7 @@ def check_plot(plot: str | None, output: str) -> None:
         raise UsageError(
             f"--plot {plot}: not a picture file; give a name that ends in {', '.join(_PICTURES)}"
         )
-    if output != "-" and os.path.realpath(output) == os.path.realpath(plot):
+    if output not in (None, "-") and os.path.realpath(str(output)) == os.path.realpath(plot):
         raise UsageError("-o and --plot name the same file; give two different files")
     from neurocal_cli.plots import check_available
 

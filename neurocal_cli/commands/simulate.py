@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands.method_names import MethodNames
-from neurocal_cli.commands.options import INPUT, Command, FiniteNumber, check_plot, json_option
+from neurocal_cli.commands.options import INPUT, Command, FiniteNumber, check_plot, json_option, plot_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
@@ -139,14 +139,7 @@ def _is_number(word: str) -> bool:
     show_default="points only",
     help="With --save: also write rendered images of the target, and the exact points that they show.",
 )
-@click.option(
-    "--plot",
-    metavar="FILE.png",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Plot the errors over the noise and the random starts, or with --rates the rates, to this .png, "
-    ".pdf or .svg file.",
-)
+@plot_option("the errors over the noise and the random starts, or with --rates the rates,")
 @json_option
 def simulate(
     camera: str | None,

@@ -75,7 +75,7 @@ _NOT_CONVERGED = 3
     show_default="none",
     help="Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
-@plot_option
+@plot_option("the residuals and the learning curve")
 @lean_option
 @output_option("RIG.yaml", "the rig")
 @click.pass_context

@@ -6,7 +6,7 @@ import os
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option
+from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option, plot_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import say
 from neurocal_cli.errors import InputError
@@ -22,13 +22,7 @@ __all__ = ["target"]
     cls=Argument,
     description="A calibration that `neurocal calibrate` wrote; - is standard input.",
 )
-@click.option(
-    "--plot",
-    metavar="FILE.png",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Plot the heights of the board's points and their shifts to this .png, .pdf or .svg file.",
-)
+@plot_option("the heights of the board's points and their shifts")
 @output_option("BOARD.yaml", "the board")
 def target(camera: str, plot: str | None, output: str) -> None:
     """Write the board as it was found.

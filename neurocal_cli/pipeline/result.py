@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
@@ -19,11 +18,10 @@ from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
-from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
-from neurocal_cli.target_shape.uncertainty import target_uncertainty
+from neurocal_cli.target_shape.uncertainty import covariance_basis
 
 __all__ = ["calibration_of"]
 
@@ -44,19 +42,14 @@ def calibration_of(
     views, state = problem.views, adjusted.state
     errors = point_residuals(views, state)  # (N, 2), by view
     repeated = repeated_poses(views, state, errors)
-    asked, n_equations = (problem.free_camera, problem.free_poses), views.n_equations
-    normal, shared, moves_without = adjusted.normal, solution.shared, None
-    if solution.target is not None:
-        uncertain = target_uncertainty(
-            solution.target, views, state, *asked, problem.points.world[_order(views)]
-        )
-        normal, shared = uncertain.normal, uncertain.entries
-        n_equations -= uncertain.determined
-        moves_without = uncertain.moves_without
-    cov = covariance(normal, *asked, n_equations, shared)
+    asked = problem.free_camera, problem.free_poses
+    basis = covariance_basis(
+        solution.target, views, state, *asked, problem.points.world, adjusted.normal, solution.shared
+    )
+    cov = covariance(basis.normal, *asked, basis.n_equations, basis.shared)
     refuse_undetermined(problem, state, cov)
     if solution.shared is None:
-        cov = counting_views(cov, normal, *asked, n_equations, repeated, moves_without)
+        cov = counting_views(cov, basis.normal, *asked, basis.n_equations, repeated, basis.moves_without)
     A = problem.matrix(state.entries[0])
     intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     if problem.type != 3 and not problem.free[1]:
@@ -103,10 +96,6 @@ def calibration_of(
             *_rejection_warnings(rejected, len(problem.points)),
         ),
     )
-
-
-def _order(views: Views) -> slice | NDArray[np.intp]:
-    return slice(None) if views.order is None else views.order
 
 
 def _camera_covariance(

@@ -34,7 +34,8 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     Target or None
         None where it stays as given.
     """
-    if choice == "given" or any(camera.straight_lines is not None for camera in cameras):
+    fixed = any(camera.straight_lines is not None or camera.method != "neuro" for camera in cameras)
+    if choice == "given" or fixed:
         return None
     if choice == "auto" and any(camera.type != 1 for camera in cameras):
         return None  # what is given may be wrong, and a target would take the blame

@@ -9,7 +9,7 @@ of which sums over views have the information that is left.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +23,7 @@ from neurocal_cli.target_shape.information import Sight, by_world, information_o
 from neurocal_cli.target_shape.posterior import known_sizes
 from neurocal_cli.target_shape.prior import Prior, prior_of
 
-__all__ = ["TargetUncertainty", "target_uncertainty"]
+__all__ = ["CovarianceBasis", "covariance_basis"]
 
 
 _MOST_POSES = (
@@ -32,7 +32,70 @@ _MOST_POSES = (
 
 
 @dataclass(frozen=True, eq=False)
-class TargetUncertainty:
+class CovarianceBasis:
+    """What the covariance of a camera is computed from (`covariance`, `counting_views`).
+
+    Attributes
+    ----------
+    normal : (V, 12 + K, 12 + K) array
+        As from `reprojection.normal_blocks`; where a target was found, with the efficient scores of what is
+        free of the camera.
+    shared : (f, f) array or None
+        Covariance of A's free entries and the free distortion coefficients, normalised, where it does not
+        follow from the normal matrices.
+    n_equations : float
+        Equations, less the unknowns of the target that they determine.
+    moves_without : callable or None
+        How far the free parameters move without the views of each pose.
+    """
+
+    normal: Array
+    shared: Array | None
+    n_equations: float
+    moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None
+
+
+def covariance_basis(
+    target: Target | None,
+    views: Views,
+    state: CameraState,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    world: Array,
+    normal: Array,
+    shared: Array | None = None,
+) -> CovarianceBasis:
+    """What the covariance of a camera at its minimum rests on, for a target that is given or was found.
+
+    Parameters
+    ----------
+    target : Target or None
+        The one that was found, if so.
+    views, state, free, free_poses
+        As for `adjust`, at the minimum.
+    world : (N, 3) array [world unit]
+        Where the points are, in their own order.
+    normal : (V, 12 + K, 12 + K) array
+        From `reprojection.normal_blocks`.
+    shared : (f, f) array, optional
+        Covariance that comes from elsewhere.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Points that do not determine the camera.
+    """
+    if target is None:
+        return CovarianceBasis(normal, shared, views.n_equations)
+    ordered = world if views.order is None else world[views.order]
+    known = _target_uncertainty(target, views, state, free, free_poses, ordered)
+    return CovarianceBasis(
+        known.normal, known.entries, views.n_equations - known.determined, known.moves_without
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _TargetUncertainty:
     """What a camera is known to be when its target is not quite known.
 
     Attributes
@@ -84,24 +147,10 @@ class TargetUncertainty:
         ).camera_step
 
 
-def target_uncertainty(
+def _target_uncertainty(
     target: Target, views: Views, state: CameraState, free: NDArray[np.bool_], free_poses: bool, world: Array
-) -> TargetUncertainty:
-    """Uncertainty of one camera at its minimum for a target that was found.
-
-    Parameters
-    ----------
-    target : Target
-    views, state, free, free_poses
-        As for `adjust`, at the minimum.
-    world : (N, 3) array
-        Where the target has each point, in the order of `views`.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        Points that do not determine the camera.
-    """
+) -> _TargetUncertainty:
+    """Of one camera; world (N, 3) in the order of `views`."""
     label = target.rows_of(world)
     prior = prior_of(target.given, target.plane)
     sight = Sight(views, state, free, free_poses, label)
@@ -113,7 +162,7 @@ def target_uncertainty(
     followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
     followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # points of no target: -1
     normal = _efficient(views, state, np.flatnonzero(free), labelled(views, label), followed)
-    return TargetUncertainty(
+    return _TargetUncertainty(
         found.variance * found.camera, normal, found.determined, sight, offsets, prior, target.sizes, variance
     )
 

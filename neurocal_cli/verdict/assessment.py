@@ -33,7 +33,7 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
-from neurocal_cli.target_shape.uncertainty import target_uncertainty
+from neurocal_cli.target_shape.uncertainty import covariance_basis
 from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
@@ -120,20 +120,18 @@ class _AtMinimum:
         self.state, self.normal = adjusted.state, adjusted.normal
         self.cost = float(self.normal[:, -1, -1].sum())
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
-        n_equations, shared, moves_without = self.views.n_equations, None, None
-        if (target := calibration.target) is not None:
-            world = self.points.world if self.views.order is None else self.points.world[self.views.order]
-            known = target_uncertainty(target, self.views, self.state, self.free, self.free_poses, world)
-            self.normal, shared = known.normal, known.entries
-            n_equations -= known.determined
-            moves_without = known.moves_without
-        self.spare = max(n_equations - self.unknowns, 1)
+        asked = self.free, self.free_poses
+        basis = covariance_basis(
+            calibration.target, self.views, self.state, *asked, self.points.world, self.normal
+        )
+        self.normal = basis.normal
+        self.spare = max(basis.n_equations - self.unknowns, 1)
         self.errors = point_residuals(self.views, self.state)
         self.repeated = repeated_poses(self.views, self.state, self.errors)
-        cov = covariance(self.normal, self.free, self.free_poses, n_equations, shared)
+        cov = covariance(self.normal, *asked, basis.n_equations, basis.shared)
         self.condition = 1.0 / cov.smallest if cov.smallest > 0 else np.inf
         self.covariance = counting_views(
-            cov, self.normal, self.free, self.free_poses, n_equations, self.repeated, moves_without
+            cov, self.normal, *asked, basis.n_equations, self.repeated, basis.moves_without
         ).entries
 
     def _arranged(self) -> Views:
