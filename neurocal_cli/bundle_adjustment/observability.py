@@ -9,10 +9,11 @@ from neurocal_cli.bundle_adjustment.covariance import Covariance
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["check_points", "refuse_undetermined"]
+__all__ = ["check_points", "refuse_undetermined", "relative_std_of_scale"]
 
 # Repeated by tests/test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal
 # matrix.
@@ -127,13 +128,7 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
     DegenerateGeometryError
         A singular normal matrix, or a focal length known no better than to `_MEANINGLESS`.
     """
-    free = np.flatnonzero(problem.free)
-    relative = np.zeros(2)
-    for slot, entry in enumerate((0, 2)):
-        if entry in free:
-            place = int(np.flatnonzero(free == entry)[0])
-            relative[slot] = np.sqrt(cov.entries[place, place]) / state.entries[0, entry]
-    views, relative_std = problem.views, relative.max(initial=0.0)
+    views, relative_std = problem.views, relative_std_of_scale(problem, state, cov)
     singular = not cov.smallest > _SINGULAR
     boards = views.nearly_flat.all() and problem.free_poses and problem.free[[0, 2]].any()
     limit = _MEANINGLESS / np.sqrt(2 * views.n_views) if boards else _MEANINGLESS
@@ -160,6 +155,24 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
         f"the focal length {known_to}; bring the target nearer, tilt it more{more}, and check that each "
         "pixel belongs to its point"
     )
+
+
+def relative_std_of_scale(problem: Problem, state: CameraState, cov: Covariance) -> float:
+    """Standard deviation of the image's scale over its value, the larger of u and v; 0 where both are given.
+
+    The scale in the middle of the image: what alpha and a wide lens's xi only tell together is no doubt of it.
+    """
+    free = np.flatnonzero(problem.free_camera if state.model != "none" else problem.free)
+    largest = 0.0
+    for entry in (0, 2):
+        if not problem.free[entry]:
+            continue
+        gradient = (free == entry) / state.entries[0, entry]
+        if state.model in WITH_XI:
+            gradient = gradient - (free == 5) / (1 + state.k[0])
+        n = len(gradient)
+        largest = max(largest, float(np.sqrt(gradient @ cov.entries[:n, :n] @ gradient)))
+    return largest
 
 
 def _check_tilts(views: Views, normals: Array, singular: bool) -> None:

@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
+from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.projection import ENTRIES, image_points, project_with_jacobian
+from neurocal_cli.camera.projection import ENTRIES, project_points, project_with_jacobian
 from neurocal_cli.geometry import Array, rotation_step
 
 __all__ = [
@@ -67,13 +68,26 @@ class CameraState:
 
     def moved(self, by_camera: Array, by_pose: Array) -> CameraState:
         """The state after a step; by_camera (1 or V, 5 + K), by_pose (V, 6) with omega and tau."""
+        by_entries, by_k = by_camera[:, :5], by_camera[:, 5:]
+        if self.model in WITH_XI:
+            by_entries = by_entries + self._along_valley(by_entries, by_k)
         return replace(
             self,
-            entries=self.entries + by_camera[:, :5],
+            entries=self.entries + by_entries,
             R=rotation_step(by_pose[:, :3]) @ self.R,
             t=self.t + by_pose[:, 3:],
-            k=self.k + (by_camera[0, 5:] if self.k.ndim == 1 else by_camera[:, 5:]),
+            k=self.k + (by_k[0] if self.k.ndim == 1 else by_k),
         )
+
+    def _along_valley(self, by_entries: Array, by_k: Array) -> Array:
+        """What a step needs beyond first order to follow the valley in which xi and alpha compensate.
+
+        The scale in the middle of the image, alpha / (1 + xi), is what the points tell.
+        """
+        bend = np.zeros_like(by_entries)
+        xi, by_xi = self.k[..., :1], by_k[:, :1]
+        bend[:, :3] = by_xi / (1 + xi) * (by_entries[:, :3] - self.entries[:, :3] * by_xi / (1 + xi))
+        return bend
 
     def coefficients(self, view: NDArray[np.intp]) -> Array:
         """The coefficients for the points of some batches, given each batch's view."""
@@ -111,8 +125,9 @@ def residuals(batches: PointBatches, state: CameraState) -> Array:
     for chunk in batches.chunks():
         view = batches.view[chunk]
         Xc = state.R[view] @ batches.local[chunk] + state.t[view][:, :, None]
-        x, y = Xc[:, 0] / Xc[:, 2], Xc[:, 1] / Xc[:, 2]
-        u, v = image_points(state.entries[0], state.model, state.coefficients(view), x, y)
+        u, v, _ = project_points(
+            state.entries[0], state.model, state.coefficients(view), Xc[:, 0], Xc[:, 1], Xc[:, 2]
+        )
         out[chunk, 0] = batches.pixels[chunk, 0] - u
         out[chunk, 1] = batches.pixels[chunk, 1] - v
     return out
@@ -137,10 +152,9 @@ def predicted_pixels(
     in_front : (N,) bool array
     """
     X, Y, Z = ((state.R[view] @ world[..., None])[..., 0] + state.t[view]).T
-    in_front = np.asarray(Z > 0)
-    depth = np.where(in_front, Z, np.nan)
-    u, v = image_points(state.entries[0], state.model, state.k, X / depth, Y / depth)
-    return np.column_stack([u, v]), in_front
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        u, v, seen = project_points(state.entries[0], state.model, state.k, X, Y, Z)
+        return np.where(seen[:, None], np.column_stack([u, v]), np.nan), seen
 
 
 def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Array) -> NDArray[np.bool_]:

@@ -21,9 +21,11 @@ from neurocal_cli.camera.projection import (
     image_points,
     image_points_with_jacobian,
     normalised_points,
+    project_points,
     project_with_jacobian,
     rays_of,
 )
+from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
@@ -101,17 +103,22 @@ class Camera:
         Returns
         -------
         pixels : (..., 2) array [px]
-            ``nan`` for points that are not in front of the camera.
+            ``nan`` for points that are not in front of the camera, or outside what a wide lens shows.
         in_front : (...) bool array
+            Whether they are not.
         """
         X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
-        in_front = np.asarray(Z > 0)
-        depth = np.where(in_front, Z, np.nan)
-        return np.stack(self.image_points(X / depth, Y / depth), axis=-1), in_front
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            u, v, seen = project_points(self.entries, self.model, self.distortion.coefficients, X, Y, Z)
+            pixels = np.stack([u, v], axis=-1)
+        return np.where(seen[..., None], pixels, np.nan), seen
 
     def sees(self, points: Array) -> NDArray[np.bool_]:
         """Whether points (..., 3) are in front of the camera where its distortion is monotonic."""
         X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
+        if self.distortion.wide:
+            within = np.arctan2(np.hypot(X, Y), Z) < largest_angle(self.distortion)
+            return np.asarray(within & self.project(points)[1])
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.asarray((Z > 0) & is_monotonic(self.distortion, X / Z, Y / Z))
 
@@ -149,7 +156,11 @@ class Camera:
         rays : (..., 3) array
             Of unit length, in the camera's frame; ``nan`` where the camera cannot see anything.
         """
-        x, y = self.normalised_points(*np.moveaxis(np.asarray(pixels, dtype=float), -1, 0))
+        u, v = np.moveaxis(np.asarray(pixels, dtype=float), -1, 0)
+        if self.distortion.wide:
+            x, y = normalised_points(self.entries, u, v)
+            return np.stack(unproject_directions(self.distortion, x, y), axis=-1)
+        x, y = self.normalised_points(u, v)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 

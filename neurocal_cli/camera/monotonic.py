@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, distort_with_jacobian
+from neurocal_cli.camera.unprojection import first_root, largest_angle, unproject_directions
 from neurocal_cli.geometry import Array
 
 __all__ = ["is_monotonic", "monotonic_radius", "nearly_undistorted", "radial_slope", "reaches", "undistort"]
@@ -23,10 +24,8 @@ _NEWTON_STEPS = 30
 _STEP = 1e-9  # of Newton's: the next one, its square, is rounding
 _ACCURACY = 1e-11  # of the point distorted again: more is no inverse
 _SMALL_STEP = 0.02  # of Newton's in the image plane: the next one would be a thousandth
-_SMALLEST = 1e-100  # coefficient; what is less overflows, and has no root near any image
 # Radii at which a slope is looked at: what it falls short of the margin between them is far less.
 _RADII, _BEYOND, _MARGIN = 65, 2.0, 0.02
-_REAL = 1e-6  # imaginary part of a double root, over its real part, that rounding makes
 
 
 def monotonic_radius(distortion: Distortion) -> float:
@@ -35,16 +34,15 @@ def monotonic_radius(distortion: Distortion) -> float:
     The first zero of the slope of the radius, or of the rational model's denominator; tangential terms,
     small within any image, are left out.
     """
-    k = distortion.coefficients
-    if distortion.model == "fisheye":
-        slope = np.array([1.0, *(k * [3, 5, 7, 9])])
-        theta = np.sqrt(_first_root(slope))
+    if distortion.wide:
+        theta = largest_angle(distortion)
         return float(np.tan(theta)) if theta < np.pi / 2 else np.inf
+    k = distortion.coefficients
     k1, k2, _, _, k3, k4, k5, k6 = np.r_[k, np.zeros(8 - len(k))]
     top, bottom = np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
     # With s = r^2: d/dr (r top / bottom) is 0 where (top + 2 s top') bottom = 2 s top bottom'.
     slope = np.convolve(top + _twice_s_slope(top), bottom) - np.convolve(top, _twice_s_slope(bottom))
-    return float(np.sqrt(min(_first_root(slope), _first_root(bottom))))
+    return float(np.sqrt(min(first_root(slope), first_root(bottom))))
 
 
 def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
@@ -83,13 +81,6 @@ def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
 
 def _twice_s_slope(p: Array) -> Array:
     return 2.0 * np.arange(len(p)) * p
-
-
-def _first_root(coefficients: Array) -> float:
-    """Smallest positive real root of a polynomial, infinity if there is none; lowest order first."""
-    roots = np.roots(np.where(np.abs(coefficients) > _SMALLEST, coefficients, 0.0)[::-1])
-    real = roots.real[(np.abs(roots.imag) <= _REAL * np.abs(roots.real)) & (roots.real > 0)]
-    return float(real.min(initial=np.inf))
 
 
 def reaches(distortion: Distortion, farthest: float) -> bool:
@@ -143,6 +134,10 @@ def undistort(
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if distortion.is_identity:
         return x, y
+    if distortion.wide:
+        X, Y, Z = unproject_directions(distortion, x, y)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(Z > 0, X / Z, np.nan), np.where(Z > 0, Y / Z, np.nan)
     radius = monotonic_radius(distortion)
     if near is None:
         sx, sy, good = _newton(distortion, radius, x, y, *_radially(distortion, radius, x, y))

@@ -2,6 +2,8 @@
 
     (x, y) = (X, Y) / Z,  (x', y') = distort(x, y),  u = A11 x' + A12 y' + A13,  v = A22 y' + A23
 
+A wide lens has no (x, y): its (x', y') follow from the direction of (X, Y, Z), which may be behind.
+
 Each coordinate is an array of its own: arithmetic on whole, contiguous arrays is what NumPy does fastest.
 A's entries and the coefficients are numbers, or arrays that broadcast against the points, so that one call
 serves a camera for each view as well as one for all. `Camera` wraps this for one camera and (N, 2) or (N, 3)
@@ -16,8 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.camera.distortion import Coefficients, Distortion, distort, distort_with_jacobian
+from neurocal_cli.camera.directions import project_directions
+from neurocal_cli.camera.distortion import WIDE, Distortion, distort, distort_with_jacobian
 from neurocal_cli.camera.monotonic import nearly_undistorted, undistort
+from neurocal_cli.camera.polynomial import Coefficients
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -29,6 +33,7 @@ __all__ = [
     "image_points_with_jacobian",
     "nearly_rays",
     "normalised_points",
+    "project_points",
     "project_with_jacobian",
     "rays_of",
     "undistorted_pixels",
@@ -87,6 +92,22 @@ def image_points_with_jacobian(
     return ImagePoints(a * x + s * y + u0, b * y + v0, x, y, by_point, by_k)
 
 
+def project_points(
+    entries: Entries, model: str, k: Coefficients, X: Array, Y: Array, Z: Array
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Pixels (u, v) of points in the camera's frame, and which of them it can see.
+
+    It sees points in front; a wide lens, those in whose direction its image grows.
+    """
+    a, s, b, u0, v0 = entries
+    if model in WIDE:
+        x, y, _, _, _, seen = project_directions(model, k, X, Y, Z)
+        return a * x + s * y + u0, b * y + v0, seen
+    q = 1.0 / Z
+    u, v = image_points(entries, model, k, X * q, Y * q)
+    return u, v, np.asarray(Z > 0)
+
+
 def project_with_jacobian(
     entries: Entries, model: str, k: Coefficients, points: Sequence[Array],
     by_entries: Array, by_point: Array, by_coefficient: Array,
@@ -110,9 +131,11 @@ def project_with_jacobian(
     -------
     u, v : (..., n) arrays
     valid : (..., n) bool array
-        Points in front of the camera, where the distortion is monotonic.
+        Points in front of the camera, or of a wide lens anywhere, where the distortion is monotonic.
     """
     X, Y, Z = points
+    if model in WIDE:
+        return _project_wide(entries, model, k, points, by_entries, by_point, by_coefficient)
     a, s, b, _, _ = entries
     q = 1.0 / Z
     x, y = X * q, Y * q
@@ -135,12 +158,31 @@ def project_with_jacobian(
         np.multiply(uy, q, out=by_Y[..., 0, :])
         np.multiply(-x[..., None, :], by_X, out=by_Z)
         by_Z -= y[..., None, :] * by_Y
-    for column, (dx, dy) in enumerate(image.by_coefficient):
-        np.multiply(a, dx, out=by_coefficient[..., column, 0, :])
-        np.multiply(b, dy, out=by_coefficient[..., column, 1, :])
-        if not _is_zero(s):
-            by_coefficient[..., column, 0, :] += s * dy
+    _through_matrix(entries, image.by_coefficient, by_coefficient)
     return image.u, image.v, valid
+
+
+def _project_wide(
+    entries: Entries, model: str, k: Coefficients, points: Sequence[Array],
+    by_entries: Array, by_point: Array, by_coefficient: Array,
+) -> tuple[Array, Array, NDArray[np.bool_]]:  # fmt: skip
+    a, s, b, u0, v0 = entries
+    image = project_directions(model, k, *points)
+    by_entries[..., 0, 0, :], by_entries[..., 1, 0, :], by_entries[..., 2, 1, :] = image.x, image.y, image.y
+    by_entries[..., 3, 0, :] = by_entries[..., 4, 1, :] = 1.0
+    _through_matrix(entries, list(zip(image.by_x, image.by_y, strict=True)), by_point)
+    _through_matrix(entries, image.by_coefficient, by_coefficient)
+    return a * image.x + s * image.y + u0, b * image.y + v0, image.seen
+
+
+def _through_matrix(entries: Entries, changes: Sequence[tuple[Array, Array]], out: Array) -> None:
+    """Fill in derivatives of pixels from those of x' and y'."""
+    a, s, b, _, _ = entries
+    for column, (dx, dy) in enumerate(changes):
+        np.multiply(a, dx, out=out[..., column, 0, :])
+        np.multiply(b, dy, out=out[..., column, 1, :])
+        if not _is_zero(s):
+            out[..., column, 0, :] += s * dy
 
 
 def _is_zero(s: Any) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.cross_validation import held_out_points, held_out_views
-from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
+from neurocal_cli.bundle_adjustment.observability import refuse_undetermined, relative_std_of_scale
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
@@ -18,8 +18,10 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names, distort, pinhole_coefficients
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
+from neurocal_cli.distortion.similar_lens import farthest_angle, similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
@@ -216,6 +218,9 @@ class _Chain:
     def _fit(self, problem: Problem, state: CameraState, most: int = 4) -> Candidate | None:
         """None when it did not settle, or too little is left for it without a part of the data."""
         model = problem.distortion.model
+        if state.model in WIDE and state.model not in (model, "fisheye"):
+            similar = similar_states(state, "fisheye", farthest_angle(self.problem.views, state))
+            state = similar[0] if similar else replace(state, model="none", k=np.zeros(0))
         start = replace(state, model=model, k=_coefficients(state, model, self.reach, most))
         steps = _RATIONAL_STEPS if model == "rational" else _STEPS
         adjusted = problem.adjust(start, steps)
@@ -260,10 +265,7 @@ def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
 
 def is_weak(problem: Problem, state: CameraState, cov: Covariance) -> bool:
     """Whether the points tell a focal length so badly that other minima may be lower."""
-    free = np.flatnonzero(problem.free)
-    variance = np.diagonal(cov.entries)[: len(free)]
-    alphas = [(place, entry) for place, entry in enumerate(free) if entry in (0, 2)]
-    return any(not variance[place] < (_WEAK * state.entries[0, entry]) ** 2 for place, entry in alphas)
+    return not relative_std_of_scale(problem, state, cov) < _WEAK
 
 
 def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate | None:

@@ -29,6 +29,7 @@ from neurocal_cli.bundle_adjustment.residual_correlation import correlation, eff
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort
 from neurocal_cli.camera.monotonic import monotonic_radius, radial_slope, reaches
 from neurocal_cli.camera.projection import ENTRIES, normalised_points, undistorted_pixels
+from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -92,8 +93,8 @@ def where_not_monotonic(distortion: Distortion, A: Array, points: Correspondence
     """Where a distortion is not monotonic: within the points, within the rest of the image, or nowhere.
 
     The image is looked at where its size is known: at its corners, which nothing is farther out than,
-    and along its border where tangential terms may turn it back elsewhere first. What a fisheye cannot
-    see because it lies beyond 90 degrees does not count.
+    and along its border where tangential terms may turn it back elsewhere first. What a wide lens that shows
+    90 degrees and more from its axis does not show, as the corners beyond its image circle, does not count.
     """
     if distortion.model == "none":
         return None
@@ -102,7 +103,7 @@ def where_not_monotonic(distortion: Distortion, A: Array, points: Correspondence
     farthest = points.pixels[np.argsort(-away, kind="stable")[:_FARTHEST]]
     border = np.zeros((0, 2))
     if points.image_size is not None and not (
-        distortion.model == "fisheye" and np.isinf(monotonic_radius(distortion))
+        distortion.wide and largest_angle(distortion) >= np.pi / 2
     ):
         border = _border(points.image_size, distortion)
     if _sees(distortion, A, np.concatenate([farthest, border])):
@@ -122,6 +123,8 @@ def _border(image_size: tuple[int, int], distortion: Distortion) -> Array:
 def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:
     """Whether all the pixels lie where the distortion is monotonic."""
     x, y = normalised_points(A[ENTRIES].tolist(), *pixels.T)
+    if distortion.wide:
+        return bool(np.isfinite(unproject_directions(distortion, x, y)[0]).all())
     if reaches(distortion, float(np.hypot(x, y).max(initial=0.0))):
         return True
     return bool(np.isfinite(undistorted_pixels(distortion, A, pixels)).all())
@@ -187,9 +190,9 @@ def _settled(problem: Problem, adjusted: Adjusted) -> tuple[Problem, Adjusted] |
 
 
 def _turn(state: CameraState) -> float:
-    """Undistorted radius, or a fisheye's angle, up to which the distortion is monotonic."""
-    r = monotonic_radius(state.distortion)
-    return float(np.arctan(r)) if state.model == "fisheye" else r
+    """Undistorted radius, or a wide lens's angle, up to which the distortion is monotonic."""
+    distortion = state.distortion
+    return largest_angle(distortion) if distortion.wide else monotonic_radius(distortion)
 
 
 def _distorted(state: CameraState, last: float) -> float:

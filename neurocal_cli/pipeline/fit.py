@@ -14,10 +14,12 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.distortion.candidate_models import fit_candidates, supported
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
+from neurocal_cli.distortion.similar_lens import farthest_angle, similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
 from neurocal_cli.initialisation.neuro import solve
@@ -30,6 +32,7 @@ __all__ = ["fit", "fit_again"]
 # Joins the pinhole's networks where a radial model leads to nothing, as with a centre of distortion far off.
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
 _FIRST_MODEL = "k1k2"
+_NO_XI = 1e-3  # its square is rounding in any image
 # Starts that lead to a pole of the distortion, or into the camera's plane, are told so by what they cost.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
@@ -107,8 +110,12 @@ def _with_selected_model(solution: Solution, options: Options) -> Solution:
 def _first_solution(problem: Problem, options: Options) -> Solution:
     """A pinhole, or where points seem mirrored to it, as through a strong distortion, a camera with one.
 
-    Where a distortion is no remedy, the pinhole's reason stands.
+    Where a distortion is no remedy, the pinhole's reason stands. Wide lenses begin as fisheyes, whose
+    coefficients are linear.
     """
+    model = problem.distortion.model
+    if problem.free_distortion and model in WIDE and model != "fisheye":
+        return _from_fisheye(problem, _first_solution(problem.with_model("fisheye"), options))
     try:
         return solve(problem, options)
     except OnlyMirroredError:
@@ -116,6 +123,27 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
         if found is None:
             raise
         return found
+
+
+def _from_fisheye(problem: Problem, fisheye: Solution) -> Solution:
+    """The best that the most similar lenses of the wanted model lead to.
+
+    Around xi = 0 a double sphere's image depends on the square of xi only: where the points tell no xi, it
+    is held at 0.
+    """
+    state, views = fisheye.state, problem.views
+    starts = similar_states(state, problem.distortion.model, farthest_angle(views, state))
+    found = [problem.adjust(replace(fisheye.adjusted, state=start)) for start in starts]
+    if not found:
+        raise DegenerateGeometryError(
+            f"no lens of the model {problem.distortion.model} is similar to what the points show; choose "
+            "another --distortion"
+        )
+    best = min(found, key=lambda a: float(a.cost.sum()))
+    if problem.distortion.model == "double_sphere" and abs(best.state.k[0]) < _NO_XI:
+        problem = replace(problem, fixed=problem.fixed | {"xi"})
+        best = problem.adjust(replace(best, state=replace(best.state, k=best.state.k * [0.0, 1.0])))
+    return replace(fisheye, problem=problem, adjusted=best)
 
 
 def _distorted_starts(problem: Problem, options: Options) -> Iterator[CameraState]:

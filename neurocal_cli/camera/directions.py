@@ -1,0 +1,162 @@
+"""Wide lenses: models that project directions, those of 90 degrees and more from the axis too.
+
+A point (X, Y, Z) of the camera's frame, of which only the direction counts, goes to (x', y') and then
+through A. With rho = hypot(X, Y), d = |(X, Y, Z)| and theta = atan2(rho, Z):
+
+    fisheye        (x', y') = (X, Y) theta (1 + k1 theta^2 + ... + k4 theta^8) / rho
+                                                                  (Kannala and Brandt 2006)
+    omnidir        (x, y) = (X, Y) / (Z + xi d), then k1, k2, p1, p2 of `polynomial`
+                                                                  (Geyer and Daniilidis 2000; Mei and Rives 2007)
+    double_sphere  (x', y') = (X, Y) / (alpha d2 + (1 - alpha) z1),  z1 = Z + xi d,  d2 = hypot(rho, z1)
+                                                                  (Usenko, Demmel and Cremers 2018)
+    eucm           (x', y') = (X, Y) / (alpha hypot(sqrt(beta) rho, Z) + (1 - alpha) Z)
+                                                                  (Khomutenko, Garcia and Martinet 2016)
+
+The last three are (X, Y) / w. The image grows with theta where w > 0 and dw/dZ > 0, because w is homogeneous of
+degree one. What a model shows beyond that is no image.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.camera.polynomial import Coefficients, distorted_with_jacobian
+from neurocal_cli.geometry import Array
+
+__all__ = ["WIDE", "WITH_XI", "Direction", "project_directions"]
+
+WIDE = {
+    "fisheye": ("k1", "k2", "k3", "k4"),
+    "omnidir": ("xi", "k1", "k2", "p1", "p2"),
+    "double_sphere": ("xi", "alpha"),
+    "eucm": ("alpha", "beta"),
+}
+# Their first coefficient is xi, and the scale in the middle of the image is alpha_u / (1 + xi).
+WITH_XI = ("omnidir", "double_sphere")
+
+_TINY = 1e-24  # squared sine below which a direction is on the axis
+
+
+class Direction(NamedTuple):
+    """Where directions are seen, before A, with derivatives.
+
+    Attributes
+    ----------
+    x, y : arrays
+        x' and y'.
+    by_x, by_y : three arrays each
+        Derivatives of x' and y' by X, Y, Z.
+    by_coefficient : list of pairs of arrays
+        Derivatives of x', y' by each coefficient.
+    seen : bool array
+        Directions in which the image still grows with theta.
+    """
+
+    x: Array
+    y: Array
+    by_x: tuple[Array, Array, Array]
+    by_y: tuple[Array, Array, Array]
+    by_coefficient: list[tuple[Array, Array]]
+    seen: NDArray[np.bool_]
+
+
+def project_directions(model: str, k: Coefficients, X: Array, Y: Array, Z: Array) -> Direction:
+    """Project directions with a wide lens, with derivatives.
+
+    Parameters
+    ----------
+    model : str
+        One of `WIDE`.
+    k : sequence of coefficients
+        Each a number or an array that broadcasts against X.
+    X, Y, Z : arrays of one shape
+        In any unit; the direction alone counts.
+    """
+    q = X * X + Y * Y
+    if model == "fisheye":
+        return _fisheye(k, X, Y, Z, q)
+    if model == "omnidir":
+        return _omnidir(k, X, Y, Z, q)
+    sphere = _double_sphere if model == "double_sphere" else _eucm
+    return _by_divisor(X, Y, *sphere(k, q, Z))
+
+
+def _fisheye(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array) -> Direction:
+    k1, k2, k3, k4 = k
+    n = q + Z * Z
+    q = np.maximum(q, _TINY * n)
+    rho = np.sqrt(q)
+    theta = np.arctan2(rho, Z)
+    t2 = theta * theta
+    growth = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+    power = theta / rho
+    scale = power * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    along = -growth / n  # d(scale) / dZ
+    slope = -(along * Z + scale) / q  # d(scale) / d(rho) / rho
+    by = []
+    for _ in range(4):
+        power = power * t2
+        by.append((X * power, Y * power))
+    seen = np.asarray((growth > 0) & (scale > 0))
+    return _radial(X, Y, scale, slope, along, by, seen)
+
+
+def _radial(
+    X: Array, Y: Array, scale: Array, slope: Array, along: Array,
+    by: list[tuple[Array, Array]], seen: NDArray[np.bool_],
+) -> Direction:  # fmt: skip
+    """(X, Y) times a scale, whose derivatives are rho `slope` by rho and `along` by Z."""
+    cross = X * Y * slope
+    by_x = scale + X * X * slope, cross, X * along
+    by_y = cross, scale + Y * Y * slope, Y * along
+    return Direction(X * scale, Y * scale, by_x, by_y, by, seen)
+
+
+# A divisor w, its derivatives by rho (divided by rho) and by Z, and by each coefficient.
+_Divisor = tuple[Array, Array, Array, list[Array]]
+
+
+def _by_divisor(X: Array, Y: Array, w: Array, w_rho: Array, w_Z: Array, by_k: list[Array]) -> Direction:
+    scale = 1.0 / w
+    square = -scale * scale
+    by = [(X * change, Y * change) for change in (square * w_k for w_k in by_k)]
+    return _radial(X, Y, scale, square * w_rho, square * w_Z, by, np.asarray((w > 0) & (w_Z > 0)))
+
+
+def _unified(xi: Any, q: Array, Z: Array) -> _Divisor:
+    d = np.sqrt(q + Z * Z)
+    return Z + xi * d, xi / d, 1 + xi * Z / d, [d]
+
+
+def _double_sphere(k: Coefficients, q: Array, Z: Array) -> _Divisor:
+    xi, alpha = k
+    z1, z1_rho, z1_Z, (d1,) = _unified(xi, q, Z)
+    d2 = np.sqrt(q + z1 * z1)
+    by_z1 = alpha * z1 / d2 + (1 - alpha)
+    w = alpha * d2 + (1 - alpha) * z1
+    return w, alpha / d2 + by_z1 * z1_rho, by_z1 * z1_Z, [by_z1 * d1, d2 - z1]
+
+
+def _eucm(k: Coefficients, q: Array, Z: Array) -> _Divisor:
+    alpha, beta = k
+    d = np.sqrt(beta * q + Z * Z)
+    w = alpha * d + (1 - alpha) * Z
+    return w, alpha * beta / d, alpha * Z / d + (1 - alpha), [d - Z, alpha * q / (2 * d)]
+
+
+def _omnidir(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array) -> Direction:
+    m = _by_divisor(X, Y, *_unified(k[0], q, Z))
+    (x, y), (xx, xy, yx, yy), by_k = distorted_with_jacobian(k[1:], m.x, m.y)
+
+    def after(dx: Array, dy: Array) -> tuple[Array, Array]:
+        return xx * dx + xy * dy, yx * dx + yy * dy
+
+    by = [after(dx, dy) for dx, dy in zip(m.by_x, m.by_y, strict=True)]
+    seen = m.seen & np.asarray((xx * yy > xy * yx) & (xx + yy > 0))
+    return Direction(
+        x, y, (by[0][0], by[1][0], by[2][0]), (by[0][1], by[1][1], by[2][1]),
+        [after(*m.by_coefficient[0]), *by_k], seen,
+    )  # fmt: skip

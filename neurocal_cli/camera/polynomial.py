@@ -1,0 +1,84 @@
+"""The distortion of ordinary lenses: polynomials of the slopes (x, y) = (X, Y) / Z, and their derivatives.
+
+    x' = x R + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = y R + p1 (r^2 + 2 y^2) + 2 p2 x y,
+    R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)       (Brown 1971; Heikkila 2000)
+
+with the coefficients k1, k2, p1, p2, k3, k4, k5, k6, of which simpler models have the first 1, 2, 4, 5 and 8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["Coefficients", "Distorted", "distorted", "distorted_with_jacobian"]
+
+# A number, or an array that broadcasts against the points.
+Coefficients = Sequence[Any] | Array
+
+# (x', y'); dx'/dx, dx'/dy, dy'/dx, dy'/dy; and dx', dy' by each coefficient.
+Distorted = tuple[tuple[Array, Array], tuple[Array, Array, Array, Array], list[tuple[Array, Array]]]
+
+
+def distorted(k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
+    """Distorted points."""
+    r2 = x * x + y * y
+    R, _ = _radial(k, r2)
+    return (x * R, y * R) if len(k) <= 2 else _tangential(k, x, y, r2, R)[1]
+
+
+def _radial(k: Coefficients, r2: Array) -> tuple[Array, Any]:
+    """R, and one over its denominator."""
+    k1, k2, _, _, k3, k4, k5, k6 = _all(k)
+    R = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    if len(k) <= 5:
+        return R, 1.0
+    inverse = 1.0 / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+    return R * inverse, inverse
+
+
+def _tangential(
+    k: Coefficients, x: Array, y: Array, r2: Array, R: Array
+) -> tuple[Array, tuple[Array, Array]]:
+    """Q = R + 2 (p1 y + p2 x), and the distorted point (x Q + p2 r^2, y Q + p1 r^2)."""
+    p1, p2 = k[2], k[3]
+    Q = R + (2 * p1) * y + (2 * p2) * x
+    return Q, (x * Q + p2 * r2, y * Q + p1 * r2)
+
+
+def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
+    """Distorted points, their derivatives by the points, and by each coefficient."""
+    count = len(k)
+    k1, k2, p1, p2, k3, k4, k5, k6 = _all(k)
+    x2, y2 = x * x, y * y
+    r2 = x2 + y2
+    r4 = r2 * r2
+    R, inverse = _radial(k, r2)
+    slope = k1 + r2 * (2 * k2 + r2 * (3 * k3))  # dR / d(r^2)
+    powers = (r2, r4, r4 * r2) if count > 4 else (r2, r4)[:count]
+    by_radial = [(x * power, y * power) for power in powers]
+    if count > 5:
+        slope = (slope - R * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) * inverse
+        by_radial = [(dx * inverse, dy * inverse) for dx, dy in by_radial]
+    twice = 2 * slope
+    xy = x * y
+    cross = xy * twice
+    if count <= 2:
+        return (x * R, y * R), (R + x2 * twice, cross, cross, R + y2 * twice), by_radial
+    Q, distorted = _tangential(k, x, y, r2, R)
+    cross = cross + (2 * p1) * x + (2 * p2) * y
+    xx, yy = Q + x2 * twice + (4 * p2) * x, Q + y2 * twice + (4 * p1) * y
+    xy2 = 2 * xy
+    by = [*by_radial[:2], (xy2, r2 + 2 * y2), (r2 + 2 * x2, xy2), *by_radial[2:]]
+    if count > 5:
+        by += [(-R * dx, -R * dy) for dx, dy in by_radial]
+    return distorted, (xx, cross, cross, yy), by
+
+
+def _all(k: Coefficients) -> list[Any]:
+    """All eight coefficients, 0 where a model has none."""
+    return [*k, *[0.0] * (8 - len(k))]

@@ -1,0 +1,140 @@
+"""Cameras of another distortion model whose images are nearly the same: where its adjustment begins.
+
+The distorted radius as a function of the angle is what two lenses must share. With xi, or a wide lens's alpha
+and beta, given, every model's radius is a linear function of the others of its coefficients times the scale, so
+that a grid and linear least squares find the most similar ones. A double sphere and an omnidirectional
+lens may have several that are about as similar; each is a start of its own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.directions import WIDE, WITH_XI
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.projection import project_points
+from neurocal_cli.geometry import Array
+
+__all__ = ["farthest_angle", "similar_states"]
+
+# Repeated by tests/test_wide_lenses.py (slow): random lenses of all models arrive at the minimum from here.
+_ANGLES = 60
+_LEAST_ANGLE, _SPARE = 0.05, 1e-3  # [rad]
+# Values of xi, and where its range is divided: each part may hold a minimum.
+_XI = {"omnidir": np.linspace(0.1, 3.0, 30), "double_sphere": np.linspace(-0.6, 0.6, 25)}
+_PARTS = {"omnidir": (0.7, 1.1, 1.4, 1.8), "double_sphere": (-0.1, 0.15)}
+_ALPHA = np.linspace(0.2, 0.9, 29)
+_BETA = np.geomspace(0.3, 3.0, 21)
+
+
+def farthest_angle(views: Views, state: CameraState) -> float:
+    """Largest angle of a point from the axis [rad]."""
+    X, Y, Z = ((state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]).T
+    return float(np.arctan2(np.hypot(X, Y), Z).max())
+
+
+def similar_states(state: CameraState, model: str, farthest: float) -> list[CameraState]:
+    """States whose image is nearly that of another one, the most similar first; same poses, same centre.
+
+    Parameters
+    ----------
+    state : CameraState
+        Of one camera.
+    model : str
+        A model with coefficients.
+    farthest : float
+        Largest angle from the axis that counts [rad].
+    """
+    theta = np.linspace(_LEAST_ANGLE, max(farthest, 2 * _LEAST_ANGLE), _ANGLES)
+    radius = _radius(state.model, state.k, theta)
+    good = np.isfinite(radius)
+    theta, radius = theta[good], radius[good]
+    if len(theta) < 10:
+        return []
+    grid = _grid(model)
+    columns = _columns(model, grid, theta)  # (G, m, c)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        usable = np.isfinite(columns).all(axis=(1, 2))
+    columns = np.where(usable[:, None, None], columns, 0.0)
+    length = np.linalg.norm(columns, axis=1, keepdims=True) + 1e-300
+    solution = np.linalg.pinv(columns / length, rcond=1e-9) @ radius[:, None] / np.swapaxes(length, 1, 2)
+    error = ((columns @ solution - radius[:, None]) ** 2).sum(axis=(1, 2))
+    scale = solution[:, 0, 0]
+    error = np.where(usable & (scale > 0), error, np.inf)
+    found = []
+    for g in _lowest(model, error, grid):
+        linear = solution[g, 1:, 0] / scale[g]
+        found.append(_with(state, model, float(scale[g]), grid[g], linear))
+    return found
+
+
+def _radius(model: str, k: Array, theta: Array) -> Array:
+    """Distorted radii, without tangential terms; nan where the lens shows nothing."""
+    names = coefficient_names(model)
+    radial = [0.0 if name in ("p1", "p2") else value for name, value in zip(names, k, strict=True)]
+    with np.errstate(all="ignore"):
+        x, _, seen = project_points(
+            (1.0, 0.0, 1.0, 0.0, 0.0), model, radial, np.sin(theta), np.zeros_like(theta), np.cos(theta)
+        )
+        # The image ends where it first ceases to grow.
+        grows = seen & (np.diff(x, prepend=0.0) > 0)
+    return np.where(np.logical_and.accumulate(grows), x, np.nan)
+
+
+def _grid(model: str) -> Array:
+    """(G, n) values of the coefficients in which the radius is not linear."""
+    if model == "omnidir":
+        return _XI[model][:, None]
+    if model in ("double_sphere", "eucm"):
+        first, second = (_XI[model], _ALPHA) if model == "double_sphere" else (_ALPHA, _BETA)
+        return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.zeros((1, 0))
+
+
+def _columns(model: str, grid: Array, theta: Array) -> Array:
+    """(G, m, c) what the scale, and the scale times each linear coefficient, add to the radius."""
+    if model in WIDE and model != "fisheye":
+        n_linear = 2 if model == "omnidir" else 0
+        k = [*grid.T[:, :, None], *([0.0] * (4 if n_linear else 0))]
+        sine = np.broadcast_to(np.sin(theta), (len(grid), len(theta)))
+        with np.errstate(all="ignore"):
+            x, _, seen = project_points(
+                (1.0, 0.0, 1.0, 0.0, 0.0), model, k, sine, np.zeros_like(sine),
+                np.broadcast_to(np.cos(theta), sine.shape),
+            )  # fmt: skip
+        m = np.where(seen, x, np.nan)
+        return m[..., None] ** np.arange(1, 2 * n_linear + 2, 2)
+    m = theta if model == "fisheye" else np.where(theta < 0.5 * np.pi - _SPARE, np.tan(theta), np.nan)
+    return np.asarray(m[None, :, None] ** np.arange(1, 2 * len(_linear_names(model)) + 2, 2))
+
+
+def _linear_names(model: str) -> list[str]:
+    """Radial coefficients of which the radius is a linear function, by rising power; no denominators."""
+    return [name for name in coefficient_names(model) if name in ("k1", "k2", "k3")] + (
+        ["k4"] if model == "fisheye" else []
+    )
+
+
+def _lowest(model: str, error: Array, grid: Array) -> list[int]:
+    """Places of the lowest errors, of a model with xi in each part of its range, the best first."""
+    part = np.digitize(grid[:, 0], _PARTS[model]) if model in WITH_XI else np.zeros(len(grid), dtype=np.intp)
+    best = [int(np.argmin(np.where(part == n, error, np.inf))) for n in np.unique(part)]
+    return sorted((g for g in best if np.isfinite(error[g])), key=lambda g: float(error[g]))
+
+
+def _with(state: CameraState, model: str, scale: float, nonlinear: Array, linear: Array) -> CameraState:
+    old = dict(zip(coefficient_names(state.model), np.asarray(state.k).tolist(), strict=True))
+    names = coefficient_names(model)
+    found = dict(zip([name for name in names if name in ("xi", "alpha", "beta")], nonlinear, strict=True))
+    found |= dict(zip(_linear_names(model), linear, strict=False))
+    # The same shift in the image: p is by the square of a distorted radius.
+    found |= {name: old[name] / scale for name in ("p1", "p2") if name in old and name in names}
+    entries = state.entries.copy()
+    entries[:, :3] *= scale
+    return replace(
+        state, entries=entries, model=model, k=np.array([float(found.get(name, 0.0)) for name in names])
+    )
