@@ -61,6 +61,11 @@ class Views:
     pixel_centre : (2,) array
     pixel_scale : float
         S1 [px].
+    along : float
+        Say that points measured across an edge have along it.
+    rays : (N, 3) array, optional
+        What the networks learn instead of (u, v, 1): directions of unit length, in the frame of a lens that
+        somebody has in mind. Without them a network is a pinhole.
     """
 
     names: tuple[str, ...]
@@ -81,6 +86,14 @@ class Views:
     pixel_centre: Array
     pixel_scale: float
     along: float = LEAST
+    rays: Array | None = None
+
+    @property
+    def targets(self) -> Array:
+        """(N, 3) what the networks learn: normalised pixels (u, v, 1), or rays."""
+        if self.rays is not None:
+            return self.rays
+        return np.column_stack([self.pixels, np.ones(len(self.pixels))])
 
     @property
     def n_views(self) -> int:
@@ -143,6 +156,7 @@ class Views:
             weights=self.weights[rows],
             across=None if self.across is None else self.across[rows],
             whitening=None if self.whitening is None else self.whitening[rows],
+            rays=None if self.rays is None else self.rays[rows],
             centre=self.centre[views],
             scale=self.scale[views],
             basis=self.basis[views],
@@ -175,9 +189,10 @@ class Views:
             local = (local @ self.basis[views])[:, :, :2]
         ones = np.ones((*rows.shape, 1))
         weights = np.where(slot < n[:, None], self.weights[rows], 0.0)
-        return Patterns(
-            np.concatenate([local, ones], axis=2), np.concatenate([self.pixels[rows], ones], axis=2), weights
+        targets = (
+            np.concatenate([self.pixels[rows], ones], axis=2) if self.rays is None else self.rays[rows]
         )
+        return Patterns(np.concatenate([local, ones], axis=2), targets, weights)
 
 
 def arrange(points: Correspondences) -> Views:

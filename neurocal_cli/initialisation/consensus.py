@@ -25,7 +25,7 @@ from neurocal_cli.network import Patterns, random_weights
 from neurocal_cli.training import Task
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
 
-__all__ = ["Consensus", "find_consensus"]
+__all__ = ["Consensus", "find_consensus", "find_consensus_through_wide_lens"]
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view, each within 3 standard deviations of clean data): starts and rounds are what the last
@@ -44,6 +44,10 @@ _AGREED = 0.97  # share of points on which two starts have to agree
 _MAJORITY, _TIGHT = 0.5, 0.05
 _LOOSE, _LOOSER = 0.01, 10.0  # or to this share, and so many times worse than most views
 _NETWORKS_AT_ONCE = 20_000
+# Angles from the axis [rad] at which the farthest point may be seen, and how much tighter networks must become.
+# A board is seen in a small part of the image, where a lens that is 20 % off bends it by 1 %.
+_HALF_ANGLES = (0.8, 1.1, 1.4, 1.7)
+_TIGHTER = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,10 +60,13 @@ class Consensus:
         Points near their view's network; all points of views that have too few to tell.
     hopeless : (V,) bool array
         Views whose points agree on nothing.
+    looseness : float
+        How far points are from their network, as a share of the view's size; the median of the views.
     """
 
     kept: NDArray[np.bool_]
     hopeless: NDArray[np.bool_]
+    looseness: float
 
 
 def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generator) -> Consensus:
@@ -92,7 +99,39 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
     if len(told) > 2:
         with np.errstate(invalid="ignore"):
             hopeless |= (loose > _LOOSE) & (loose > _LOOSER * median(told))
-    return Consensus(kept, hopeless)
+    return Consensus(kept, hopeless, float(median(told)) if len(told) else np.inf)
+
+
+def find_consensus_through_wide_lens(
+    pinhole: Consensus, views: Views, flat: NDArray[np.bool_], middle: Array, rng: np.random.Generator
+) -> Consensus:
+    """The same where a wide lens bends boards by more than wrong points do.
+
+    The networks learn rays instead of pixels, through lenses whose image grows evenly with the angle, of several
+    focal lengths; the one that brings points together best tells.
+
+    Parameters
+    ----------
+    pinhole : Consensus
+        What the networks agree on without a lens: the result, unless a lens brings points decidedly
+        nearer together.
+    views, flat, rng
+        As before.
+    middle : (2,) array
+        Where the axis is taken to be, in normalised pixels.
+
+    """
+    away = views.pixels - middle
+    radius = np.hypot(*away.T)
+    best, most = None, _TIGHTER * pinhole.looseness
+    for half_angle in _HALF_ANGLES:
+        theta = radius * (half_angle / radius.max())
+        rays = np.column_stack([away * np.sinc(theta / np.pi)[:, None], np.cos(theta)])
+        rays[:, :2] *= half_angle / radius.max()
+        consensus = find_consensus(replace(views, rays=rays), flat, rng)
+        if consensus.looseness < most:
+            best, most = consensus, consensus.looseness
+    return pinhole if best is None or best.hopeless.sum() > pinhole.hopeless.sum() else best
 
 
 class _Search:
@@ -107,7 +146,7 @@ class _Search:
         self.scale = np.full(K, np.inf)
         self.near = np.zeros((K, n), dtype=bool)
         self.agreed = np.zeros(K, dtype=np.int64)
-        seen = np.where(self.real[..., None], self.patterns.targets[..., :2], np.nan)
+        seen = np.where(self.real[..., None], self.patterns.targets, np.nan)
         self.spread = np.sqrt(np.nanvar(seen, axis=1).sum(axis=1))
 
     def run(self) -> None:
@@ -177,10 +216,20 @@ class _Search:
     def _errors(self, which: NDArray[np.intp], product: Array) -> Array:
         """Distance between each point and where the networks put it; (K', S, n)."""
         o = self.patterns.inputs[which][:, None] @ np.swapaxes(product, -1, -2)
+        return self._distance(o, self.patterns.targets[which][:, None])
+
+    def _distance(self, o: Array, targets: Array) -> Array:
+        """Between outputs and targets: in the image, or of rays the sine of the angle; 1e9 for the other side."""
         with np.errstate(all="ignore"):
-            error = np.hypot(
-                *np.moveaxis(o[..., :2] / o[..., 2:] - self.patterns.targets[which][:, None, :, :2], -1, 0)
-            )
+            if self.views.rays is None:
+                error = np.hypot(*np.moveaxis(o[..., :2] / o[..., 2:] - targets[..., :2], -1, 0))
+            else:
+                along = (o * targets).sum(axis=-1, keepdims=True)
+                across = o - along * targets
+                error = np.sqrt((across * across).sum(axis=-1) / (o * o).sum(axis=-1))
+                # A product has no sign of its own.
+                same_side = along[..., 0] * along.sum(axis=-2) > 0
+                error = np.where(same_side, error, np.nan)
         return np.where(np.isfinite(error), error, 1e9)
 
     def _scale(self, error: Array, real: NDArray[np.bool_]) -> Array:
@@ -196,10 +245,9 @@ class _Search:
             if self.flat:
                 local = (local @ self.views.basis[view])[:, :2]
             o = np.column_stack([local, np.ones(len(local))]) @ self.product[k].T
-            with np.errstate(all="ignore"):
-                error = np.hypot(*(o[:, :2] / o[:, 2:] - self.views.pixels[rows]).T)
-            near = error < _FAR * self.scale[k]
-            extent = np.sqrt(self.views.pixels[rows][near].var(axis=0).sum()) if near.any() else 0.0
+            targets = self.views.targets[rows]
+            near = self._distance(o, targets) < _FAR * self.scale[k]
+            extent = np.sqrt(targets[near].var(axis=0).sum()) if near.any() else 0.0
             hopeless[k] = near.mean() <= _MAJORITY or self.scale[k] > _TIGHT * extent
             kept[rows] = near
         return hopeless

@@ -33,7 +33,7 @@ from neurocal_cli.initialisation.options import Options, options_for
 from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
 
-__all__ = ["radial_start"]
+__all__ = ["middle_of_image", "radial_start"]
 
 # lambda_1 = -0.8 is a barrel that shows 5 times the radius of a pinhole at the farthest point, 0.3 a
 # pincushion. Repeated by tests/test_radial_networks.py and the campaign of tests/test_campaign.py (slow).
@@ -59,7 +59,7 @@ def radial_start(problem: Problem, options: Options) -> Solution | None:
         A minimum of the reprojection error, with the distortion model that was nearest to the division
         model; None where it leads to no camera.
     """
-    search = _Search(problem, _middle(problem), options)
+    search = _Search(problem, middle_of_image(problem), options)
     strength = search.best_strength()
     corrected = search.corrected(strength)
     best = None
@@ -83,7 +83,7 @@ def _pinholes(problem: Problem, middle: Array) -> Iterator[Problem]:
     yield problem
 
 
-def _middle(problem: Problem) -> Array:
+def middle_of_image(problem: Problem) -> Array:
     """(2,) what the distortion is taken to be radial about [px]."""
     points = problem.points
     if problem.given_centre is not None:

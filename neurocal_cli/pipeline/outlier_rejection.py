@@ -32,8 +32,9 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.consensus import find_consensus
+from neurocal_cli.initialisation.consensus import find_consensus, find_consensus_through_wide_lens
 from neurocal_cli.initialisation.options import Options
+from neurocal_cli.initialisation.radial_networks import middle_of_image
 from neurocal_cli.median import median
 from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import why_odd
@@ -95,7 +96,11 @@ class _Search:
     def agree(self, first: Solution | None, failure: DegenerateGeometryError | None) -> None:
         """Points that each view's network agrees on."""
         views = arrange(self.points)
-        consensus = find_consensus(views, views.nearly_flat, np.random.default_rng(self.options.seed))
+        rng = np.random.default_rng(self.options.seed)
+        consensus = find_consensus(views, views.nearly_flat, rng)
+        if consensus.hopeless.any() and self._may_be_wide():
+            middle = (middle_of_image(self.problem) - views.pixel_centre) / views.pixel_scale
+            consensus = find_consensus_through_wide_lens(consensus, views, views.nearly_flat, middle, rng)
         order = slice(None) if views.order is None else views.order
         self.kept[order] = consensus.kept
         for view in np.flatnonzero(consensus.hopeless):
@@ -113,6 +118,10 @@ class _Search:
             if failure is not None:
                 raise failure from None
             raise
+
+    def _may_be_wide(self) -> bool:
+        """Whether the lens may be one that bends whole boards."""
+        return self.options.distortion == "auto" or self.problem.distortion.wide
 
     def _drop(self, name: str, reason: str) -> None:
         self.wrong_views[name] = reason
