@@ -48,7 +48,7 @@ def opencv(problem: Problem) -> Found:
     """
     import cv2
 
-    if problem.type not in (1, 2) or problem.distortion.model == "fisheye":
+    if problem.type not in (1, 2) or problem.distortion.wide:
         raise UsageError("OpenCV's calibrateCamera solves types 1 and 2, with the models none to rational")
     check_points(problem)
     views, points = problem.views, problem.points

@@ -189,9 +189,7 @@ class Views:
             local = (local @ self.basis[views])[:, :, :2]
         ones = np.ones((*rows.shape, 1))
         weights = np.where(slot < n[:, None], self.weights[rows], 0.0)
-        targets = (
-            np.concatenate([self.pixels[rows], ones], axis=2) if self.rays is None else self.rays[rows]
-        )
+        targets = np.concatenate([self.pixels[rows], ones], axis=2) if self.rays is None else self.rays[rows]
         return Patterns(np.concatenate([local, ones], axis=2), targets, weights)
 
 

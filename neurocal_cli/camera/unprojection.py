@@ -101,7 +101,9 @@ def unproject_directions(distortion: Distortion, x: Array, y: Array) -> tuple[Ar
 _Three = tuple[Array, Array, Array]
 
 
-def _moved(ray: _Three, by_x: _Three, by_y: _Three, dx: Array, dy: Array) -> tuple[Array, Array, Array, Array]:
+def _moved(
+    ray: _Three, by_x: _Three, by_y: _Three, dx: Array, dy: Array
+) -> tuple[Array, Array, Array, Array]:
     """Rays of unit length after one of Newton's steps, which is across the ray, and its length."""
     X, Y, Z = ray
     # Two directions across the ray: towards the axis's meridian, and around the axis.

@@ -292,10 +292,12 @@ _OPTIONS = [
     click.option(
         "--distortion",
         type=click.Choice(
-            ["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"]
+            ["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational"]
+            + ["fisheye", "omnidir", "double_sphere", "eucm", "plumb-line"]
         ),
         default="auto",
-        help="Distortion model, with coefficients as in OpenCV; none is a pinhole camera. auto compares the "
+        help="Distortion model, with coefficients as in OpenCV; none is a pinhole camera. fisheye, omnidir, "
+        "double_sphere and eucm are for wide lenses, also beyond 180 degrees. auto compares the "
         "models by cross-validation and chooses the simplest one whose error is as low as any. plumb-line "
         "estimates k1, k2, p1 and p2 from the straight lines of the target alone.",
     ),

@@ -102,9 +102,7 @@ def where_not_monotonic(distortion: Distortion, A: Array, points: Correspondence
     away = np.hypot(points.pixels[:, 0] - A[0, 2], points.pixels[:, 1] - A[1, 2])
     farthest = points.pixels[np.argsort(-away, kind="stable")[:_FARTHEST]]
     border = np.zeros((0, 2))
-    if points.image_size is not None and not (
-        distortion.wide and largest_angle(distortion) >= np.pi / 2
-    ):
+    if points.image_size is not None and not (distortion.wide and largest_angle(distortion) >= np.pi / 2):
         border = _border(points.image_size, distortion)
     if _sees(distortion, A, np.concatenate([farthest, border])):
         return None

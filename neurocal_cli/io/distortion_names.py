@@ -1,10 +1,12 @@
-"""Names of distortion models: ours, and ROS's with the number of coefficients it expects."""
+"""Names of distortion models: ours, and ROS's with the number of coefficients it expects.
+
+ROS has no name for wide lenses other than the fisheye; these have their own."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.distortion import WIDE, coefficient_names
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
@@ -24,8 +26,8 @@ def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
         An unknown model, or coefficients that it doesn't have.
     """
     own = own_length(model)
-    name = _ROS.get(model, "plumb_bob")
-    length = _LENGTHS[name]
+    name = _ROS.get(model, model if model in WIDE else "plumb_bob")
+    length = _LENGTHS.get(name, own)
     values = np.asarray(coefficients, dtype=float).ravel()
     if np.any(values[own:] != 0) or not np.isfinite(values).all():
         raise InputError(
@@ -37,7 +39,9 @@ def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
 
 
 def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
-    """Find our name of a ROS (or OpenCV) model and its coefficients; all zeros are no distortion.
+    """Find our name of a ROS (or OpenCV) model and its coefficients.
+
+    All zeros are no distortion, but for a fisheye, whose image they let grow evenly with the angle.
 
     Raises
     ------
@@ -45,15 +49,20 @@ def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
         A model or coefficients that we don't have; the message tells which there are.
     """
     values = np.asarray(coefficients, dtype=float).ravel()
-    if not values.any():
-        return "none", np.zeros(0)
-    if name in ("equidistant", "fisheye"):
+    if name in ("equidistant", "fisheye") and values.size:
         if len(values) != 4:
             raise InputError(f"an equidistant (fisheye) lens has 4 coefficients, found {len(values)}")
         return "fisheye", values
+    if not values.any():
+        return "none", np.zeros(0)
+    if name in WIDE:
+        if len(values) != own_length(name):
+            raise InputError(f"the model {name} has {own_length(name)} coefficients, found {len(values)}")
+        return name, values
     if name not in ("plumb_bob", "rational_polynomial"):
         raise InputError(
-            f"distortion model {name[:40]!r} is unknown; use plumb_bob, rational_polynomial, equidistant"
+            f"distortion model {name[:40]!r} is unknown; use plumb_bob, rational_polynomial, "
+            "equidistant, omnidir, double_sphere, eucm"
         )
     if values[8:].any() or len(values) not in (4, 5, 8, 12, 14):
         raise InputError(f"distortion has 4, 5 or 8 coefficients k1,k2,p1,p2,k3,..,k6, found {len(values)}")
