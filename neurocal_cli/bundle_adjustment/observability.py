@@ -158,9 +158,10 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
 
 
 def relative_std_of_scale(problem: Problem, state: CameraState, cov: Covariance) -> float:
-    """Standard deviation of the image's scale over its value, the larger of u and v; 0 where both are given.
+    """Standard deviation of the image's scale over its value, the larger of u and v.
 
-    The scale in the middle of the image: what alpha and a wide lens's xi only tell together is no doubt of it.
+    0 where both are given.
+    The scale is that in the middle of the image, which alpha and a wide lens's xi tell together.
     """
     free = np.flatnonzero(problem.free_camera if state.model != "none" else problem.free)
     largest = 0.0

@@ -6,14 +6,14 @@ through A. With rho = hypot(X, Y), d = |(X, Y, Z)| and theta = atan2(rho, Z):
     fisheye        (x', y') = (X, Y) theta (1 + k1 theta^2 + ... + k4 theta^8) / rho
                                                                   (Kannala and Brandt 2006)
     omnidir        (x, y) = (X, Y) / (Z + xi d), then k1, k2, p1, p2 of `polynomial`
-                                                                  (Geyer and Daniilidis 2000; Mei and Rives 2007)
+                                                                  (Mei and Rives 2007)
     double_sphere  (x', y') = (X, Y) / (alpha d2 + (1 - alpha) z1),  z1 = Z + xi d,  d2 = hypot(rho, z1)
                                                                   (Usenko, Demmel and Cremers 2018)
     eucm           (x', y') = (X, Y) / (alpha hypot(sqrt(beta) rho, Z) + (1 - alpha) Z)
                                                                   (Khomutenko, Garcia and Martinet 2016)
 
-The last three are (X, Y) / w. The image grows with theta where w > 0 and dw/dZ > 0, because w is homogeneous of
-degree one. What a model shows beyond that is no image.
+The last three are (X, Y) / w. The image grows with theta where w > 0 and dw/dZ > 0, because w is homogeneous
+of degree one. What a model shows beyond that is no image.
 """
 
 from __future__ import annotations

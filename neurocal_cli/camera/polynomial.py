@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from neurocal_cli.geometry import Array
 
 __all__ = ["Coefficients", "Distorted", "distorted", "distorted_with_jacobian"]

@@ -99,8 +99,8 @@ def project_points(
 
     It sees points in front; a wide lens, those in whose direction its image grows.
     """
-    a, s, b, u0, v0 = entries
     if model in WIDE:
+        a, s, b, u0, v0 = entries
         x, y, _, _, _, seen = project_directions(model, k, X, Y, Z)
         return a * x + s * y + u0, b * y + v0, seen
     q = 1.0 / Z
@@ -136,7 +136,7 @@ def project_with_jacobian(
     X, Y, Z = points
     if model in WIDE:
         return _project_wide(entries, model, k, points, by_entries, by_point, by_coefficient)
-    a, s, b, _, _ = entries
+    s = entries[1]
     q = 1.0 / Z
     x, y = X * q, Y * q
     image = image_points_with_jacobian(entries, model, k, x, y)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.camera.directions import project_directions
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
@@ -48,7 +49,7 @@ def first_root(coefficients: Array) -> float:
     return float(real.min(initial=np.inf))
 
 
-def _along_radius(distortion: Distortion, theta: Array) -> tuple[Array, Array]:
+def _along_radius(distortion: Distortion, theta: Array) -> tuple[Array, NDArray[np.bool_]]:
     """Distorted radii of angles, without tangential terms, and whether the image grows there."""
     names = coefficient_names(distortion.model)
     k = [
@@ -94,7 +95,7 @@ def unproject_directions(distortion: Distortion, x: Array, y: Array) -> tuple[Ar
                 break
         seen = project_directions(distortion.model, k, X, Y, Z)
         good = np.hypot(seen.x - x, seen.y - y) < _ACCURACY * (1 + radius)
-        good &= seen.seen & (Z > np.cos(limit))
+        good &= seen.seen & (np.cos(limit) < Z)
     return np.where(good, X, np.nan), np.where(good, Y, np.nan), np.where(good, Z, np.nan)
 
 

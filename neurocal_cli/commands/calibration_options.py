@@ -292,8 +292,21 @@ _OPTIONS = [
     click.option(
         "--distortion",
         type=click.Choice(
-            ["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational"]
-            + ["fisheye", "omnidir", "double_sphere", "eucm", "plumb-line"]
+            # As `MODELS`, which --help does not wait for.
+            [
+                "auto",
+                "none",
+                "k1",
+                "k1k2",
+                "k1k2p1p2",
+                "plumb_bob",
+                "rational",
+                "fisheye",
+                "omnidir",
+                "double_sphere",
+                "eucm",
+                "plumb-line",
+            ]
         ),
         default="auto",
         help="Distortion model, with coefficients as in OpenCV; none is a pinhole camera. fisheye, omnidir, "

@@ -1,9 +1,9 @@
 """Cameras of another distortion model whose images are nearly the same: where its adjustment begins.
 
-The distorted radius as a function of the angle is what two lenses must share. With xi, or a wide lens's alpha
-and beta, given, every model's radius is a linear function of the others of its coefficients times the scale, so
-that a grid and linear least squares find the most similar ones. A double sphere and an omnidirectional
-lens may have several that are about as similar; each is a start of its own.
+Two lenses must share the distorted radius as a function of the angle. Given xi, or a wide lens's alpha and
+beta, every model's radius is a linear function of the scale and of its other coefficients times the scale, so
+that a grid and linear least squares find the most similar lenses. A double sphere and an omnidirectional lens
+may have several that are about as similar; each is a start of its own.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
@@ -51,14 +52,14 @@ def similar_states(state: CameraState, model: str, farthest: float) -> list[Came
     """
     theta = np.linspace(_LEAST_ANGLE, max(farthest, 2 * _LEAST_ANGLE), _ANGLES)
     radius = _radius(state.model, state.k, theta)
-    good = np.isfinite(radius)
+    good: NDArray[np.bool_] = np.isfinite(radius)
     theta, radius = theta[good], radius[good]
     if len(theta) < 10:
         return []
     grid = _grid(model)
     columns = _columns(model, grid, theta)  # (G, m, c)
     with np.errstate(invalid="ignore", divide="ignore"):
-        usable = np.isfinite(columns).all(axis=(1, 2))
+        usable = np.asarray(np.isfinite(columns).all(axis=(1, 2)))
     columns = np.where(usable[:, None, None], columns, 0.0)
     length = np.linalg.norm(columns, axis=1, keepdims=True) + 1e-300
     solution = np.linalg.pinv(columns / length, rcond=1e-9) @ radius[:, None] / np.swapaxes(length, 1, 2)

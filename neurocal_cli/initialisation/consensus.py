@@ -44,8 +44,8 @@ _AGREED = 0.97  # share of points on which two starts have to agree
 _MAJORITY, _TIGHT = 0.5, 0.05
 _LOOSE, _LOOSER = 0.01, 10.0  # or to this share, and so many times worse than most views
 _NETWORKS_AT_ONCE = 20_000
-# Angles from the axis [rad] at which the farthest point may be seen, and how much tighter networks must become.
-# A board is seen in a small part of the image, where a lens that is 20 % off bends it by 1 %.
+# Angles from the axis [rad] at which the farthest point may be seen, and how much tighter networks must
+# become. A board is seen in a small part of the image, where a lens that is 20 % off bends it by 1 %.
 _HALF_ANGLES = (0.8, 1.1, 1.4, 1.7)
 _TIGHTER = 0.5
 
@@ -107,8 +107,8 @@ def find_consensus_through_wide_lens(
 ) -> Consensus:
     """The same where a wide lens bends boards by more than wrong points do.
 
-    The networks learn rays instead of pixels, through lenses whose image grows evenly with the angle, of several
-    focal lengths; the one that brings points together best tells.
+    The networks learn rays instead of pixels, through lenses whose image grows evenly with the angle, of
+    several focal lengths; the one that brings points together best tells.
 
     Parameters
     ----------
@@ -219,7 +219,7 @@ class _Search:
         return self._distance(o, self.patterns.targets[which][:, None])
 
     def _distance(self, o: Array, targets: Array) -> Array:
-        """Between outputs and targets: in the image, or of rays the sine of the angle; 1e9 for the other side."""
+        """Between outputs and targets: in the image, or the sine of the angle between rays."""
         with np.errstate(all="ignore"):
             if self.views.rays is None:
                 error = np.hypot(*np.moveaxis(o[..., :2] / o[..., 2:] - targets[..., :2], -1, 0))

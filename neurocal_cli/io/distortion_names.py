@@ -1,6 +1,7 @@
 """Names of distortion models: ours, and ROS's with the number of coefficients it expects.
 
-ROS has no name for wide lenses other than the fisheye; these have their own."""
+ROS has no name for wide lenses other than the fisheye; these have their own.
+"""
 
 from __future__ import annotations
 
