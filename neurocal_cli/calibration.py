@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import UsageError
@@ -246,6 +247,22 @@ class Calibration:
     def K(self) -> Array:
         """(3, 3) camera matrix A, skew included."""
         return self.intrinsics.A
+
+    @property
+    def relative_std_of_scale(self) -> float:
+        """Standard deviation of the image's scale over its value, the larger of u and v.
+
+        Of alpha; with a wide lens's xi, of alpha / (1 + xi), the scale in the middle of the image.
+        """
+        shares = [self.std[name] / getattr(self.intrinsics, name) for name in ("alpha_u", "alpha_v")]
+        if self.distortion_model in WITH_XI and {"alpha_u", "xi"} <= set(self.covariance_names):
+            xi = self.covariance_names.index("xi")
+            for n, name in enumerate(("alpha_u", "alpha_v")):
+                gradient = np.zeros(len(self.covariance_names))
+                gradient[self.covariance_names.index(name)] = 1 / getattr(self.intrinsics, name)
+                gradient[xi] = -1 / (1 + self.distortion[0])
+                shares[n] = float(np.sqrt(gradient @ self.covariance @ gradient))
+        return max(shares)
 
     @property
     def image_size(self) -> tuple[int, int] | None:

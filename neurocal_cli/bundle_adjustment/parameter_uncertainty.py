@@ -10,6 +10,7 @@ from collections.abc import Collection, Mapping
 
 import numpy as np
 
+from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
 from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
@@ -82,15 +83,18 @@ def parameter_warnings(
 
     A distortion model that was chosen for what it predicts may well have one of those.
     """
-    return (*_poor(intrinsics, std), *(() if model_chosen else _noise_coefficients(distortion, std)))
+    return (
+        *_poor(intrinsics, distortion.model, std),
+        *(() if model_chosen else _noise_coefficients(distortion, std)),
+    )
 
 
-def _poor(intrinsics: Intrinsics, std: Mapping[str, float]) -> tuple[str, ...]:
-    """Parameters that exist but are badly determined."""
+def _poor(intrinsics: Intrinsics, model: str, std: Mapping[str, float]) -> tuple[str, ...]:
+    """Parameters that exist but are badly determined; alpha by itself means nothing beside a xi."""
     alpha = max(intrinsics.alpha_u, intrinsics.alpha_v)
     limits = {
-        "alpha_u": _POOR * intrinsics.alpha_u,
-        "alpha_v": _POOR * intrinsics.alpha_v,
+        "alpha_u": np.inf if model in WITH_XI else _POOR * intrinsics.alpha_u,
+        "alpha_v": np.inf if model in WITH_XI else _POOR * intrinsics.alpha_v,
         "u0": _POOR * alpha,
         "v0": _POOR * alpha,
         "theta": _POOR_THETA,
@@ -108,7 +112,9 @@ def _noise_coefficients(distortion: Distortion, std: Mapping[str, float]) -> tup
     """Warn of coefficients that the data does not tell from 0."""
     pairs = zip(coefficient_names(distortion.model), distortion.coefficients, strict=True)
     noise = [
-        f"{name} ({k:.2g} +- {std[name]:.2g})" for name, k in pairs if 0 < abs(k) < _TOLD_APART * std[name]
+        f"{name} ({k:.2g} +- {std[name]:.2g})"
+        for name, k in pairs
+        if name[0] in "kp" and 0 < abs(k) < _TOLD_APART * std[name]
     ]
     if not noise:
         return ()

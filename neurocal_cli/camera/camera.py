@@ -164,6 +164,14 @@ class Camera:
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
+    def seen_points(self, pixels: Array) -> Array:
+        """Points that pixels (..., 2) see: at depth 1, or of a wide lens, for which there is none, at distance 1.
+
+        ``nan`` where the camera cannot see anything.
+        """
+        rays = self.unproject(pixels)
+        return rays if self.distortion.wide else np.asarray(rays / rays[..., 2:])
+
     def unproject_jacobian(self, pixels: Array) -> tuple[Array, Array]:
         """Derivatives of the rays of pixels (N, 2).
 

@@ -213,7 +213,10 @@ class _Chain:
 
     def _made_monotonic(self, candidate: Candidate) -> Candidate:
         found = fit_monotonic(candidate.problem, candidate.adjusted)
-        return candidate if found is None else self.assessed(*found) or candidate
+        if found is not None:
+            return self.assessed(*found) or candidate
+        # The image of a wide lens may end within the picture.
+        return replace(candidate, not_monotonic=None) if candidate.problem.distortion.wide else candidate
 
     def _fit(self, problem: Problem, state: CameraState, most: int = 4) -> Candidate | None:
         """None when it did not settle, or too little is left for it without a part of the data."""

@@ -43,6 +43,8 @@ def check_distortion(solution: Solution) -> Solution:
         found = fit_monotonic(problem, solution.adjusted)
         if found is not None:
             return replace(solution, problem=found[0], adjusted=found[1])
+        if distortion.wide:  # its image may end within the picture
+            return solution
     raise DegenerateGeometryError(
         f"the distortion model {distortion.model} is not monotonic (maps two directions to one pixel) inside "
         f"the {where}; choose another --distortion, or give points nearer to the image's corners"

@@ -63,7 +63,7 @@ def pixel_changes(camera: Camera, free: NDArray[np.bool_], pixels: Array, depths
     -------
     J : (g, 2, f) array
     """
-    rays = np.column_stack([*camera.normalised_points(*pixels.T), np.ones(len(pixels))])
+    rays = camera.seen_points(pixels)
     rays = rays[np.isfinite(rays[:, 0])]
     J, P = _derivatives(camera, free, np.concatenate([depth * rays for depth in depths]))
     motion = np.linalg.lstsq(P.reshape(-1, 6), J.reshape(-1, J.shape[2]), rcond=None)[0]

@@ -21,12 +21,14 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.two_view_points import PointBatch
+from neurocal_cli.stereo.wide_points import WidePointBatch
 
 __all__ = ["METHODS", "Triangulated", "epipolar_limit", "triangulate"]
 
 METHODS = ("optimal", "linear", "midpoint")
 
 _BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache
+_FARTHEST, _LEAST_DEPTH = 20, 0.17  # pixels looked at; the depth of a ray at 80 degrees
 _EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
 
 
@@ -106,19 +108,31 @@ def triangulate(
         raise InputError(f"{n} left pixels but {len(pixels[1])} right ones; give one of each for every point")
     cameras = camera_of(left), camera_of(right)
     rigs = _Rigs.of([pose] if isinstance(pose, Pose) else pose, which, n)
+    wide = any(_sees_sideways(camera, seen) for camera, seen in zip(cameras, pixels, strict=True))
+    batch_type: type[PointBatch] | type[WidePointBatch] = WidePointBatch if wide else PointBatch
     points, epipolar, behind = np.empty((n, 3)), np.empty(n), np.empty(n, dtype=bool)
     covariance = np.empty((n, 6)) if method == "optimal" else None
     with np.errstate(all="ignore"):
         for start in range(0, n, _BLOCK):
             rows = slice(start, start + _BLOCK)
             factors = None if whitening is None else (whitening[0][rows].T, whitening[1][rows].T)
-            batch = PointBatch(cameras, rigs.of_points(rows), pixels[0][rows].T, pixels[1][rows].T, factors)
+            batch = batch_type(cameras, rigs.of_points(rows), pixels[0][rows].T, pixels[1][rows].T, factors)
             if covariance is None:
                 points[rows] = batch.linear() if method == "linear" else batch.midpoint()
                 epipolar[rows], behind[rows] = batch.compare(points[rows])
             else:
                 points[rows], covariance[rows], epipolar[rows], behind[rows] = batch.optimal()
     return Triangulated(points, covariance, epipolar, behind)
+
+
+def _sees_sideways(camera: Camera, pixels: Array) -> bool:
+    """Whether any pixel's ray is so far from the axis that (x, y, 1) / w, which is quicker, is of no use."""
+    if not camera.distortion.wide or not len(pixels):
+        return False
+    # The farthest from the principal point tell, up to what tangential terms may change.
+    away = np.nan_to_num(np.hypot(*(pixels - camera.A[:2, 2]).T))
+    farthest = np.argsort(-away, kind="stable")[:_FARTHEST]
+    return not bool((camera.unproject(pixels[farthest])[:, 2] > _LEAST_DEPTH).all())
 
 
 def _pixels(values: Array) -> Array:

@@ -126,6 +126,6 @@ def _motions(
 
 def _derivatives(camera: Camera, pixels: Array, scale: float) -> tuple[Array, Array, Array]:
     """Of the pixels (G, 2) by the normalised camera (5 + K) and by points at depth 1; rays (G, 3)."""
-    rays = np.column_stack([*camera.normalised_points(*pixels.T), np.ones(len(pixels))])
+    rays = camera.seen_points(pixels)
     by_camera, by_point = camera.project_jacobian(rays)
     return by_camera * np.array([scale] * 5 + [1.0] * (by_camera.shape[2] - 5)), by_point, rays

@@ -193,10 +193,10 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
     A, std, fixed = calibration.intrinsics, calibration.std, calibration.fixed
     more = "add views in which the target is near, tilted and fills the image"
     if "alpha_u" not in fixed:
-        share = max(std["alpha_u"] / A.alpha_u, std["alpha_v"] / A.alpha_v)
+        share = calibration.relative_std_of_scale
         yield _ALPHA.grade(share), f"the std of the focal length is {100 * share:.2g} % of its value", more
     off_centre = list(_off_centre(calibration))
-    if e.coverage.relief < _SHALLOW and (off_centre or std["alpha_u"] > _ALPHA.good * A.alpha_u):
+    if e.coverage.relief < _SHALLOW and (off_centre or calibration.relative_std_of_scale > _ALPHA.good):
         yield (
             1,
             f"the target is only {100 * e.coverage.relief:.2g} % as deep as it is far away: too shallow to "
