@@ -90,9 +90,17 @@ def assess(calibration: Calibration) -> Verdict | None:
 
 
 def _views_behind(calibration: Calibration) -> int:
-    """How many views have points behind the camera, or in its plane, as their stored poses say."""
+    """How many views have points behind the camera, or in its plane, as their stored poses say.
+
+    Of a wide lens: points that it does not show.
+    """
     points = calibration.points
     poses = [calibration.views[name].pose for name in points.view_names]
+    if calibration.camera.distortion.wide:
+        R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+        world, index = points.world, points.view_index
+        seen = calibration.camera.sees((R[index] @ world[..., None])[..., 0] + t[index])
+        return len(np.unique(index[~seen]))
     axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
     depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
     return len(np.unique(points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]))
