@@ -171,6 +171,9 @@ DISTORTIONS = {
     "plumb_bob": [-0.26, 0.06, 2e-3, -1e-3, 0.03],
     "rational": [0.4, -0.2, 1e-3, 2e-3, 0.05, 0.7, -0.1, 0.02],
     "fisheye": [0.08, -0.03, 0.02, -0.005],
+    "omnidir": [0.9, -0.1, 0.03, 1e-3, -2e-3],
+    "double_sphere": [-0.2, 0.58],
+    "eucm": [0.6, 1.1],
 }
 SIZE = (640, 480)
 every_model = pytest.mark.parametrize("model", list(MODELS))
