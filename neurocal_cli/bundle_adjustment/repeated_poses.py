@@ -99,7 +99,7 @@ def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedP
 
 
 def _seen(views: Views, state: CameraState) -> Array:
-    """Where each view's pose puts five places of the target; only a wide lens's distortion counts; (V, 10)."""
+    """Where each view's pose puts five places of the target; (V, 10). Only a wide lens is distorted."""
     centre = np.average(views.centre, axis=0, weights=views.counts)
     reach = views.scale[0] * views.extent[0, :2] * views.basis[0][:, :2]  # columns
     places = centre + np.concatenate([np.zeros((1, 3)), reach.T, -reach.T])
