@@ -1,7 +1,8 @@
 """All chessboards of an image, of any size: `find_grids` runs the steps of this package.
 
 On a reduced image, saddle points of the brightness are linked along edges, and blocks of 3 x 3 linked
-vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices.
+vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices. Where more
+saddles are linked than grids hold, `straighten` searches again, in a view without the bends of a wide lens.
 
 In: an image. Out: grids with vertices known to a few tenths of a pixel, for `measuring`.
 """
@@ -20,12 +21,13 @@ from neurocal_cli.detection.finding.folds import split_at_folds
 from neurocal_cli.detection.finding.from_links import lattice_from_links
 from neurocal_cli.detection.finding.grow import grow, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
-from neurocal_cli.detection.finding.levels import Level, levels_of
+from neurocal_cli.detection.finding.levels import Level, levels_of, pyramid
 from neurocal_cli.detection.finding.links import Links, find_links
 from neurocal_cli.detection.finding.merge import merge_lattices
 from neurocal_cli.detection.finding.overlaps import any_overlap, drop_duplicates, trim_overlaps
 from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
 from neurocal_cli.detection.finding.seeds import find_seeds_2x3, find_seeds_3x3
+from neurocal_cli.detection.finding.straighten import find_bent, refined_locally
 from neurocal_cli.detection.finding.stretch import stretch
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.grid import Grid
@@ -63,10 +65,19 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
         meet at a fold are separate grids. A grid has at least 3 x 3 vertices, because smaller ones
         occur in clutter and no third vertex tests their lines.
     """
-    lattices: list[Lattice] = []
-    saddles: Saddles
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
     levels = levels_of(image)
+    lattices = _find(levels, wanted)
+    if levels and not _nearest_whole(lattices, wanted):
+        bent = _find_bent(levels, lattices, wanted)
+        lattices = drop_duplicates(bent + lattices) if bent else lattices
+    return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
+
+
+def _find(levels: list[Level], wanted: frozenset[Size]) -> list[Lattice]:
+    """Lattices on the finest level of a pyramid."""
+    lattices: list[Lattice] = []
+    saddles: Saddles
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
         lattices = [_to_finer_level(level, x) for x in lattices]
@@ -79,7 +90,25 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
                 lattices = _split_planes(level, lattices)
     if not lattices and levels and levels[0] in small:
         lattices = _split_planes(levels[0], _find_slivers(levels[0], saddles))
-    return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
+    return lattices
+
+
+def _find_bent(levels: list[Level], known: list[Lattice], wanted: frozenset[Size]) -> list[Lattice]:
+    """Lattices that a wide lens bends, larger than the known ones at the same places."""
+    at = next((k for k, level in enumerate(levels) if level.image.size <= _SEARCHED), len(levels) - 1)
+    level = levels[at]
+    saddles = find_saddles(level)
+    if len(saddles) < 9:
+        return []
+    here = [replace(x, pixels=x.pixels / level.scale) for x in known]
+
+    def search(view: NDArray[np.float32]) -> list[Lattice]:
+        return _find(pyramid(view), wanted)
+
+    found = find_bent(level, saddles, find_links(level, saddles), here, search)
+    for finer in reversed(levels[:at]):
+        found = [refined_locally(finer, replace(x, pixels=2 * x.pixels), 2) for x in found]
+    return found
 
 
 def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:
