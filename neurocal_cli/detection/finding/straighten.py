@@ -25,7 +25,7 @@ from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.detection.finding.seeds import whole_blocks
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.medians import median
-from neurocal_cli.detection.wide_lens import WideFit, WideLens, fit_wide_lens
+from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
 from neurocal_cli.geometry import Array
 
 __all__ = ["PlaneView", "find_bent", "refined_locally"]
@@ -116,7 +116,7 @@ def find_bent(
         fit = _fitted(places.astype(float), pixels, level)
         if fit is None:
             continue
-        view = PlaneView.of(fit, places)
+        view = PlaneView.of(fit, places.astype(float))
         for lattice in search(view.seen(level.image)):
             inside = _into_image(lattice, view, level)
             if inside is not None and inside.seen.sum() > max(
@@ -177,7 +177,7 @@ def _into_image(lattice: Lattice, view: PlaneView, level: Level) -> Lattice | No
     pixels = view.back(lattice.pixels)
     room = np.array(level.image.shape[::-1]) - 2
     with np.errstate(invalid="ignore"):
-        inside = ((pixels >= 1) & (pixels <= room)).all(axis=-1)
+        inside = np.asarray(((pixels >= 1) & (pixels <= room)).all(axis=-1))
     if not inside.any():
         return None
     kept = replace(lattice, pixels=pixels).subset(inside)
@@ -185,7 +185,7 @@ def _into_image(lattice: Lattice, view: PlaneView, level: Level) -> Lattice | No
 
 
 def refined_locally(level: Level, lattice: Lattice, most: float) -> Lattice:
-    """The lattice with its vertices at the saddle points within `most` px, smoothed as their own squares allow."""
+    """The lattice with its vertices at saddle points within `most` px, smoothed for squares of any size."""
     row, col, predicted = lattice.predicted
     sigma = np.clip(np.round(_SIGMA * predicted.width / 0.25) * 0.25, 0.75, 2.0)
     pixels = lattice.pixels.copy()
