@@ -24,13 +24,14 @@ from neurocal_cli.detection.fitting.edge_fit import (
 from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
-from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map
+from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of
 from neurocal_cli.detection.fitting.map_selection import select_map
 from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading, square_levels
-from neurocal_cli.detection.fitting.smooth_map import RICHEST_LENS, Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
+from neurocal_cli.detection.fitting.wide_map import wide_start
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 from neurocal_cli.geometry import Array
@@ -42,6 +43,8 @@ Image = NDArray[np.generic]
 # Insensitive: later stages correct the errors of earlier ones.
 _START_SIGMA = 0.3  # px, of the coordinates of the found vertices
 _GOOD_START = 1.3  # chi2 per coordinate of these vertices at which no richer map is tried
+_BENT = 0.25  # displacement by the lens, relative to the distance from its centre, of a strong bend
+_PARAMETER = 2.0  # chi2 that a parameter must be worth, in the choice between two kinds of lenses
 _ANCHOR = 2.0  # px, of these vertices in later maps, which they only keep regular
 _ENOUGH = 60  # edges that need no such anchors
 _MOMENT_SIGMA = 0.05  # px, of offsets from moments
@@ -171,12 +174,30 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     points = grid_image.anchors.value.reshape(2, n).T
     start = homography_start(frame, grid_image.anchors.grid[:n], points)
     found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
+    found = _wide_if_better(grid_image, found, points)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = fit_shading(frame, dark, light)
     noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
     mapped, sigma = _by_moments(grid_image, found, shading)
     first = _first_fit(grid_image, mapped, sigma, shading, noise)
     return _last_fit(grid_image, first)
+
+
+def _wide_if_better(grid_image: GridImage, found: MapFit, points: Array) -> MapFit:
+    """The map of a wide lens where one of slopes bends strongly or does not fit, and the other fits better."""
+    grid = grid_image.anchors.grid[: len(points)]
+    if found.model_index <= found.map.richest_lens and found.map.bend(grid) < _BENT:
+        return found
+    size = grid_image.image.shape[1], grid_image.image.shape[0]
+    start = wide_start(found.map.frame, grid, points, size)
+    if start is None:
+        return found
+    wide = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
+    both = [
+        loss_of(fit.residual / np.sqrt(grid_image.anchors.variance)) + _PARAMETER * len(fit.map.free)
+        for fit in (found, wide)
+    ]
+    return wide if both[1] < both[0] else found
 
 
 def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
@@ -212,7 +233,7 @@ def _first_fit(
         observations,
         mapped.shift,
         least=mapped.model_index,
-        most=max(mapped.model_index, RICHEST_LENS),
+        most=max(mapped.model_index, mapped.map.richest_lens),
     )
     good &= chosen.weight[: len(good)] > 0
     return GridFit(lines, fit, data, chosen, shading, shape, PixelNoise(noise, noise, noise), good)
