@@ -65,7 +65,9 @@ def wide_scene(recipe: WideRecipe, seed: int) -> Scene:
     camera = replace(plain, focal=radius / plain.radius, centre=centre)
     plane = Plane("", recipe.cols, recipe.rows, SQUARE)
     target = Target(plane, recipe.black, recipe.white, bool(rng.integers(2)), margin=Sides.all(0.5))
-    strewn = Background(level=0.4, clutter=CLUTTER_KINDS if recipe.clutter else (), seed=int(rng.integers(2**31)))
+    strewn = Background(
+        level=0.4, clutter=CLUTTER_KINDS if recipe.clutter else (), seed=int(rng.integers(2**31))
+    )
     scene = Scene(
         camera,
         Pose(np.eye(3), np.zeros(3)),
