@@ -33,7 +33,7 @@ from neurocal_cli.detection.fitting.initial_fit import fit_initial
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of
 from neurocal_cli.detection.fitting.map_selection import select_map
 from neurocal_cli.detection.fitting.pixel_box import half_widths
-from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading, square_levels
+from neurocal_cli.detection.fitting.shading import Levels, LocalShading, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
@@ -184,7 +184,7 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     if found.model_index > found.map.richest_lens or _bend(grid_image, found) > _STRONGLY_BENT:
         found = _wide_if_better(grid_image, found, grid_image.anchors, _GOOD_START)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
-    shading = fit_shading(frame, dark, light)
+    shading = _shading_of(found.map, dark, light)
     noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
     mapped, sigma = _by_moments(grid_image, found, shading)
     first = _first_fit(grid_image, mapped, sigma, shading, noise)
@@ -293,6 +293,9 @@ def _fine_fit(
     data = edge_pixels(grid_image.image, lines, sigma, shading, REACH * sigma, 1)
     prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
     offset = first.map.residual[:n] + first.map.shift[0]
+    if isinstance(first.map.map, WideMap):
+        # A fit that went astray in the dark of the rim starts at the map again.
+        offset = np.where(first.map.weight[:n] > 0, offset, first.map.shift[0])
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     data = with_weight(data, noise.weights(light_at(data, start)))
     fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
@@ -367,4 +370,9 @@ def _shading(first: GridFit) -> Shading:
     place = first.lines.middle[good]
     dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
     light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
-    return fit_shading(first.shading.frame, dark, light)
+    return _shading_of(first.map.map, dark, light)
+
+
+def _shading_of(at: SmoothMap, dark: Levels, light: Levels) -> Shading:
+    smooth = fit_shading(at.frame, dark, light)
+    return LocalShading.of(smooth, dark, light) if isinstance(at, WideMap) else smooth

@@ -153,7 +153,7 @@ class SmoothMap:
             rho = (e * (self._metric @ e)).sum(axis=0)
             q += e * (rho * (values[10] + values[11] * rho))
         if self.degree:
-            q += values[_REST:].reshape(2, -1) @ polynomials(self.degree, self.frame, ground[0], ground[1]).T
+            q += values[_REST:].reshape(2, -1) @ polynomials(self.degree, frame, ground[0], ground[1]).T
         return np.asarray(frame.centre + frame.unit * q.T).reshape(grid.shape)
 
     def bend(self, grid: Array) -> float:
