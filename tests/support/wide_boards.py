@@ -147,3 +147,37 @@ def wide_picture(recipe: WideRecipe, seed: int) -> tuple[Scene, Rendered]:
 def truth_of(scene: Scene) -> Array:
     """(rows, cols, 2) vertices of the board [px]."""
     return ground_truth(scene).planes[0].vertices
+
+
+def mixture(seed: int, clutter: float = 0.5) -> tuple[WideRecipe, Scene]:
+    """A random mixture of lenses, boards, poses, light and noise; squares of 8 to 120 px."""
+    rng = np.random.default_rng([seed, 79])
+    laws: tuple[Law, ...] = ("equidistant", "equisolid", "stereographic")
+    for _ in range(50):
+        square = float(np.exp(rng.uniform(np.log(10), np.log(115))))
+        size = (960, 720) if square < 60 else (1280, 960)
+        contrast = float(rng.uniform(0.3, 0.8))
+        black = float(rng.uniform(0.03, 0.95 - contrast))
+        recipe = WideRecipe(
+            field=float(rng.uniform(120, 220)),
+            law=laws[rng.integers(3)],
+            size=size,
+            circle=float(rng.uniform(0.36, 0.6)),
+            cols=int(rng.integers(5, 12)),
+            rows=int(rng.integers(4, 9)),
+            square=square,
+            tilt=55.0,
+            psf=float(rng.uniform(0.5, 1.8)),
+            noise=float(rng.uniform(0.5, 7)),
+            black=black,
+            white=black + contrast,
+            vignetting=float(rng.uniform(0, 0.7)),
+            ring=float(rng.choice([0.0, 0.0, 0.5, 1.0])),
+            clutter=bool(rng.uniform() < clutter),
+            off_centre=float(rng.choice([0.0, 0.05])),
+        )
+        try:
+            return recipe, wide_scene(recipe, int(rng.integers(2**31)))
+        except AssertionError:
+            continue  # a board too large for its image
+    raise AssertionError(f"no scene for the seed {seed}")

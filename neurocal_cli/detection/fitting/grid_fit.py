@@ -49,8 +49,11 @@ Image = NDArray[np.generic]
 # Insensitive: later stages correct the errors of earlier ones.
 _START_SIGMA = 0.3  # px, of the coordinates of the found vertices
 _GOOD_START = 1.3  # chi2 per coordinate of these vertices at which no richer map is tried
-_STRONGLY_BENT, _BENT = 0.25, 0.05  # displacement by the lens, relative to the distance from its centre ...
-_NOT_NOISE = 2.0  # ... the latter with so much more variance than the noise explains: a wide lens is tried
+# Displacement by the lens, relative to the distance from its centre, from which on a wide lens is tried: at
+# once, after the first fit, and there if the residuals are ...
+_STRONGLY_BENT, _BENT, _WEAKLY_BENT = 0.25, 0.15, 0.05
+_UNEVEN = 100.0  # ... below so many variances of the noise
+_NOT_NOISE, _CLEARLY = 2.0, 0.5  # variance over that of the noise which a wide lens may lower, to this share
 _PARAMETER = 2.0  # chi2 that a parameter must be worth, in the choice between two kinds of lenses
 _ANCHOR = 2.0  # px, of these vertices in later maps, which they only keep regular
 _ENOUGH = 60  # edges that need no such anchors
@@ -214,6 +217,14 @@ def _wide_if_better(
     return wide if costs[1] < costs[0] else found
 
 
+def _may_be_wide(bend: float, excess: float) -> bool:
+    """Whether a lens that bends so much can be what is left of the variance.
+
+    A weak bend follows slopes up to hundredths of a pixel, and what is more comes from an uneven board.
+    """
+    return excess > _NOT_NOISE and (bend > _BENT or (bend > _WEAKLY_BENT and excess < _UNEVEN))
+
+
 def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
     """The map through offsets from moments, and the blur [px]."""
     lines = grid_image.lines(found.map)
@@ -249,12 +260,10 @@ def _first_fit(
         least=mapped.model_index,
         most=max(mapped.model_index, mapped.map.richest_lens),
     )
-    if (
-        chosen.excess > _NOT_NOISE
-        and isinstance(chosen.map, WideMap) is False
-        and (_bend(grid_image, chosen) > _BENT)
-    ):
-        chosen = _wide_if_better(grid_image, chosen, observations)
+    if not isinstance(chosen.map, WideMap) and _may_be_wide(_bend(grid_image, chosen), chosen.excess):
+        wide = _wide_if_better(grid_image, chosen, observations)
+        # An uneven board departs from both.
+        chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
     good &= chosen.weight[: len(good)] > 0
     return GridFit(lines, fit, data, chosen, shading, shape, PixelNoise(noise, noise, noise), good)
 
@@ -295,7 +304,7 @@ def _fine_fit(
     offset = first.map.residual[:n] + first.map.shift[0]
     if isinstance(first.map.map, WideMap):
         # A fit that went astray in the dark of the rim starts at the map again.
-        offset = np.where(first.map.weight[:n] > 0, offset, first.map.shift[0])
+        offset = np.where(first.good, offset, first.map.shift[0])
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     data = with_weight(data, noise.weights(light_at(data, start)))
     fit = fit_edges(data, start, prior, half_length, shape, _STEPS)

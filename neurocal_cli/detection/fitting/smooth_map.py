@@ -157,7 +157,7 @@ class SmoothMap:
         return np.asarray(frame.centre + frame.unit * q.T).reshape(grid.shape)
 
     def bend(self, grid: Array) -> float:
-        """Greatest displacement by the lens at grid points (N, 2), relative to the distance from its centre."""
+        """Greatest displacement by the lens at grid points (N, 2), over the distance from its centre."""
         ground = np.column_stack([(grid - self.frame.origin) / self.frame.half, np.ones(len(grid))])
         homogeneous = ground @ self._homography.T
         e = homogeneous[:, :2] / homogeneous[:, 2:] - self.parameters[8:10]
