@@ -28,8 +28,10 @@ from neurocal_cli.detection.medians import median
 from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
 from neurocal_cli.geometry import Array
 
-__all__ = ["PlaneView", "find_bent", "refined_locally"]
+__all__ = ["PlaneView", "any_left", "find_bent", "refined_locally"]
 
+_OWN, _BESIDE = 0.4, 2.0  # squares; nearer saddles are the lattice's own, farther ones not its next line
+_LIKE, _LINE = 0.5, 3  # least contrast relative to the lattice's, and least number of saddles of such a line
 _GROUPS = 3  # of linked saddles that are tried
 _OFF = 0.12  # squares; greatest rms distance of vertices from the fit of the lens ...
 _OUTLIER = 0.3  # ... and greatest distance of a vertex that is not left out of it
@@ -82,6 +84,21 @@ class PlaneView:
         places = self.back(np.stack([u, v], axis=-1)).astype(np.float32)
         view = cv2.remap(image, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
         return np.asarray(view, dtype=np.float32)
+
+
+def any_left(saddles: Saddles, links: Links, known: list[Lattice]) -> bool:
+    """Whether linked saddles belong to no lattice: a block of their own, or a line beside a lattice."""
+    linked = (links.to >= 0).any(axis=1)
+    blocks = np.zeros(len(saddles), dtype=bool)
+    blocks[whole_blocks(links)] = True
+    beside = np.zeros(len(saddles), dtype=bool)
+    for lattice in known:
+        own = lattice.pixels[lattice.seen]
+        away = np.sqrt(((saddles.points[:, None] - own) ** 2).sum(axis=-1).min(axis=1)) / lattice.width
+        like = saddles.contrast > _LIKE * median(lattice.contrast)
+        beside |= linked & like & (away > _OWN) & (away < _BESIDE)
+        blocks &= away > _OWN
+    return bool(blocks.any() or np.count_nonzero(beside) >= _LINE)
 
 
 def find_bent(
