@@ -16,7 +16,7 @@ from typing import Any
 import click
 
 from neurocal_cli import __version__
-from neurocal_cli.commands.streams import one_line, say
+from neurocal_cli.commands.streams import TYPED, one_line, say
 from neurocal_cli.errors import NeurocalError
 
 __all__ = ["neurocal"]
@@ -72,10 +72,16 @@ class _LazyGroup(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, text in self._summaries.items() if text])
 
-    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        """Parse; ``--help`` is shown here."""
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        """Parse, and keep what was typed; ``--help`` is shown here."""
+        words = tuple(args)  # parsing takes them away
         with _one_line_errors():
-            return super().make_context(*args, **kwargs)
+            ctx = super().make_context(info_name, args, parent, **extra)
+        if parent is None:
+            ctx.meta[TYPED] = words
+        return ctx
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command."""

@@ -16,6 +16,7 @@ from neurocal_cli.commands.options import (
     plot_option,
     points_argument,
 )
+from neurocal_cli.commands.pages import html_option, write_page
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
@@ -37,6 +38,7 @@ _NOT_CONVERGED = 3
     "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
 )
 @plot_option("the residuals and the learning curve")
+@html_option
 @lean_option
 @output_option("CAMERA.yaml", "the calibration")
 @click.pass_context
@@ -46,6 +48,7 @@ def calibrate(
     estimation: Estimation,
     camera_name: str,
     plot: str | None,
+    html: str | None,
     lean: bool,
     output: str,
 ) -> None:
@@ -73,7 +76,7 @@ def calibrate(
     Examples:
       neurocal calibrate sample_data/flat.csv -o camera.yaml --camera-name left
       neurocal calibrate sample_data/flat.csv --distortion k1 --no-skew \\
-          --plot errors.png -o camera.yaml
+          --plot errors.png --html report.html -o camera.yaml
       neurocal calibrate sample_data/flat.csv --outliers keep --image-size 640 480 \\
           --lean -o camera.json
       neurocal calibrate sample_data/flat.csv --target free -o camera.yaml
@@ -91,9 +94,11 @@ def calibrate(
     estimation.check()
     check_one_stdin(*points, *estimation.stdin_candidates)
     _check_outputs(output, plot, camera_name)
-    check_outputs((output, plot), (*points, estimation.intrinsics, estimation.extrinsics))
+    inputs = *points, estimation.intrinsics, estimation.extrinsics
+    check_outputs((output, plot, html), inputs)
     calibration = _estimate(points, estimation, camera_name)
     _write(calibration, output, plot, lean)
+    write_page(html, calibration, *inputs)
     _report(calibration)
     if not calibration.converged:
         ctx.exit(_NOT_CONVERGED)

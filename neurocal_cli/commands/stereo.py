@@ -18,6 +18,7 @@ from neurocal_cli.commands.options import (
     output_option,
     plot_option,
 )
+from neurocal_cli.commands.pages import html_option, write_page
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
@@ -76,6 +77,7 @@ _NOT_CONVERGED = 3
     help="Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
 @plot_option("the residuals and the learning curve")
+@html_option
 @lean_option
 @output_option("RIG.yaml", "the rig")
 @click.pass_context
@@ -89,6 +91,7 @@ def stereo(
     alpha: float | None,
     ros: tuple[str, str] | None,
     plot: str | None,
+    html: str | None,
     lean: bool,
     output: str,
 ) -> None:
@@ -114,7 +117,8 @@ def stereo(
     \b
     Examples:
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
-          -o rig.yaml --plot errors.png --ros left.yaml right.yaml --alpha 0
+          -o rig.yaml --plot errors.png --html rig.html --ros left.yaml right.yaml \\
+          --alpha 0
       neurocal calibrate sample_data/stereo_left.csv -o left.yaml
       neurocal calibrate sample_data/stereo_right.csv -o right.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
@@ -136,9 +140,11 @@ def stereo(
     check_one_stdin(left, right, left_intrinsics, right_intrinsics)
     check_plot(plot, output)
     _check_outputs(output, ros)
-    check_outputs((output, plot, *(ros or ())), (left, right, left_intrinsics, right_intrinsics))
+    inputs = left, right, left_intrinsics, right_intrinsics
+    check_outputs((output, plot, html, *(ros or ())), inputs)
     rig = _estimate((left, right), sides, estimation)
     _write(rig, output, alpha, ros, plot, lean)
+    write_page(html, rig, *inputs)
     _report(rig)
     if not rig.converged:
         ctx.exit(_NOT_CONVERGED)

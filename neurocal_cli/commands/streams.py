@@ -9,7 +9,10 @@ import click
 
 from neurocal_cli.errors import UsageError
 
-__all__ = ["check_one_stdin", "is_terminal", "note", "one_line", "say", "warn"]
+__all__ = ["TYPED", "check_one_stdin", "is_terminal", "note", "one_line", "say", "warn"]
+
+
+TYPED = "neurocal.typed"  # where a context keeps the words of the command line
 
 
 def one_line(text: str) -> str:
