@@ -19,7 +19,7 @@ HOMES = {
     "click": ("commands/",),
     "rich": ("commands/",),
     "matplotlib": (
-        "plots.py",
+        "plots/",
         "target_plot.py",
         "simulation/plots.py",
         "planning/plots.py",

@@ -13,17 +13,17 @@ from neurocal_cli.commands.options import (
     INPUT,
     Argument,
     Command,
-    check_plot,
     lean_option,
     output_option,
-    plot_option,
 )
 from neurocal_cli.commands.pages import html_option, write_page
+from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
+from neurocal_cli.plots import RIG_PANELS
 
 if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
@@ -76,7 +76,7 @@ _NOT_CONVERGED = 3
     show_default="none",
     help="Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
-@plot_option("the residuals and the learning curve")
+@panels_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
 @html_option
 @lean_option
 @output_option("RIG.yaml", "the rig")
@@ -90,7 +90,7 @@ def stereo(
     right_intrinsics: str | None,
     alpha: float | None,
     ros: tuple[str, str] | None,
-    plot: str | None,
+    plots: Plots,
     html: str | None,
     lean: bool,
     output: str,
@@ -138,12 +138,12 @@ def stereo(
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
     check_one_stdin(left, right, left_intrinsics, right_intrinsics)
-    check_plot(plot, output)
+    check_plots(plots, output)
     _check_outputs(output, ros)
     inputs = left, right, left_intrinsics, right_intrinsics
-    check_outputs((output, plot, html, *(ros or ())), inputs)
+    check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
     rig = _estimate((left, right), sides, estimation)
-    _write(rig, output, alpha, ros, plot, lean)
+    _write(rig, output, alpha, ros, plots, lean)
     write_page(html, rig, *inputs)
     _report(rig)
     if not rig.converged:
@@ -206,17 +206,17 @@ def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], esti
 
 
 def _write(
-    rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plot: str | None, lean: bool
+    rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plots: Plots, lean: bool
 ) -> None:
-    """Write all files, the picture drawn before any is touched."""
+    """Write all files."""
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.io.rig_yaml import format_ros_pair
     from neurocal_cli.io.writing import write_whole
 
-    if plot is not None:
-        from neurocal_cli.plots import draw_rig
+    if plots:
+        from neurocal_cli.plots.pages import draw_rig
 
-        write_whole(plot, draw_rig(rig, os.path.splitext(plot)[1][1:].lower()))
+        write_plots(plots, lambda kind, panel: draw_rig(rig, kind, panel))
     if ros is not None:
         for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
             write_whole(name, text)
