@@ -18,6 +18,7 @@ from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, wr
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import CAMERA_PANELS
@@ -41,6 +42,7 @@ _NOT_CONVERGED = 3
 )
 @html_option
 @lean_option
+@summary_option
 @output_option("CAMERA.yaml", "the calibration")
 @click.pass_context
 def calibrate(
@@ -51,6 +53,7 @@ def calibrate(
     plots: Plots,
     html: str | None,
     lean: bool,
+    as_json: bool,
     output: str,
 ) -> None:
     """Calibrate a camera from known points and their pixels.
@@ -87,13 +90,15 @@ def calibrate(
           --intrinsics camera.yaml -o poses.yaml
       neurocal calibrate sample_data/flat.csv --type 4 --extrinsics camera.yaml
       neurocal calibrate sample_data/flat.csv --method neuro --starts 40 --seed 1
-      neurocal calibrate sample_data/points.csv --method linear -o linear.yaml
+      neurocal calibrate sample_data/points.csv --method linear --json \\
+          -o linear.yaml
       neurocal calibrate sample_data/points.csv --trainer backprop \\
           --epochs 20000 --rate 0.05 --rate-gamma 0.4
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     estimation.check()
+    check_summary(as_json, output)
     check_one_stdin(*points, *estimation.stdin_candidates)
     _check_outputs(output, plots, camera_name)
     inputs = *points, estimation.intrinsics, estimation.extrinsics
@@ -101,7 +106,7 @@ def calibrate(
     calibration = _estimate(points, estimation, camera_name)
     _write(calibration, output, plots, lean)
     write_page(html, calibration, *inputs)
-    _report(calibration)
+    _report(calibration, as_json)
     if not calibration.converged:
         ctx.exit(_NOT_CONVERGED)
 
@@ -139,8 +144,11 @@ def _write(calibration: Calibration, output: str, plots: Plots, lean: bool) -> N
     warn(write_result(calibration, output, lean=lean))
 
 
-def _report(calibration: Calibration) -> None:
-    from neurocal_cli.report import calibration_report
+def _report(calibration: Calibration, as_json: bool) -> None:
+    from neurocal_cli.report import calibration_json, calibration_report
 
-    say(calibration_report(calibration))
+    if as_json:
+        print_summary(calibration_json(calibration))
+    else:
+        say(calibration_report(calibration))
     warn(calibration.warnings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -11,7 +11,8 @@ from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note, one_line, say, warn
+from neurocal_cli.commands.streams import check_one_stdin, complain, note, one_line, say, warn
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import NeurocalError, UsageError
 
@@ -65,6 +66,7 @@ _SECOND = 2  # images of another size, from which on it is no single one that st
     show_default="the number of cores",
     help="Number of processes that examine images at the same time.",
 )
+@summary_option
 @output_option("POINTS.csv", "the points")
 def detect(
     images: tuple[str, ...],
@@ -77,6 +79,7 @@ def detect(
     gamma: float | None,
     overlay: str | None,
     jobs: int | None,
+    as_json: bool,
     output: str,
 ) -> None:
     """Detect chessboards in images and measure points on them.
@@ -102,9 +105,11 @@ def detect(
           --points vertices --gamma 1 --jobs 2 --overlay overlays \\
           | neurocal calibrate - -o camera.yaml
       echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
-      neurocal detect sample_data/board*.png --board board.yaml -o points.csv
+      neurocal detect sample_data/board*.png --board board.yaml --json \\
+          -o points.csv
     """  # noqa: D301 - as in the group
     check_one_stdin(*images, board)
+    check_summary(as_json, output)
     compute_in_one_thread()
     target = given_board(board, cols, rows, square, unit)
     if target is None:
@@ -112,7 +117,7 @@ def detect(
             "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
         )
     outcomes = _examined(images, target, board, output, points, gamma, overlay, jobs)
-    _report(outcomes, target)
+    _report(outcomes, target, as_json)
     _write(outcomes, target, overlay, output)
 
 
@@ -173,11 +178,11 @@ def _check_overlay(folder: str, paths: Sequence[str]) -> None:
         raise UsageError(f"--overlay {folder} is the folder of the images; give another folder")
 
 
-def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board) -> None:
+def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool) -> None:
     """Say what is wrong with which image, and once what is to be known of several."""
     for _, outcome in outcomes:
         if outcome.problem:
-            say(one_line(outcome.problem))
+            complain(outcome.problem)
     remarks: dict[str, list[str]] = {}
     for name, outcome in outcomes:
         for text in outcome.notes:
@@ -191,11 +196,25 @@ def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board) -> None:
             "the image does not show" if len(outcomes) == 1 else f"none of the {len(outcomes)} images shows"
         )
         raise NeurocalError(f"{what} the board; see the reason above")
+    if as_json:
+        print_summary(_summary(outcomes))
+        return
     say(
         f"board detected in {len(found)} of {len(outcomes)} images: "
         f"{sum(len(detection.ids) for detection in found)} points, "
         f"{sum(detection.rejected for detection in found)} rejected"
     )
+
+
+def _summary(outcomes: Sequence[tuple[str, Outcome]]) -> dict[str, Any]:
+    found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
+    return {
+        "n_images": len(outcomes),
+        "n_points": sum(len(detection.ids) for detection in found.values()),
+        "n_rejected": sum(detection.rejected for detection in found.values()),
+        "views": {name: len(detection.ids) for name, detection in found.items()},
+        "without_board": {name: one_line(outcome.problem) for name, outcome in outcomes if outcome.problem},
+    }
 
 
 def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> list[str]:

@@ -21,6 +21,7 @@ from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, wr
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
@@ -79,6 +80,7 @@ _NOT_CONVERGED = 3
 @panels_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
 @html_option
 @lean_option
+@summary_option
 @output_option("RIG.yaml", "the rig")
 @click.pass_context
 def stereo(
@@ -93,6 +95,7 @@ def stereo(
     plots: Plots,
     html: str | None,
     lean: bool,
+    as_json: bool,
     output: str,
 ) -> None:
     """Calibrate two cameras and the pose of the right one relative to the left one.
@@ -128,12 +131,13 @@ def stereo(
           --no-skew --distortion k1 --outliers keep --target given --image-size 640 480 \\
           --method neuro --starts 40 --seed 1 | neurocal evaluate stereo -
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
-          --type 2 --image-center 319.5 239.5 -o rig.yaml
+          --type 2 --image-center 319.5 239.5 --json -o rig.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --trainer backprop --epochs 20000 --rate 0.05 --rate-gamma 0.4 \\
           -o rig.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
+    check_summary(as_json, output)
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
@@ -145,7 +149,7 @@ def stereo(
     rig = _estimate((left, right), sides, estimation)
     _write(rig, output, alpha, ros, plots, lean)
     write_page(html, rig, *inputs)
-    _report(rig)
+    _report(rig, as_json)
     if not rig.converged:
         ctx.exit(_NOT_CONVERGED)
 
@@ -223,9 +227,12 @@ def _write(
     warn(write_result(rig, output, lean=lean, alpha=alpha))
 
 
-def _report(rig: Rig) -> None:
-    from neurocal_cli.stereo.report import rig_report, views_alone
+def _report(rig: Rig, as_json: bool) -> None:
+    from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
 
     note(views_alone(rig.alone))
-    say(rig_report(rig))
+    if as_json:
+        print_summary(rig_json(rig))
+    else:
+        say(rig_report(rig))
     warn(rig.warnings)
