@@ -31,6 +31,7 @@ HOMES = {
         "detection/",
         "simulation/",
         "io/images.py",
+        "io/video.py",
         "io/board_pictures.py",
         "distortion/remapping.py",
     ),

@@ -22,6 +22,7 @@ __all__ = [
     "MOST_PIXELS",
     "Image",
     "Picture",
+    "captured_stderr",
     "encode_image",
     "encode_png",
     "parse_image",
@@ -226,7 +227,7 @@ def encode_image(
 
 def _decoded(data: bytes, header: Header, source: str, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Pixels of a file that looks whole; the decoder's complaints stay off the user's screen."""
-    with _captured_stderr() as complaints:
+    with captured_stderr() as complaints:
         try:
             pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
         except cv2.error:
@@ -254,7 +255,7 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> NDArray[np
 
 
 @contextmanager
-def _captured_stderr() -> Iterator[list[str]]:
+def captured_stderr() -> Iterator[list[str]]:
     """Catch what the C libraries below OpenCV write to stderr, past Python; yields its lines."""
     lines: list[str] = []
     with _ONE_AT_A_TIME, tempfile.TemporaryFile() as file:
