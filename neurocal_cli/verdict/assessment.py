@@ -32,6 +32,7 @@ from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.distortion.similar_lens import farthest_angle
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covariance
@@ -239,6 +240,12 @@ class _AtMinimum:
             return None
         view = self.points.view_index
         depth = (self.given.R[view, 2] * self.points.world).sum(axis=1) + self.given.t[view, 2]
+        angle = None
+        if self.camera.distortion.wide:  # depths behind 90 degrees are none
+            angle = farthest_angle(self.views, self.state)
+            depth = np.linalg.norm(
+                (self.given.R[view] @ self.points.world[..., None])[..., 0] + self.given.t[view], axis=1
+            )
         depths = np.array([depth.min(), median(depth), depth.max(), _DISTANT * depth.max()])
         state, camera, normal, free = self.state, self.camera, self.normal, self.free
         shared = self.covariance
@@ -253,7 +260,7 @@ class _AtMinimum:
             camera = replace(camera, distortion=Distortion(richer.model, richer.k))
         return projection_uncertainty(
             self.views, state, camera, normal, free, self.free_poses, self.cost / self.spare,
-            image_grid(self.points.image_size), depths, shared,
+            image_grid(self.points.image_size), depths, shared, angle,
         )  # fmt: skip
 
 
