@@ -379,7 +379,7 @@ class _Work:
                 shape, "another --fov or --size"
             )
             name = f"a {shape}" if shape != "equirectangular" else "the picture"
-            say(f"{name} shows {' and '.join(parts)} that the images see; {more} shows more")
+            say(f"{name} shows {' and '.join(parts)} that the images span; {more} shows more")
 
     def write_camera(self, path: str) -> None:
         """Write the camera of what was corrected."""
