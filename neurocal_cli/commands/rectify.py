@@ -236,7 +236,13 @@ class _Work:
         moved = []
         for side, (path,) in enumerate(sides):
             notes: list[str] = []
-            moved.append(rectify_points(self.pair, side, read_points(path, notes=notes)))
+            points = read_points(path, notes=notes)
+            moved.append(rectify_points(self.pair, side, points))
+            if len(moved[-1]) < len(points):
+                notes.append(
+                    f"{points.source}: {len(points) - len(moved[-1])} of {len(points)} points are left out, "
+                    "which are 90 degrees from the rectified camera's axis or more"
+                )
             note(notes)
         for name, (path,), points in zip(_SIDES, sides, moved, strict=True):
             self._write(os.path.join(name, os.path.basename(path)), format_points(points))

@@ -71,6 +71,8 @@ def camera_from_tree(root: Field, side: str = "", whole: bool = True) -> Camera:
     InputError, FormatError
         No camera matrix, or one that is none; a distortion that cannot be read.
     """
+    if "projection" in root and "f" in root:
+        raise InputError("is the file of an undistorted panorama; give the camera of the original images")
     intrinsics = _intrinsics(root, side)
     model, coefficients = _distortion(root, side, whole)
     name = next((root[key].text() for key in _ended(("camera_name",), side) if key in root), "camera")

@@ -1,0 +1,63 @@
+"""Cameras of each wide model that see 90 degrees from the axis and more, and the models' plain formulas."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.geometry import Array
+
+SIZE = (1000, 800)
+# The scale, which xi enters, and the coefficients; all show 95 degrees within 500 px.
+WIDE_LENSES: dict[str, tuple[float, list[float]]] = {
+    "fisheye": (293.0, [0.02, -0.01, 0.004, -0.001]),
+    "omnidir": (530.0, [1.2, -0.02, 0.01, 1e-3, -5e-4]),
+    "double_sphere": (250.0, [-0.1, 0.58]),
+    "eucm": (280.0, [0.62, 1.1]),
+}
+
+
+def wide_camera(model: str, skew: float = 0.0, name: str = "camera") -> Camera:
+    f, k = WIDE_LENSES[model]
+    A = np.array([[f, skew, 503.2], [0.0, 1.01 * f, 396.7], [0.0, 0.0, 1.0]])
+    return Camera(Intrinsics.from_matrix(A), Distortion(model, np.array(k)), SIZE, name)
+
+
+def wide_points(n: int = 100, farthest: float = 95.0, seed: int = 0) -> Array:
+    """(n, 3) points in directions up to an angle [degrees] from the axis, at 0.5 to 5 units."""
+    rng = np.random.default_rng(seed)
+    theta, around = np.radians(rng.uniform(0.5, farthest, n)), rng.uniform(0, 2 * np.pi, n)
+    rays = np.column_stack([np.sin(theta) * np.cos(around), np.sin(theta) * np.sin(around), np.cos(theta)])
+    return rays * rng.uniform(0.5, 5, n)[:, None]
+
+
+def plainly_projected(model: str, k: list[float], A: Array, points: Array) -> Array:
+    """Pixels by the formulas of the papers, a point at a time."""
+    return np.array([_projected(model, k, A, *point) for point in points.tolist()])
+
+
+def _projected(model: str, k: list[float], A: Array, X: float, Y: float, Z: float) -> Array:
+    d = np.sqrt(X**2 + Y**2 + Z**2)
+    if model == "fisheye":
+        r = np.hypot(X, Y)
+        theta = np.arctan2(r, Z)
+        bent = theta + k[0] * theta**3 + k[1] * theta**5 + k[2] * theta**7 + k[3] * theta**9
+        x, y = bent * X / r, bent * Y / r
+    elif model == "omnidir":  # as in OpenCV's omnidir::projectPoints
+        x, y = X / d / (Z / d + k[0]), Y / d / (Z / d + k[0])
+        r2 = x**2 + y**2
+        radial = 1 + k[1] * r2 + k[2] * r2**2
+        x, y = (
+            x * radial + 2 * k[3] * x * y + k[4] * (r2 + 2 * x**2),
+            y * radial + k[3] * (r2 + 2 * y**2) + 2 * k[4] * x * y,
+        )
+    elif model == "double_sphere":
+        shifted = Z + k[0] * d
+        w = k[1] * np.sqrt(X**2 + Y**2 + shifted**2) + (1 - k[1]) * shifted
+        x, y = X / w, Y / w
+    else:
+        w = k[0] * np.sqrt(k[1] * (X**2 + Y**2) + Z**2) + (1 - k[0]) * Z
+        x, y = X / w, Y / w
+    return np.asarray((A @ [x, y, 1.0])[:2])
