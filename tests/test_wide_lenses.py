@@ -68,7 +68,10 @@ def test_given_poses_with_points_behind_need_a_wide_lens() -> None:
         found(scene, "k1", type=4, extrinsics=scene.poses)
 
 
-@pytest.mark.parametrize(("model", "distortion", "field"), [("eucm", "eucm", 190), ("fisheye", "auto", 200)])
+@pytest.mark.parametrize(
+    ("model", "distortion", "field"),
+    [("eucm", "eucm", 190), pytest.param("fisheye", "auto", 200, marks=pytest.mark.slow)],
+)
 def test_wrong_points_are_found_and_no_view_is_lost(model: str, distortion: str, field: float) -> None:
     scene = wide_set(15, model, field, n_views=10, sigma=0.1)
     rng = np.random.default_rng(0)
