@@ -18,9 +18,8 @@ from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.stereo.triangulation import METHODS, triangulate
 
 every_wide_model = pytest.mark.parametrize("model", list(WIDE))
-AT_THE_MINIMUM = (
-    1.003  # times the error that is reached from the truth: an image that must grow to its corners
-)
+# Times the error that is reached from the truth: an image that has to grow up to its corners costs a little.
+AT_THE_MINIMUM = 1.003
 
 
 def found(scene: WideScene, distortion: str = "", **given: object) -> Calibration:
