@@ -38,6 +38,11 @@ class WideLens:
     focal: float
     centre: Array
 
+    def angles(self, pixels: Array) -> Array:
+        """Angles (...) from the axis at which pixels (..., 2) see [rad]."""
+        away = pixels - self.centre
+        return np.asarray(np.hypot(away[..., 0], away[..., 1]) / self.focal)
+
     def rays(self, pixels: Array) -> Array:
         """Unit vectors (..., 3) that pixels (..., 2) see; z is the axis."""
         away = pixels - self.centre
