@@ -18,8 +18,8 @@ __all__ = ["WideFit", "WideLens", "fit_wide_lens"]
 
 # Angle of the outermost vertex from the axis, where the search for a focal length begins [rad].
 _ANGLES = np.geomspace(0.12, 2.1, 16)
-_STEPS = 8  # Gauss-Newton steps from there, at most
-_SMALL = 1e-4  # relative change for derivatives, and of the focal length at which steps end
+_STEPS = 15  # Levenberg-Marquardt steps from there, at most
+_SMALL = 1e-4  # relative change for derivatives, and at which steps end
 _CENTRE = 0.1  # half diagonals; prior standard deviation of the centre ...
 _SQUARE = 0.05  # ... at which deviations of so many squares are believed
 _FARTHEST = 3.0  # rad; no lens sees farther
@@ -37,6 +37,11 @@ class WideLens:
 
     focal: float
     centre: Array
+
+    def angles(self, pixels: Array) -> Array:
+        """Angles (...) from the axis at which pixels (..., 2) see [rad]."""
+        away = pixels - self.centre
+        return np.asarray(np.hypot(away[..., 0], away[..., 1]) / self.focal)
 
     def rays(self, pixels: Array) -> Array:
         """Unit vectors (..., 3) that pixels (..., 2) see; z is the axis."""
@@ -103,20 +108,27 @@ def fit_wide_lens(grid: Array, pixels: Array, size: tuple[int, int]) -> WideFit:
     # In units of the vertices' errors, and of the centre's.
     square = _SQUARE * float(np.sqrt(np.ptp(pixels, axis=0).prod() / np.maximum(high - low, 1.0).prod()))
     prior = square / (_CENTRE * half)
+    change = np.array([best[0], half, half]) * _SMALL
+
+    def cost(error: Array, lens: Array) -> float:
+        return float((error**2).sum() + (prior**2 * (lens[1:] - middle) ** 2).sum())
+
+    damping = 0.0
     for _ in range(_STEPS):
-        change = np.array([best[0], half, half]) * _SMALL
-        tried = np.vstack([best, best + np.diag(change)])
-        error = _errors(tried, scaled, pixels)[1]
+        error = _errors(np.vstack([best, best + np.diag(change)]), scaled, pixels)[1]
         slopes = (error[1:] - error[0]).T / change
-        slopes = np.vstack([slopes, np.column_stack([np.zeros(2), prior * np.eye(2)])])
-        right = np.concatenate([error[0], prior * (best[1:] - middle)])
-        step = -np.linalg.lstsq(slopes, right, rcond=None)[0]
-        step[0] = np.clip(step[0], -0.3 * best[0], 0.5 * best[0])
-        ahead = best + step
-        if not (_errors(ahead[None], scaled, pixels)[1] ** 2).sum() < (error[0] ** 2).sum():
+        normal = slopes.T @ slopes + np.diag([0.0, prior**2, prior**2])
+        gradient = slopes.T @ error[0] + prior**2 * np.concatenate([[0.0], best[1:] - middle])
+        if not np.isfinite(normal).all():
             break
-        best = ahead
-        if abs(step[0]) < _SMALL * best[0]:
+        normal.ravel()[::4] *= 1 + damping
+        step = -np.linalg.solve(normal, gradient)
+        step[0] = np.clip(step[0], -0.3 * best[0], 0.5 * best[0])
+        if not cost(_errors((best + step)[None], scaled, pixels)[1][0], best + step) < cost(error[0], best):
+            damping = max(10 * damping, 0.1)
+            continue
+        best, damping = best + step, 0.1 * damping
+        if np.abs(step / change).max() < 1:
             break
     matrices, errors = _errors(best[None], scaled, pixels)
     shrink = np.array([[scale[0], 0, 0], [0, scale[1], 0], [0, 0, 1.0]])

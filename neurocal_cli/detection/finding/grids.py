@@ -42,6 +42,7 @@ _SEARCHED = 1.4e6
 _MOST_SEARCHED = 30_000_000
 # Insensitive; they bound the time: tests/benchmarks/test_detection_speed.py, "clutter only".
 _TRIES, _TRIES_2X3 = 8, 4  # seeds of a level that may fail; bounds the time where there is no board
+_UNFINISHED = 0.4  # least share of the wanted vertices in a lattice that a wide lens may have cut short
 _BEHIND = 3.0  # ratio of the squares' sizes from which on a second board is not searched
 
 Size = tuple[int, int]
@@ -111,7 +112,9 @@ def _find_bent(
     Saddles are those besides lattices of so many masked vertices.
     """
     lost = masked > sum(int(x.seen.sum()) for x in known)
-    if not (lost or any_left(saddles, links, known)):
+    least = _UNFINISHED * min((cols * rows for cols, rows in wanted), default=np.inf)
+    unfinished = [x for x in known if x.seen.sum() >= least]
+    if not (lost or unfinished or any_left(saddles, links, known)):
         return known, []
     if masked:
         saddles = find_saddles(level)
@@ -120,7 +123,7 @@ def _find_bent(
     def search(view: NDArray[np.float32]) -> list[Lattice]:
         return _find(pyramid(view), wanted, straight=True)
 
-    found = find_bent(level, saddles, links, known, search)
+    found = find_bent(level, saddles, links, known, unfinished, search)
     left = drop_duplicates(found + known) if found else known
     bent = [x for x in left if any(x is y for y in found)]
     return [x for x in left if not any(x is y for y in bent)], bent

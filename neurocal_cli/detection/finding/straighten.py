@@ -36,6 +36,7 @@ _GROUPS = 3  # of linked saddles that are tried
 _OFF = 0.12  # squares; greatest rms distance of vertices from the fit of the lens ...
 _OUTLIER = 0.3  # ... and greatest distance of a vertex that is not left out of it
 _ROUNDS = 3  # of leaving such vertices out
+_WIDE = 0.5  # rad; least angle from the axis at which a lens may be why a lattice is not finished
 _MORE = 1.1  # least ratio of a group to the known vertices in it, to be searched again
 _AROUND, _LEAST_AROUND = 0.75, 4.0  # of the group's extent, and squares, that the view shows around it
 _SQUARE = 24.0  # px; a square of the view ...
@@ -106,9 +107,10 @@ def find_bent(
     saddles: Saddles,
     links: Links,
     known: list[Lattice],
+    unfinished: list[Lattice],
     search: Callable[[NDArray[np.float32]], list[Lattice]],
 ) -> list[Lattice]:
-    """Search again where more saddles are linked than lattices hold.
+    """Search again where more saddles are linked than lattices hold, and around unfinished lattices.
 
     Parameters
     ----------
@@ -117,6 +119,8 @@ def find_bent(
         Of the whole level, those of known lattices too.
     links : Links
     known : list of Lattice
+    unfinished : list of Lattice
+        Those known ones that are smaller than the board.
     search : function of an image
         Finds its lattices.
 
@@ -126,12 +130,13 @@ def find_bent(
         Each larger than the known ones at the same place.
     """
     found: list[Lattice] = []
-    for places, members in _groups(saddles, links):
-        pixels = saddles.points[members]
-        if len(members) < _MORE * max((_shared(x, pixels) for x in (*known, *found)), default=0):
+    groups = [(places, saddles.points[members], _MORE, 0.0) for places, members in _groups(saddles, links)]
+    groups += [(np.argwhere(x.seen)[:, ::-1], x.pixels[x.seen], 1.0, _WIDE) for x in unfinished]
+    for places, pixels, more, wide in groups:
+        if len(pixels) < more * max((_shared(x, pixels) for x in (*known, *found)), default=0):
             continue
         fit = _fitted(places.astype(float), pixels, level)
-        if fit is None:
+        if fit is None or fit.lens.angles(pixels).max() < wide:
             continue
         view = PlaneView.of(fit, places.astype(float))
         for lattice in search(view.seen(level.image)):

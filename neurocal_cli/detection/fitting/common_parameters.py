@@ -142,6 +142,7 @@ def profile_shape(
     rest = slice(1, RESPONSE_TERMS + 7)
     normal, right = products[rest, rest], products[rest, 0]
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
+    normal[np.diag_indices_from(normal)] += _TINY  # no edge may be good
     # Blur, contrast, tails and the odd terms of the response are strongly correlated.
     believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _RESPONSE)]) ** -2
     known = np.concatenate([shape.tails.mean(axis=0), shape.nonlinearity])
