@@ -251,5 +251,5 @@ def _origin(likely: str, origin: Origin, facts: Mapping[str, str]) -> str:
     entries |= facts
     if origin.versions:
         entries["versions"] = ", ".join(f"{name} {number}" for name, number in origin.versions.items())
-    hashes = [["file", "SHA-256"], *([printable(name), digest] for name, digest in origin.files.items())]
-    return definitions(entries) + (table(hashes) if len(hashes) > 1 else "")
+    entries |= {f"SHA-256 of {printable(name)}": digest for name, digest in origin.files.items()}
+    return definitions(entries)
