@@ -154,5 +154,5 @@ def _pixels(near: NearestCamera) -> str:
     if at is not None:
         text += f", by {at.rms_px:.3g} px rms and {at.max_px:.3g} px at most where points were seen"
     if near.lost > _NO_LOSS:
-        text += f", and does not show {100 * near.lost:.0f} % of it"
+        text += f", and it does not show {100 * near.lost:.0f} % of the image"
     return text
