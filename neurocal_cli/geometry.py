@@ -28,6 +28,7 @@ __all__ = [
     "nearest_similarity",
     "orthonormalised",
     "rotation_step",
+    "rotation_to_axis",
     "rotation_to_euler",
     "rotation_vector",
     "rq",
@@ -153,6 +154,20 @@ def rotation_vector(R: Array) -> Array:
     sine = np.linalg.norm(sines, axis=-1)
     angle = np.arctan2(sine, 0.5 * (np.trace(R, axis1=-2, axis2=-1) - 1.0))
     return np.asarray(sines * np.where(sine > 0, angle / np.where(sine > 0, sine, 1.0), 1.0)[..., None])
+
+
+def rotation_to_axis(directions: Array) -> Array:
+    """Smallest rotations (V, 3, 3) that turn unit vectors (V, 3) to the z axis.
+
+    With v = d x z, R = I + [v]_x + [v]_x^2 / (1 + d_z); half a turn about x for the opposite direction.
+    """
+    directions = np.asarray(directions, dtype=float)
+    v = np.column_stack([directions[:, 1], -directions[:, 0], np.zeros(len(directions))])
+    opposite = directions[:, 2] < -1 + 1e-12
+    K = cross_matrix(v)
+    R = np.eye(3) + K + K @ K / np.where(opposite, 1.0, 1.0 + directions[:, 2])[:, None, None]
+    R[opposite] = np.diag([1.0, -1.0, -1.0])
+    return np.asarray(R)
 
 
 def orthonormalised(R: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
@@ -42,4 +42,4 @@ def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]
     distortion = problem.distortion
     if distortion.model == "none" or problem.free_distortion:
         return problem, state
-    return problem.with_seen_pixels(), replace(state, model=distortion.model, k=distortion.coefficients)
+    return problem.as_seen(state)

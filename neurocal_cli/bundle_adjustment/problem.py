@@ -15,15 +15,17 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.adjust import Adjusted, Restraint, adjust
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
 from neurocal_cli.bundle_adjustment.views import Views, arrange
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
-from neurocal_cli.camera.projection import undistorted_pixels
+from neurocal_cli.camera.projection import image_points, undistorted_pixels
 from neurocal_cli.errors import InputError, UsageError
-from neurocal_cli.geometry import Array
+from neurocal_cli.geometry import Array, rotation_to_axis
 from neurocal_cli.points import Correspondences
 
 __all__ = ["Problem", "intrinsic_matrix", "problem_for"]
 
+_LEAST_DEPTH = 0.1  # of a ray: 84 degrees from a view's middle
 _LARGEST = 1e9  # px; no image is larger
 _MAX_ITERATIONS = 200
 
@@ -55,6 +57,9 @@ class Problem:
         Whether the other coefficients are estimated.
     restraint : callable, optional
         What the distortion has to obey beside the points.
+    turned : (V, 3, 3) array, optional
+        With a given wide lens taken off, the pinhole of each view looks at its target: rotations from the
+        camera's frame to that pinhole's. Until `with_seen_pixels`.
     """
 
     points: Correspondences
@@ -68,6 +73,7 @@ class Problem:
     distortion: Distortion
     free_distortion: bool
     restraint: Restraint | None = None
+    turned: Array | None = None
 
     @property
     def free_camera(self) -> NDArray[np.bool_]:
@@ -116,7 +122,11 @@ class Problem:
         DegenerateGeometryError
             All pixels coincide.
         """
-        return replace(self, points=points, views=_arranged(points, self), restraint=None)
+        if self.free_distortion:
+            views, turned = arrange(points), None
+        else:
+            views, turned = _undistorted_views(points, self.distortion, self.entries)
+        return replace(self, points=points, views=views, turned=turned, restraint=None)
 
     def with_model(self, model: str) -> Problem:
         """The same points with another distortion model to be estimated."""
@@ -131,7 +141,15 @@ class Problem:
         views = self.views
         order = slice(None) if views.order is None else views.order
         pixels = (self.points.pixels[order] - views.pixel_centre) / views.pixel_scale
-        return replace(self, views=replace(views, pixels=pixels))
+        return replace(self, views=replace(views, pixels=pixels), turned=None)
+
+    def as_seen(self, state: CameraState) -> tuple[Problem, CameraState]:
+        """A given distortion put back, which was taken off the pixels for what knows a pinhole only."""
+        state = replace(state, model=self.distortion.model, k=self.distortion.coefficients)
+        if self.turned is not None:
+            back = np.swapaxes(self.turned, 1, 2)
+            state = replace(state, R=back @ state.R, t=(back @ state.t[..., None])[..., 0])
+        return self.with_seen_pixels(), state
 
     def adjust(self, start: CameraState | Adjusted, max_iterations: int = _MAX_ITERATIONS) -> Adjusted:
         """Minimise the reprojection error (3) from a state; see `adjust`.
@@ -222,23 +240,24 @@ def problem_for(
     free_distortion = type != 3 and distortion.model != "none"
     if type == 3:
         fixed |= set(coefficient_names(distortion.model))
+    views, turned = arrange(points), None
+    if not free_distortion:
+        views, turned = _undistorted_views(points, distortion, entries)
     given = type, entries, free, poses, frozenset(fixed), intrinsics, distortion, free_distortion
-    return Problem(
-        points, arrange(points if free_distortion else _undistorted(points, distortion, entries)), *given
-    )
+    return Problem(points, views, *given, turned=turned)
 
 
-def _arranged(points: Correspondences, problem: Problem) -> Views:
-    if problem.free_distortion:
-        return arrange(points)
-    return arrange(_undistorted(points, problem.distortion, problem.entries))
-
-
-def _undistorted(points: Correspondences, distortion: Distortion, entries: Array) -> Correspondences:
-    """Points without a given distortion."""
+def _undistorted_views(
+    points: Correspondences, distortion: Distortion, entries: Array
+) -> tuple[Views, Array | None]:
+    """Views of points without a given distortion, and how the pinhole of each is turned."""
     if distortion.is_identity:
-        return points
-    pixels = undistorted_pixels(distortion, intrinsic_matrix(entries), points.pixels)
+        return arrange(points), None
+    A, turned = intrinsic_matrix(entries), None
+    if distortion.wide:
+        pixels, turned = _turned_pixels(points, Camera(Intrinsics.from_matrix(A), distortion))
+    else:
+        pixels = undistorted_pixels(distortion, A, points.pixels)
     lost = ~np.isfinite(pixels[:, 0])
     if lost.any():
         row = int(np.argmax(lost))
@@ -247,7 +266,24 @@ def _undistorted(points: Correspondences, distortion: Distortion, entries: Array
             f"{points.place(row)}: the given distortion maps nothing to the pixel ({u:g}, {v:g}); "
             "check that the camera belongs to these images"
         )
-    return replace(points, pixels=pixels)
+    return arrange(replace(points, pixels=pixels)), turned
+
+
+def _turned_pixels(points: Correspondences, camera: Camera) -> tuple[Array, Array]:
+    """Pixels (N, 2) of pinholes that look at the middle of each view's rays, and their rotations (V, 3, 3).
+
+    A target may be seen far beyond 90 degrees from the axis, but it is seen within a cone of less.
+    """
+    rays, index = camera.unproject(points.pixels), points.view_index
+    sums = np.zeros((points.n_views, 3))
+    np.add.at(sums, index, np.nan_to_num(rays))
+    forward = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
+    forward[~sums.any(axis=1)] = 0.0, 0.0, 1.0
+    turned = rotation_to_axis(forward)
+    X, Y, Z = (turned[index] @ rays[..., None])[..., 0].T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.where(Z > _LEAST_DEPTH, Z, np.nan)
+        return np.column_stack(image_points(camera.entries, "none", (), X / depth, Y / depth)), turned
 
 
 def _centre(points: Correspondences, image_center: tuple[float, float] | None) -> Array:

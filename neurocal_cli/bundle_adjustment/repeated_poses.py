@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.projection import project_points
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import folds_of
 
@@ -97,18 +99,18 @@ def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedP
 
 
 def _seen(views: Views, state: CameraState) -> Array:
-    """Where each view's pose puts five places of the target, distortion aside; (V, 10)."""
+    """Where each view's pose puts five places of the target; (V, 10). Only a wide lens is distorted."""
     centre = np.average(views.centre, axis=0, weights=views.counts)
     reach = views.scale[0] * views.extent[0, :2] * views.basis[0][:, :2]  # columns
     places = centre + np.concatenate([np.zeros((1, 3)), reach.T, -reach.T])
     local = (places - views.centre[:, None]) / views.scale[:, None, None]
     X, Y, Z = np.moveaxis(local @ np.swapaxes(state.R, 1, 2) + state.t[:, None], 2, 0)
-    a11, a12, a22, a13, a23 = state.entries.T[..., None]
+    model, k = (state.model, state.k) if state.model in WIDE else ("none", np.zeros(0))
     with np.errstate(divide="ignore", invalid="ignore"):
-        x, y = X / Z, Y / Z
-        seen = np.concatenate([a11 * x + a12 * y + a13, a22 * y + a23], axis=1)
-    behind = np.asarray((Z <= 0).any(axis=1) | ~np.isfinite(seen).all(axis=1))
-    return np.where(behind[:, None], np.inf, seen)
+        u, v, in_front = project_points(state.entries.T[..., None], model, k, X, Y, Z)
+        seen = np.concatenate([u, v], axis=1)
+    lost = np.asarray(~in_front.all(axis=1) | ~np.isfinite(seen).all(axis=1))
+    return np.where(lost[:, None], np.inf, seen)
 
 
 def _by_distance(seen: Array, near: float) -> NDArray[np.intp]:

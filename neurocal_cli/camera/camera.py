@@ -165,7 +165,7 @@ class Camera:
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     def seen_points(self, pixels: Array) -> Array:
-        """Points that pixels (..., 2) see: at depth 1, or of a wide lens, for which there is none, at distance 1.
+        """Points that pixels (..., 2) see, at depth 1; of a wide lens, at distance 1.
 
         ``nan`` where the camera cannot see anything.
         """

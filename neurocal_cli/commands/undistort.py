@@ -13,7 +13,7 @@ import click
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, is_terminal, note, one_line, say
+from neurocal_cli.commands.streams import check_one_stdin, complain, is_terminal, note, say
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
@@ -247,7 +247,7 @@ def _correct_all(work: _Work, paths: Sequence[str], outputs: Sequence[str]) -> i
                 work.correct(path, output)
                 done += 1
             except (InputError, FormatError) as error:
-                say(one_line(str(error)))
+                complain(str(error))
             progress(f"{number} of {len(paths)} files", number / len(paths))
     if not done:
         raise NeurocalError(f"none of the {len(paths)} files could be undistorted; see the reasons above")

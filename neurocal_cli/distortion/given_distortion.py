@@ -31,8 +31,7 @@ def check_distortion(solution: Solution) -> Solution:
     if distortion.model == "none":
         return solution
     if not problem.free_distortion:
-        problem = problem.with_seen_pixels()
-        start = replace(solution.state, model=distortion.model, k=distortion.coefficients)
+        problem, start = problem.as_seen(solution.state)
         adjusted = problem.adjust(replace(solution.adjusted, state=start))
         solution = replace(solution, problem=problem, adjusted=adjusted)
     state = solution.state

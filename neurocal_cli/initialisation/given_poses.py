@@ -18,6 +18,10 @@ from neurocal_cli.training.starts import FixedWeights, learn
 
 __all__ = ["solve_given_poses"]
 
+# With a wide lens: the depth of a point that trains the network, as a share of its distance (60 degrees from
+# the axis), and the fewest of them.
+_LEAST_DEPTH, _FEWEST = 0.5, 12
+
 
 def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generator) -> Solution:
     """Train the five weights of W, then minimise the reprojection error.
@@ -29,7 +33,9 @@ def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generat
     """
     views = problem.views
     R, t = _normalised_poses(problem)
-    _check_in_front(views, R, t)
+    wide = problem.distortion.wide
+    if not wide:
+        _check_in_front(views, R, t)
     rows = views.patterns(np.arange(views.n_views), False, options.finish_points, rng)
     # Hidden outputs Y = V Z, eq. (6): the camera's coordinates.
     hidden = rows.inputs @ np.swapaxes(np.concatenate([R, t[..., None]], axis=2), 1, 2)
@@ -37,6 +43,14 @@ def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generat
     # "with appropriate scaling if necessary".
     real = rows.weights > 0
     depth = np.where(real, hidden[..., 2], np.nan)
+    if wide:  # the network, a pinhole, learns from what is well in front
+        real &= depth > _LEAST_DEPTH * np.linalg.norm(hidden, axis=2)
+        if real.sum() < _FEWEST:
+            raise DegenerateGeometryError(
+                "the given poses put nearly all points beside or behind the camera; they must map world to "
+                "camera, Xc = R M + t, z forward"
+            )
+        depth = np.linalg.norm(hidden, axis=2)
     hidden = hidden / np.nanmean(depth, axis=1)[:, None, None]
     patterns = Patterns(hidden[real][None], rows.targets[real][None], rows.weights[real][None])
     given = problem.normalised_entries
@@ -70,7 +84,8 @@ def _check_in_front(views: Views, R: Array, t: Array) -> None:
     if behind.any():
         raise DegenerateGeometryError(
             f"the given pose of view {views.names[int(np.argmax(behind))]!r} puts points behind the camera; "
-            "it must map world to camera, Xc = R M + t, z forward"
+            "it must map world to camera, Xc = R M + t, z forward; a lens that sees 90 degrees from its axis "
+            "and more needs --distortion fisheye"
         )
 
 

@@ -72,6 +72,8 @@ def fit_again(
     if options.distortion == "plumb-line":
         return _plumb_line_first(solution.problem.with_points(points), options)
     problem = solution.problem.with_points(points)
+    if not problem.free_distortion:
+        problem = problem.with_seen_pixels()
     place = [solution.problem.views.names.index(name) for name in problem.views.names]
     known, record = solution.in_pixels, solution.record
     start = normalised(replace(known, R=known.R[place], t=known.t[place]), problem.views)

@@ -26,13 +26,13 @@ from neurocal_cli.bundle_adjustment.outlier_views import find_outlier_view
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.bundle_adjustment.views import arrange
+from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.consensus import find_consensus, find_consensus_through_wide_lens
+from neurocal_cli.initialisation.consensus import Consensus, find_consensus, find_consensus_through_wide_lens
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.initialisation.radial_networks import middle_of_image
 from neurocal_cli.median import median
@@ -54,6 +54,8 @@ _PASSES = 12
 _NO_WORSE = 1.05  # times the rms error with a view that is taken back
 _MAJORITY = 0.5  # share of the points that must be left
 _ORDINARY = 6.0  # times the median error: the points that tell whether stated sigmas hold
+_LOOKS = 2  # through a wide lens: the first may still be drawn away by wrong points
+_BACKWARDS = (0.0, 0.0, -1.0)  # the ray of a pixel at which the lens shows nothing
 _LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 
 
@@ -94,17 +96,17 @@ class _Search:
         return fit(self.problem.with_points(self.points.select(kept)), options)
 
     def agree(self, first: Solution | None, failure: DegenerateGeometryError | None) -> None:
-        """Points that each view's network agrees on."""
+        """Points that each view's network agrees on.
+
+        A wide lens bends boards by more than wrong points do: once it is known, points are looked at again.
+        """
         views = arrange(self.points)
         rng = np.random.default_rng(self.options.seed)
         consensus = find_consensus(views, views.nearly_flat, rng)
         if consensus.hopeless.any() and self._may_be_wide():
             middle = (middle_of_image(self.problem) - views.pixel_centre) / views.pixel_scale
             consensus = find_consensus_through_wide_lens(consensus, views, views.nearly_flat, middle, rng)
-        order = slice(None) if views.order is None else views.order
-        self.kept[order] = consensus.kept
-        for view in np.flatnonzero(consensus.hopeless):
-            self._drop(views.names[view], "its pixels do not match its points")
+        self._keep(views, consensus)
         if self.kept.all():
             if first is None:
                 assert failure is not None
@@ -118,6 +120,29 @@ class _Search:
             if failure is not None:
                 raise failure from None
             raise
+        for _ in range(_LOOKS):
+            if not self.solution.state.distortion.wide:
+                break
+            again = find_consensus(replace(views, rays=self._rays(views)), views.nearly_flat, rng)
+            if again.hopeless.sum() > consensus.hopeless.sum() or not again.looseness < consensus.looseness:
+                break
+            self._keep(views, again)
+            self.solution, consensus = self._fit(self.kept, self.options), again
+
+    def _rays(self, views: Views) -> Array:
+        """Rays of all pixels through the lens as it is known by now, in the order of the views."""
+        solution = self.solution
+        matrix = solution.problem.matrix(solution.state.entries[0])
+        rays = Camera(Intrinsics.from_matrix(matrix), solution.state.distortion).unproject(self.points.pixels)
+        rays = np.where(np.isfinite(rays), rays, _BACKWARDS)
+        return rays if views.order is None else rays[views.order]
+
+    def _keep(self, views: Views, consensus: Consensus) -> None:
+        """Begin with what the networks of all views agree on."""
+        self.kept[slice(None) if views.order is None else views.order] = consensus.kept
+        self.wrong_views = {}
+        for view in np.flatnonzero(consensus.hopeless):
+            self._drop(views.names[view], "its pixels do not match its points")
 
     def _may_be_wide(self) -> bool:
         """Whether the lens may be one that bends whole boards."""
@@ -148,9 +173,9 @@ class _Search:
         """Set aside views that are of another camera, or of another target than their points say.
 
         A distortion model that is chosen with the wrong views among the others hides them, so that a pinhole
-        looks for them first.
+        looks for them first, unless the lens is a wide one.
         """
-        if self.options.distortion == "auto":
+        if self.options.distortion == "auto" and not self.solution.state.distortion.wide:
             pinhole = replace(self.options, distortion="")
             before = len(self.wrong_views)
             # The distortion may be so strong that there is no pinhole: then nothing is learnt from it.

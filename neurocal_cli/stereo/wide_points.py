@@ -1,7 +1,7 @@
 """Triangulation with a wide lens, whose rays may be 90 degrees and more from the axis.
 
-As `two_view_points`, but the point is B (x, y, 1) / w, where the third column of B is the ray of its left pixel:
-x and y stay small wherever the ray points, and w is one over the distance.
+As `two_view_points`, but the point is B (x, y, 1) / w, where the third column of B is the ray of its left
+pixel: x and y stay small wherever the ray points, and w is one over the distance.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class WidePointBatch:
         return J, np.concatenate([left, right], axis=1), seen_left & seen_right
 
     def _seen(self, side: int, points: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Derivatives of pixels by points, what is missing to the observed ones, and which points are seen."""
+        """Derivatives of pixels by points, what is missing to the observed ones, and what is seen."""
         camera = self.cameras[side]
         pixels, seen = camera.project(points)
         by_point, missing = camera.project_jacobian(points)[1], self.pixels[side] - pixels
