@@ -14,14 +14,14 @@ from neurocal_cli.bundle_adjustment.observability import refuse_undetermined, re
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names, distort, pinhole_coefficients
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
-from neurocal_cli.distortion.similar_lens import farthest_angle, similar_states
+from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 

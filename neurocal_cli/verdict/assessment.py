@@ -24,7 +24,7 @@ from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.cross_validation import Minimum, disagreement, held_out
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
-from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import normalised
@@ -32,7 +32,6 @@ from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.distortion.similar_lens import farthest_angle
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covariance
