@@ -298,7 +298,11 @@ def test_a_model_of_points_makes_no_sense(tmp_path: Path) -> None:
 
 
 def test_all_models_become_all_others_or_say_why_not() -> None:
-    cameras = [replace(wide_camera("eucm"), distortion=Distortion(m, np.array(k))) for m, k in LENSES.items()]
+    cameras = [
+        replace(wide_camera("eucm"), distortion=Distortion(m, np.array(k)))
+        for m, k in LENSES.items()
+        if m not in WIDE
+    ]
     for camera in [replace(c, intrinsics=Intrinsics(900, 900, 500, 400)) for c in cameras]:
         for model in ("none", "rational", "fisheye", "eucm"):
             near = nearest_camera(camera, model, skew=False)
