@@ -17,6 +17,7 @@ from support.wide_cameras import SIZE, WIDE_LENSES, plainly_projected, wide_came
 
 from neurocal_cli import Camera, Intrinsics, Pose, read_calibration, write_calibration
 from neurocal_cli.camera.distortion import MODELS, WIDE, Distortion
+from neurocal_cli.commands.convert import convert
 from neurocal_cli.distortion.nearest_camera import nearest_camera, with_model
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.camera_files import read_intrinsics
@@ -288,6 +289,11 @@ def test_a_camera_is_simplified_to_a_model_and_the_loss_is_told(calibrated: Path
     refused = run("convert", calibrated, "--to", "ros", "--model", "eucm")
     assert refused.exit_code == 1
     assert "ROS has no distortion model eucm; choose one of none, plumb_bob, rational" in refused.stderr
+
+
+def test_the_command_offers_all_models() -> None:
+    (option,) = [option for option in convert.params if option.name == "model"]
+    assert option.type.to_info_dict()["choices"] == list(MODELS)
 
 
 def test_a_model_of_points_makes_no_sense(tmp_path: Path) -> None:
