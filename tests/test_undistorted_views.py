@@ -111,7 +111,7 @@ def test_the_field_of_view_is_the_one_asked_for(shape: str, fov: float, size: tu
 
 def test_a_whole_sphere_is_that_of_other_programs() -> None:
     """As in COLMAP, whose first pixel ends at 0 and begins at 1: u = (longitude / 2 pi + 1/2) width."""
-    cam = Camera(Intrinsics(300, 300, 499.5, 399.5), Distortion("fisheye"), SIZE)
+    cam = Camera(Intrinsics(300, 300, 480, 410), Distortion("fisheye"), SIZE)
     new = undistorted_view(cam, SIZE, "equirectangular", 360, (720, 360))
     pixels = new.project(np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 1e-9], [-1, 0, -1e-9]]))[0]
     assert pixels + 0.5 == pytest.approx(np.array([[360, 180], [540, 180], [360, 360], [180, 180]]), abs=1e-4)

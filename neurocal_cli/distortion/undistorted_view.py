@@ -1,7 +1,8 @@
 """What undistorted pictures show: on a plane, a cylinder or a sphere, and how much of the field of view.
 
-The optical axis keeps its pixel, in proportion where the picture has another size. A plane shows less than
-180 degrees, and its scale grows outwards with 1 / cos^2 of the angle.
+The optical axis keeps its pixel, in proportion where the picture has another size; it is in the middle of a
+panorama whose field of view is given. A plane shows less than 180 degrees, and its scale grows outwards with
+1 / cos^2 of the angle.
 """
 
 from __future__ import annotations
@@ -141,7 +142,8 @@ def undistorted_view(
         field = field_of_view(camera, size)
         f = min(left / max(-field.left, _NARROW), right / max(field.right, _NARROW))
     else:
-        f = (left + right) / np.radians(fov)
+        f = new_size[0] / np.radians(fov)
+        u0, v0 = 0.5 * (np.array(new_size) - 1.0)
     return Panorama(shape, float(f), float(u0), float(v0), new_size, camera.name)
 
 
