@@ -293,7 +293,7 @@ def test_a_camera_is_simplified_to_a_model_and_the_loss_is_told(calibrated: Path
 
 def test_the_command_offers_all_models() -> None:
     (option,) = [option for option in convert.params if option.name == "model"]
-    assert option.type.to_info_dict()["choices"] == list(MODELS)
+    assert list(option.type.to_info_dict()["choices"]) == list(MODELS)
 
 
 def test_a_model_of_points_makes_no_sense(tmp_path: Path) -> None:
