@@ -92,7 +92,7 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
                 lattices += _find_new(level, saddles, links, lattices, wanted)
             if level not in small[1:]:
                 lattices = _split_planes(level, lattices)
-            if level is small[0] and links is not None and not (straight or _nearest_whole(lattices, wanted)):
+            if level is small[0] and not (straight or _nearest_whole(lattices, wanted)):
                 lattices, bent = _find_bent(level, saddles, links, masked, lattices, wanted)
     if not lattices and not bent and levels and levels[0] in small:
         lattices = _split_planes(levels[0], _find_slivers(levels[0], saddles))
@@ -102,7 +102,7 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
 def _find_bent(
     level: Level,
     saddles: Saddles,
-    links: Links,
+    links: Links | None,
     masked: int,
     known: list[Lattice],
     wanted: frozenset[Size],
@@ -114,11 +114,13 @@ def _find_bent(
     lost = masked > sum(int(x.seen.sum()) for x in known)
     least = _UNFINISHED * min((cols * rows for cols, rows in wanted), default=np.inf)
     unfinished = [x for x in known if x.seen.sum() >= least]
-    if not (lost or unfinished or any_left(saddles, links, known)):
+    if not (lost or unfinished or (links is not None and any_left(saddles, links, known))):
         return known, []
     if masked:
         saddles = find_saddles(level)
-        links = find_links(level, saddles)
+        links = find_links(level, saddles) if len(saddles) >= 9 else None
+    if links is None:
+        return known, []
 
     def search(view: NDArray[np.float32]) -> list[Lattice]:
         return _find(pyramid(view), wanted, straight=True)

@@ -298,7 +298,7 @@ def _fine_fit(
     n, half_length = len(first.good), 0.5 * lines.length
     shape = profile_shape(first.data, first.fit, first.shape, first.good)
     noise = PixelNoise.of(first.fit, first.data.root, grid_image.floor)
-    sigma, spread = _blur(first, lines)
+    sigma, spread = _blur(first, lines, lines)
     data = edge_pixels(grid_image.image, lines, sigma, shading, REACH * sigma, 1)
     prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
     offset = first.map.residual[:n] + first.map.shift[0]
@@ -326,7 +326,7 @@ def fit_grid_vertices(
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
-    (first, spread), (second, _) = (_blur(fitted, line) for line in lines)
+    (first, spread), (second, _) = (_blur(fitted, fitted.lines, line) for line in lines)
     sigma = 0.5 * (first + second)
     contrast = fitted.shading.at(place)[1]
     slopes = fitted.shading.slopes(place)
@@ -353,13 +353,13 @@ def fit_grid_vertices(
     return fit, lines, is_reliable(fit, departure, data.beyond)
 
 
-def _blur(fitted: GridFit, lines: Lines) -> tuple[Array, Array | float]:
+def _blur(fitted: GridFit, edges: Lines, lines: Lines) -> tuple[Array, Array | float]:
     """Blur (E,) [px] of lines by the fits of all edges, and the variance of single ones around it [px^2]."""
     if isinstance(fitted.map.map, WideMap):
-        field = FieldBlur.of(fitted.fit, fitted.lines, fitted.good, fitted.map.map.frame)
+        field = FieldBlur.of(fitted.fit, edges, fitted.good, fitted.map.map.frame)
         sigma = field.along(lines.normal, lines.middle)
         return sigma, field.relative * sigma**2
-    board = BoardBlur.of(fitted.fit, fitted.lines.normal, fitted.good)
+    board = BoardBlur.of(fitted.fit, edges.normal, fitted.good)
     return board.along(lines.normal), board.spread
 
 
