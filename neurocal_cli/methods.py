@@ -58,6 +58,7 @@ def calibrate(
     seed: int = 0,
     *,
     target: str | Target = "auto",
+    preferred: str = "",
     starts: int = _STARTS,
     backprop: BackpropOptions | None = None,
     camera_name: str = "camera",
@@ -97,6 +98,9 @@ def calibrate(
         Where the points of the target are: given, as they are given; free, found with the camera; flat,
         found, but each left in its plane; auto: found where the data ask for it (`target_shape`). A target
         that was found already: there.
+    preferred : str
+        With ``distortion="auto"``, a model to take where no other predicts decidedly better, such as that
+        of the other camera of a rig.
     starts : int
         Most random starts for each network, at least 2.
     backprop : BackpropOptions, optional
@@ -134,7 +138,9 @@ def calibrate(
             f"type 3 uses the distortion of the given camera ({model.model}), not {distortion}; leave it out"
         )
     way = distortion if distortion in _FOUND and not type_3 else ""
-    options = options_for(trainer, starts, seed, distortion=way, backprop=backprop, progress=progress)
+    options = options_for(
+        trainer, starts, seed, distortion=way, preferred=preferred, backprop=backprop, progress=progress
+    )
     try:
         problem = problem_for(points, type, image_center, known, extrinsics, skew, model)
         if method != "neuro":

@@ -32,6 +32,7 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 __all__ = [
     "OpenCoefficients",
     "OpenPrior",
+    "corner_radius",
     "open_coefficients",
     "radius",
     "spread_of_open",
@@ -39,10 +40,11 @@ __all__ = [
 ]
 
 # Groups that come and go together, the power of the radius, and the std of their terms' share of the radius
-# at the farthest point. Four real lenses have 0.03-0.14, 0.001-0.035, 0.0001-0.001 and 0.0015-0.007.
-# Repeated by tests/test_choice_uncertainty.py (slow: 200 draws of each of four lenses, std true to 0.9-1.2).
-_POLYNOMIAL = ((("k1",), 2, 0.1), (("k2",), 4, 0.03), (("p1", "p2"), 1, 0.001), (("k3",), 6, 0.005))
-_FISHEYE = ((("k1",), 2, 0.1), (("k2",), 4, 0.03), (("k3",), 6, 0.01), (("k4",), 8, 0.003))
+# where the lens reaches farthest, in a corner of the image. At the farthest points of four real cameras these
+# are 0.03-0.14, 0.001-0.035, 0.0001-0.001 and 0.0015-0.007; corners have up to three times as much.
+# Repeated by tests/test_choice_uncertainty.py (slow: 200 draws of each of four lenses, std true to 0.9-1.2)
+_POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015), (("k3",), 6, 0.012))
+_FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
 _ODDS = 3.0  # that a group is there
 _RICHEST = ("plumb_bob", "k1k2p1p2", "k1k2", "k1")
 
@@ -97,8 +99,31 @@ def radius(views: Views, state: CameraState) -> float:
     return float((np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]).max())
 
 
+def corner_radius(
+    entries: Array, pixel_centre: Array, pixel_scale: float, size: tuple[int, int] | None
+) -> float:
+    """Radius of the farthest corner of the image in normalised image coordinates, as it is seen.
+
+    Parameters
+    ----------
+    entries : (5,) array
+        Of A, normalised.
+    pixel_centre, pixel_scale
+        Of the normalisation.
+    size : (width, height), optional
+        Without it, 0.
+    """
+    if size is None:
+        return 0.0
+    a11, a12, a22, a13, a23 = entries
+    u, v = np.meshgrid([0.0, size[0] - 1.0], [0.0, size[1] - 1.0])
+    y = ((v - pixel_centre[1]) / pixel_scale - a23) / a22
+    x = ((u - pixel_centre[0]) / pixel_scale - a13 - a12 * y) / a11
+    return float(np.hypot(x, y).max())
+
+
 def open_coefficients(
-    model: str, k: Array, free: NDArray[np.bool_], choice: Collection[str], reach: float
+    model: str, k: Array, free: NDArray[np.bool_], choice: Collection[str], reach: float, corner: float
 ) -> OpenCoefficients | None:
     """Coefficients that a model was chosen without; None where there are none.
 
@@ -112,6 +137,8 @@ def open_coefficients(
         The models that were chosen from; empty where the model was named.
     reach : float
         `radius` of the farthest point.
+    corner : float
+        `corner_radius`.
     """
     own = coefficient_names(model)
     richer = model if model == "fisheye" else next((m for m in _RICHEST if m in choice), "none")
@@ -124,7 +151,7 @@ def open_coefficients(
     if not is_open.any():
         return None
     wanted = free.copy()[:5].tolist() + [True] * len(names)
-    far = float(np.arctan(reach)) if richer == "fisheye" else reach
+    far = max(float(np.arctan(reach)) if richer == "fisheye" else reach, corner)
     at = {name: place for place, name in enumerate(np.array(names)[is_open[5:]].tolist())}
     size, groups = np.zeros(len(at)), []
     for members, power, share in _FISHEYE if richer == "fisheye" else _POLYNOMIAL:

@@ -11,6 +11,7 @@ from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.cross_validation import held_out_points, held_out_views
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined, relative_std_of_scale
+from neurocal_cli.bundle_adjustment.open_coefficients import radius
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
@@ -25,7 +26,19 @@ from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["Candidate", "falls_short", "fit_candidates", "is_weak", "judged_again", "supported", "worth"]
+__all__ = [
+    "WIDE",
+    "Candidate",
+    "falls_short",
+    "fit_candidates",
+    "is_weak",
+    "judged_again",
+    "supported",
+    "worth",
+]
+
+WIDE = ("fisheye",)
+"""Models of wide-angle lenses, which are candidates only where points reach far from the axis."""
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
 # tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
@@ -44,7 +57,7 @@ _BEHIND = 1.5  # times the squared error
 _LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
 _SPARE = 1.3  # equations for each unknown
-_WIDE = 0.5  # radius from which on a model can be a fisheye's: 27 degrees off the axis
+_WIDE = 0.7  # radius from which on a model can be a fisheye's: 35 degrees off the axis
 _TOLD_APART = 4.0  # squared standard deviations, for each coefficient
 _WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (slow) repeats it
 _LARGEST_TERM = 3.0  # of one coefficient at the farthest point; all terms together are about 1
@@ -123,7 +136,7 @@ def fit_candidates(
     wanted : str, optional
         The model that counts; the others are only on the way to it, and need not be monotonic.
     """
-    return _Chain(problem, by_views, _reach(problem.views, state), wanted=wanted).all_from(state)
+    return _Chain(problem, by_views, radius(problem.views, state), wanted=wanted).all_from(state)
 
 
 def judged_again(
@@ -132,7 +145,7 @@ def judged_again(
     """The same fits, views that repeat a pose being one view to what they are judged by."""
     again = {}
     for model, candidate in fitted.items():
-        reach = _reach(candidate.problem.views, candidate.adjusted.state)
+        reach = radius(candidate.problem.views, candidate.adjusted.state)
         chain = _Chain(candidate.problem, by_views, reach, repeated)
         if (found := chain.assessed(candidate.problem, candidate.adjusted)) is not None:
             again[model] = found
@@ -199,7 +212,8 @@ class _Chain:
     def _fisheyes(self, state: CameraState) -> list[Candidate]:
         """With one, two and four coefficients, each from the one before it."""
         problem = supported(self.problem, "fisheye")
-        if problem is None or self.reach < _WIDE:
+        # The pinhole that all began with may see a fisheye's points nearer to the axis than they are.
+        if problem is None or max(self.reach, radius(problem.views, state)) < _WIDE:
             return []
         found = []
         for count, tail in _FISHEYES:
@@ -333,12 +347,6 @@ def _terms(model: str, reach: float) -> Array:
         return np.asarray(np.arctan(reach) ** np.array([2.0, 4.0, 6.0, 8.0]))
     powers = np.array([2.0, 4.0, 1.0, 1.0, 6.0, 2.0, 4.0, 6.0])
     return np.asarray(reach ** powers[: len(coefficient_names(model))])
-
-
-def _reach(views: Views, state: CameraState) -> float:
-    """Radius of the farthest point in normalised image coordinates, before distortion."""
-    seen = (state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]
-    return float((np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]).max())
 
 
 def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -> Array:

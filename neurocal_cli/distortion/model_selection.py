@@ -1,15 +1,18 @@
 """``auto``: the simplest distortion model that the data support.
 
 Every model is fitted, each from the one before it. The cross-validation error decides: five folds of
-the views, or of the points of a single view. Models whose error is within 0.9 % of the lowest are
-equally good; so are those within the scatter of five folds, for a single view or where the information
-criterion is decidedly for them. Among them the Bayesian information criterion (Schwarz 1978) chooses,
-n log E + p log n, n being the effective number of residuals when neighbours are correlated, and when views
-repeat a pose (`repeated_poses`), which are one view to the folds, too. Models with
-more than two coefficients beyond what the criterion alone would choose take no part. Neither do models
-that did not converge, that have too few points, or that are not monotonic (`monotonic_fit`). Models
-whose coefficients are strongly correlated are kept only when they lower the cross-validation error over
-several views by 5 %.
+the views, or of the points of a single view. The model with the lowest one is taken, unless others are as
+good: all whose error is within 0.9 % of the lowest, and simpler ones whose error is above it by no more than
+the standard error that the five folds have. Among them the Bayesian information criterion (Schwarz 1978)
+chooses, n log E + p log n, n being the effective number of residuals when neighbours are correlated, and when
+views repeat a pose (`repeated_poses`), which are one view to the folds, too.
+
+Models with more than two coefficients beyond what the criterion alone would choose take no part, unless they
+predict far better than all others. Neither do models that did not converge, that have too few points,
+or that are not monotonic (`monotonic_fit`). Models whose coefficients are strongly correlated are kept only
+when they lower the cross-validation error over several views by 5 %. A wide-angle lens's model (`WIDE`) is a
+candidate only where points reach far from the axis, and where the criterion is decidedly for it against all
+ordinary models: near the axis all lenses are alike.
 """
 
 from __future__ import annotations
@@ -27,6 +30,7 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.distortion.candidate_models import (
+    WIDE,
     Candidate,
     falls_short,
     fit_candidates,
@@ -41,16 +45,21 @@ __all__ = ["select_model"]
 # 100 %, never more than two coefficients too many, 1 % of the best error on new views) and
 # tests/test_rendered_sets.py.
 _TIE = 0.009  # of the rms error
+_CERTAIN = 2.0  # standard errors of five folds, and
+_DECIDEDLY = 1.03  # times the rms error, that something must be better by to be so decidedly
 _FAR_WORSE = 2.0  # times the rms error of a model that folds back
 _WORTH = 1.05  # times the rms error: what coefficients that cancel each other must be better by
-_CHANCE = 4.6  # standard errors, of five folds, that chance exceeds in one case of a hundred
+_FAR_BETTER = 1.25  # times the rms error, with more coefficients than the criterion asks for
 _MORE = 2  # coefficients
+_MOST_ORDINARY = 5  # coefficients: with eight, a rational model is a wide-angle lens's too
 _DECISIVE = 10.0  # of the criterion: odds of 150
 _CORRELATED = 0.3  # correlation of neighbours' residuals
 _BETTER, _MUCH_BETTER = 0.999, 0.8  # times the squared error
 
 
-def select_model(solution: Solution, more_starts: Callable[[], Iterable[CameraState]] = tuple) -> Solution:
+def select_model(
+    solution: Solution, more_starts: Callable[[], Iterable[CameraState]] = tuple, preferred: str = ""
+) -> Solution:
     """Fit all models, from a solution with any of them, and choose.
 
     Parameters
@@ -58,6 +67,8 @@ def select_model(solution: Solution, more_starts: Callable[[], Iterable[CameraSt
     solution : Solution
     more_starts : callable
         Other states to begin with, where the first leads to nothing that explains the points.
+    preferred : str
+        A model to take where no other predicts decidedly better.
 
     Returns
     -------
@@ -82,7 +93,7 @@ def select_model(solution: Solution, more_starts: Callable[[], Iterable[CameraSt
     if not repeated.none:
         by_views = _views_can_spare_any(solution, repeated)
         fitted = judged_again(fitted, by_views, repeated) or fitted
-    chosen = fitted[_best(fitted, views, repeated)]
+    chosen = fitted[_best(fitted, views, repeated, preferred)]
     n, px = len(views.index), views.pixel_scale
     iterations = solution.adjusted.iterations + chosen.adjusted.iterations
     return replace(
@@ -141,33 +152,73 @@ def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
     return pinhole.criterion(n) < lowest + _DECISIVE and not falls_short(views, [pinhole])
 
 
-def _best(fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses) -> str:
+def _best(fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses, preferred: str) -> str:
     """Of the models whose held-out error is as low as any, the one with the lowest criterion.
 
     What is held out may ask for two coefficients more than the criterion does, but not for more: a few
     folds tell the better of two models, but among many models one is better than it should be by chance.
     """
-    sound = _eligible(fitted, views.n_views > 1)
-    n = worth(views, sound.values()) * repeated.worth
+    eligible = _eligible(fitted, views.n_views > 1)
+    n = worth(views, eligible.values()) * repeated.worth
+    sound = _without_wide(eligible, fitted, n)
     criterion = {name: candidate.criterion(n) for name, candidate in sound.items()}
     most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + _MORE
+    finite = {name: candidate for name, candidate in sound.items() if np.isfinite(candidate.lost).all()}
+    few = {name: candidate for name, candidate in finite.items() if candidate.coefficients <= most}
+    if not few:
+        return next(iter(sound))  # the simplest: nothing can be left out
     pool = {
         name: candidate
-        for name, candidate in sound.items()
-        if candidate.coefficients <= most and np.isfinite(candidate.lost).all()
+        for name, candidate in finite.items()
+        if name in few or all(_decidedly(candidate, other, repeated, _FAR_BETTER) for other in few.values())
     }
-    if not pool:
-        return next(iter(sound))  # the simplest: nothing can be left out
     best = min(pool, key=lambda name: _lost(pool[name]))
+    wanted = eligible.get(preferred)
+    if wanted is not None and np.isfinite(wanted.lost).all() and not _decidedly(pool[best], wanted, repeated):
+        return preferred
     tied = []
     for name, candidate in pool.items():
         excess = _by_fold(candidate.lost - pool[best].lost, repeated)
-        chance = _CHANCE * np.sqrt(len(excess)) * excess.std()
-        # Folds of views tell models apart, unless all the data are decidedly of another opinion.
-        close = views.n_views == 1 or criterion[name] < criterion[best] - _DECISIVE
-        if excess.sum() <= max(2 * _TIE * _lost(pool[best]), chance if close else 0.0):
+        chance = np.sqrt(len(excess)) * excess.std()
+        simpler = candidate.coefficients < pool[best].coefficients
+        if excess.sum() <= max(2 * _TIE * _lost(pool[best]), chance if simpler else 0.0):
             tied.append(name)
     return min(tied, key=lambda name: criterion[name])
+
+
+def _without_wide(
+    eligible: dict[str, Candidate], fitted: dict[str, Candidate], n: float
+) -> dict[str, Candidate]:
+    """Without wide-angle lenses' models where ordinary ones do nearly as well.
+
+    An ordinary one need not be sound to tell that the lens may be ordinary.
+    """
+    ordinary = [c for name, c in fitted.items() if name not in WIDE and c.coefficients <= _MOST_ORDINARY]
+    ordinary = [c for c in ordinary if c.not_monotonic is None and np.isfinite(c.lost).all()]
+    if not ordinary:
+        return eligible
+    lowest, least = min(c.criterion(n) for c in ordinary), min(map(_lost, ordinary))
+    some = {
+        name: c
+        for name, c in eligible.items()
+        if name not in WIDE or (c.criterion(n) < lowest - _DECISIVE and _lost(c) <= (1 + 2 * _TIE) * least)
+    }
+    return some or eligible
+
+
+def _decidedly(
+    candidate: Candidate, other: Candidate, repeated: RepeatedPoses, enough: float = _DECIDEDLY
+) -> bool:
+    """Whether a candidate predicts better than another by enough to matter, and nearly everywhere.
+
+    Everywhere by the mean logarithm of the ratio of what the parts of the data lose: a part that one of both
+    cannot do without has no more to say than others.
+    """
+    lost = [np.maximum(_by_fold(c.lost, repeated), 1e-300) for c in (candidate, other)]
+    if not lost[1].sum() > enough**2 * lost[0].sum():
+        return False
+    ratio = np.log(lost[1] / lost[0])
+    return bool(ratio.sum() > _CERTAIN * np.sqrt(len(ratio)) * ratio.std())
 
 
 def _lost(candidate: Candidate) -> float:

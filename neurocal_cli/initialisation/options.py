@@ -42,6 +42,8 @@ class Options:
         where bundle adjustment alone imposes the constraints.
     distortion : str
         "auto": choose the model; "plumb-line": find it from straight lines first; else as the problem says.
+    preferred : str
+        With "auto", a model to take where no other predicts decidedly better.
     seed : int
         Of the random weights.
     progress : callable
@@ -55,6 +57,7 @@ class Options:
     starts: int
     constrained: Callable[[Task, float], Trained] | None = None
     distortion: str = ""
+    preferred: str = ""
     seed: int = 0
     progress: Progress = lambda stage, share: None
 
@@ -65,6 +68,7 @@ def options_for(
     seed: int,
     *,
     distortion: str = "",
+    preferred: str = "",
     backprop: BackpropOptions | None = None,
     progress: Progress | None = None,
 ) -> Options:
@@ -86,6 +90,7 @@ def options_for(
             finish_points=1024,
             starts=starts,
             distortion=distortion,
+            preferred=preferred,
             seed=seed,
             progress=report,
         )
@@ -102,4 +107,6 @@ def options_for(
         return train_backprop(task, gentle, lambda share: report("training with orthogonality", share))
 
     agreement = Agreement(0.02, 1e-4)
-    return Options(train, agreement, (1024, 1024), None, 1024, starts, constrained, distortion, seed, report)
+    return Options(
+        train, agreement, (1024, 1024), None, 1024, starts, constrained, distortion, preferred, seed, report
+    )

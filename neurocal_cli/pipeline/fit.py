@@ -89,7 +89,7 @@ def _finished(solution: Solution, options: Options, only_from_here: bool = False
     """With its distortion model, and weights that the residuals bear out."""
     chosen = options.distortion == "auto"
     if chosen and only_from_here:
-        solution = select_model(solution)
+        solution = select_model(solution, preferred=options.preferred)
     elif chosen:
         solution = _with_selected_model(solution, options)
     solution = reweighted(solution)
@@ -102,11 +102,11 @@ def _with_selected_model(solution: Solution, options: Options) -> Solution:
     def more_starts() -> Iterator[CameraState]:
         return _distorted_starts(solution.problem, options)
 
-    found = select_model(solution, more_starts)
+    found = select_model(solution, more_starts, options.preferred)
     turned = _turned(found)
-    return (
-        found if turned is found else select_model(replace(solution, adjusted=turned.adjusted), more_starts)
-    )
+    if turned is found:
+        return found
+    return select_model(replace(solution, adjusted=turned.adjusted), more_starts, options.preferred)
 
 
 def _first_solution(problem: Problem, options: Options) -> Solution:

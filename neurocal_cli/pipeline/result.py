@@ -44,7 +44,7 @@ def calibration_of(
     known = camera_covariance(
         CameraSeen(
             views, state, adjusted.normal, problem.free_camera, problem.free_poses, repeated,
-            problem.points.world, solution.target, tuple(solution.model_errors or ()), solution.shared,
+            problem.points, solution.target, tuple(solution.model_errors or ()), solution.shared,
         )
     )  # fmt: skip
     refuse_undetermined(problem, state, known.plain)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -38,7 +39,8 @@ def calibrate_stereo(
 
     Each camera is calibrated alone, as by `calibrate`. The rig is then found from the views of both cameras,
     which are paired by name. A common bundle adjustment refines both cameras, the rig and all poses. Views of
-    one camera alone contribute to that camera.
+    one camera alone contribute to that camera. Where the distortion models are chosen, both cameras get the
+    same one unless the points insist on two.
 
     Parameters
     ----------
@@ -92,13 +94,20 @@ def _on_one_target(
     """Both cameras, and the target found with both of them where the points ask for it."""
     choice = sides[0].get("target", "auto")
 
+    def camera(side: int, target: str | Target, preferred: str = "") -> Calibration:
+        name, points = _SIDES[side], (left, right)[side]
+        options = {"camera_name": name, **sides[side], "target": target, "preferred": preferred}
+        return calibrate(points, **options, progress=_named(progress, name))
+
     def calibrated(target: str | Target) -> list[Calibration]:
-        return [
-            calibrate(
-                points, **{"camera_name": name, **side, "target": target}, progress=_named(progress, name)
-            )
-            for name, points, side in zip(_SIDES, (left, right), sides, strict=True)
-        ]
+        cameras = [camera(side, target) for side in (0, 1)]
+        for side in _others_model(cameras):
+            model = cameras[1 - side].distortion_model
+            alike = camera(side, target, model)
+            if alike.distortion_model == model:
+                cameras[side] = alike
+                break
+        return cameras
 
     cameras = calibrated("given")
     for _ in range(_ROUNDS):
@@ -110,6 +119,22 @@ def _on_one_target(
         if [camera.distortion_model for camera in cameras] == before:
             break
     return cameras
+
+
+def _others_model(cameras: Sequence[Calibration]) -> list[int]:
+    """Sides that may take the other camera's distortion model, first the one that it suits better.
+
+    Both cameras of a rig are mostly of one make, so their models differ only where the points insist on it.
+    """
+    models = [camera.distortion_model for camera in cameras]
+    choices = [camera.lens_choice for camera in cameras]
+    if models[0] == models[1] or not all(choices):
+        return []
+    cost = [
+        choices[side].get(models[1 - side], math.inf) / max(choices[side][models[side]], 1e-300)
+        for side in (0, 1)
+    ]
+    return sorted((side for side in (0, 1) if math.isfinite(cost[side])), key=lambda side: cost[side])
 
 
 def _named(progress: Progress | None, name: str) -> Progress | None:

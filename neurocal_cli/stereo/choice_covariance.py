@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.open_coefficients import (
     OpenCoefficients,
     OpenPrior,
+    corner_radius,
     open_coefficients,
     spread_of_open,
 )
@@ -80,10 +81,11 @@ def _opened(
     """Of one camera; None too where the common bundle adjustment left it as it was."""
     if not free.any():
         return None
-    camera = adjusted.state.cameras[side]
-    return open_coefficients(
-        camera.model, camera.k, free, tuple(calibration.lens_choice), _radius(calibration)
+    camera, reach = adjusted.state.cameras[side], _radius(calibration)
+    corner = corner_radius(
+        np.array(calibration.camera.entries), np.zeros(2), 1.0, calibration.points.image_size
     )
+    return open_coefficients(camera.model, camera.k, free, tuple(calibration.lens_choice), reach, corner)
 
 
 def _radius(calibration: Calibration) -> float:

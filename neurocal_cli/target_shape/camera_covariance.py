@@ -17,6 +17,7 @@ from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.open_coefficients import (
     OpenCoefficients,
+    corner_radius,
     open_coefficients,
     radius,
     spread_of_open,
@@ -29,6 +30,7 @@ from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled
+from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.uncertainty import CovarianceBasis, covariance_basis
 
@@ -49,8 +51,8 @@ class CameraSeen:
         Of A's entries and the distortion coefficients.
     free_poses : bool
     repeated : RepeatedPoses
-    world : (N, 3) array [world unit]
-        Where the points are, in their own order.
+    points : Correspondences
+        Where the target has them.
     target : Target, optional
         Where it was found.
     choice : collection of str
@@ -65,7 +67,7 @@ class CameraSeen:
     free: NDArray[np.bool_]
     free_poses: bool
     repeated: RepeatedPoses
-    world: Array
+    points: Correspondences
     target: Target | None = None
     choice: Collection[str] = ()
     shared: Array | None = None
@@ -130,8 +132,10 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     known = CameraCovariance(basis, plain, found)
     if not seen.choice or not np.isfinite(found.entries).all():
         return known
-    reach = radius(seen.views, seen.state)
-    richer = open_coefficients(seen.state.model, seen.state.k, seen.free, seen.choice, reach)
+    views, state = seen.views, seen.state
+    reach = radius(views, state)
+    corner = corner_radius(state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size)
+    richer = open_coefficients(state.model, state.k, seen.free, seen.choice, reach, corner)
     return known if richer is None else _opened(seen, known, richer)
 
 
@@ -169,4 +173,6 @@ def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
 def _basis(
     seen: CameraSeen, state: CameraState, free: NDArray[np.bool_], normal: Array, shared: Array | None = None
 ) -> CovarianceBasis:
-    return covariance_basis(seen.target, seen.views, state, free, seen.free_poses, seen.world, normal, shared)
+    return covariance_basis(
+        seen.target, seen.views, state, free, seen.free_poses, seen.points.world, normal, shared
+    )

@@ -134,7 +134,7 @@ class _AtMinimum:
         known = camera_covariance(
             CameraSeen(
                 self.views, self.state, self.normal, self.free, self.free_poses, self.repeated,
-                self.points.world, calibration.target, tuple(calibration.lens_choice),
+                self.points, calibration.target, tuple(calibration.lens_choice),
             )
         )  # fmt: skip
         self.normal = known.basis.normal
