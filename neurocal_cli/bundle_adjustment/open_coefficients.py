@@ -45,6 +45,7 @@ __all__ = [
 # Repeated by tests/test_choice_uncertainty.py (slow: 200 draws of each of four lenses, std true to 0.9-1.2)
 _POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015), (("k3",), 6, 0.012))
 _FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
+_STEEPEST = 1.55  # rad
 _ODDS = 3.0  # that a group is there
 _RICHEST = ("plumb_bob", "k1k2p1p2", "k1k2", "k1")
 
@@ -94,9 +95,9 @@ class OpenCoefficients:
 
 
 def radius(views: Views, state: CameraState) -> float:
-    """Radius of the farthest point in normalised image coordinates, before distortion."""
+    """Undistorted radius of the farthest point, normalised; that of 89 degrees at most."""
     seen = (state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]
-    return float((np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]).max())
+    return float(np.tan(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]).clip(max=_STEEPEST).max()))
 
 
 def corner_radius(

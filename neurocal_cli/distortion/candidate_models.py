@@ -27,7 +27,6 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
 __all__ = [
-    "WIDE",
     "Candidate",
     "falls_short",
     "fit_candidates",
@@ -37,8 +36,6 @@ __all__ = [
     "worth",
 ]
 
-WIDE = ("fisheye",)
-"""Models of wide-angle lenses, which are candidates only where points reach far from the axis."""
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
 # tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are

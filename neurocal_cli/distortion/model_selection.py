@@ -28,9 +28,8 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion import MODELS
+from neurocal_cli.camera.distortion import MODELS, WIDE
 from neurocal_cli.distortion.candidate_models import (
-    WIDE,
     Candidate,
     falls_short,
     fit_candidates,
