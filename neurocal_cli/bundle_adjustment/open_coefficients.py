@@ -42,7 +42,7 @@ __all__ = [
 # Groups that come and go together, the power of the radius, and the std of their terms' share of the radius
 # where the lens reaches farthest, in a corner of the image. At the farthest points of four real cameras these
 # are 0.03-0.14, 0.001-0.035, 0.0001-0.001 and 0.0015-0.007; corners have up to three times as much.
-# Repeated by tests/test_choice_uncertainty.py (slow: 200 draws of each of four lenses, std true to 0.9-1.2)
+# Repeated by tests/test_choice_uncertainty.py (slow: 200 draws)
 _POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015), (("k3",), 6, 0.012))
 _FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
 _STEEPEST = 1.55  # rad
