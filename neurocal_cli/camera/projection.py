@@ -101,7 +101,7 @@ def project_points(
     """
     if model in WIDE:
         a, s, b, u0, v0 = entries
-        x, y, _, _, _, seen = project_directions(model, k, X, Y, Z)
+        x, y, _, _, _, seen = project_directions(model, k, X, Y, Z, by_coefficients=False)
         return a * x + s * y + u0, b * y + v0, seen
     q = 1.0 / Z
     u, v = image_points(entries, model, k, X * q, Y * q)

@@ -46,7 +46,7 @@ def calibration_of(
     basis = covariance_basis(
         solution.target, views, state, *asked, problem.points.world, adjusted.normal, solution.shared
     )
-    cov = covariance(basis.normal, *asked, basis.n_equations, basis.shared)
+    cov = covariance(basis.normal, *asked, basis.n_equations + solution.by_prior, basis.shared)
     refuse_undetermined(problem, state, cov)
     if solution.shared is None:
         cov = counting_views(cov, basis.normal, *asked, basis.n_equations, repeated, basis.moves_without)
@@ -153,7 +153,7 @@ def _network_record(solution: Solution, rmse: float) -> NetworkRecord:
 
 def _corner_warning(problem: Problem) -> tuple[str, ...]:
     """Where no point is, a distortion is anyone's guess."""
-    if problem.restraint is None:
+    if problem.restraint is None or problem.distortion.model == "rich":
         return ()
     return (
         f"the distortion model {problem.distortion.model} that fits the points best is not monotonic (maps "
