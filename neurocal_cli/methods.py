@@ -187,8 +187,8 @@ def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics
 
 def _distortion_of(method: str, distortion: str) -> str:
     """The distortion model of a method other than the network's."""
-    if distortion == "plumb-line":
-        raise UsageError(f"distortion plumb-line needs the method neuro, but the method is {method}")
+    if distortion in ("plumb-line", "rich"):
+        raise UsageError(f"distortion {distortion} needs the method neuro, but the method is {method}")
     if distortion == "auto":
         return "k1" if method == "tsai" else "none"
     return distortion

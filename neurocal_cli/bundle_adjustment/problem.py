@@ -87,15 +87,22 @@ class Problem:
         return np.concatenate([self.free, np.array(coefficients, dtype=bool)])
 
     @property
+    def free_of_prior(self) -> NDArray[np.bool_]:
+        """The same without a rich lens's nodes, which a prior holds where points do not."""
+        free = self.free_camera
+        if self.distortion.model == "rich":
+            free[5 + FIRST_NODE :] = False
+        return free
+
+    @property
     def free_poses(self) -> bool:
         """Whether the poses are estimated."""
         return self.poses is None
 
     @property
     def n_parameters(self) -> int:
-        """Number of unknowns, without a rich lens's displacement, which a prior holds where points do not."""
-        end = 5 + FIRST_NODE if self.distortion.model == "rich" else None
-        return int(self.free_camera[:end].sum()) + (6 * self.views.n_views if self.free_poses else 0)
+        """Number of unknowns that the points alone have to determine."""
+        return int(self.free_of_prior.sum()) + (6 * self.views.n_views if self.free_poses else 0)
 
     @property
     def given_centre(self) -> Array | None:

@@ -175,7 +175,9 @@ def _omnidir(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array) -> Directi
 def _rich(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array, by_coefficients: bool) -> Direction:
     m = _fisheye(k[:4], X, Y, Z, q)
     more = rich_lens.displacement(np.asarray(k[4:]), X, Y, Z, by_coefficients)
-    by_x, by_y = ((a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in ((m.by_x, more.by_x), (m.by_y, more.by_y)))
+    by_x, by_y = (
+        (a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in ((m.by_x, more.by_x), (m.by_y, more.by_y))
+    )
     # The image grows where it is nowhere folded: the two derivatives across the ray turn the same way.
     cross = (
         X * (by_x[1] * by_y[2] - by_x[2] * by_y[1])

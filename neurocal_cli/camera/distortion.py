@@ -46,7 +46,7 @@ _PINHOLES = {
     "omnidir": (0.1, 0.0, 0.0, 0.0, 0.0),
     "double_sphere": (0.0, 0.1),
     "eucm": (0.1, 1.0),
-    "rich": (1 / 3, 2 / 15, 17 / 315, 62 / 2835, 1.0, *np.zeros(len(WIDE["rich"]) - 5)),
+    "rich": (1 / 3, 2 / 15, 17 / 315, 62 / 2835, 1.0, 1.0, 1.0, *np.zeros(len(WIDE["rich"]) - 7)),
 }
 
 

@@ -3,10 +3,11 @@
 The displacement (dx', dy') of a distorted point is a function of its direction. In stereographic coordinates
 s = (X, Y) / (d + Z), d = |(X, Y, Z)|, whose length is tan(theta / 2), it is
 
-    s / |s| sum_i g_i (B(|s| / h - i) - B(|s| / h + i))  +  sum_rc (fx_rc, fy_rc) B(sy / l - r) B(sx / l - c)
+    s / |s| sum_i g_i (B(|s| / h - i) - B(|s| / h + i)) + sum_rc (fx_rc, fy_rc) B(sy / ly - r) B(sx / lx - c)
 
-with the cubic B-spline B: a radial profile, odd and so smooth on the axis, and a field on a square grid
-around the axis. Both cover |s| <= reach, and fade to 0 within two or three of their nodes' spacings beyond.
+with the cubic B-spline B: a radial profile, odd and so smooth on the axis, and a field on a grid around the
+axis. They cover |s| <= reach, |sx| <= reach_x and |sy| <= reach_y, and fade to 0 within two or three of
+their nodes' spacings beyond.
 Schoeps et al. (2020) calibrate with such fields of directions, mrcal with stereographic ones.
 """
 
@@ -19,16 +20,16 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["FIRST_NODE", "GRID", "NAMES", "RADII", "Displacement", "displacement"]
+__all__ = ["FIRST_NODE", "GRID", "NAMES", "NODES", "RADII", "REACHES", "Displacement", "displacement"]
 
 RADII, GRID = 16, 10  # nodes of the profile, and of the field in each direction
-NAMES = (
-    "reach",
+REACHES = ("reach", "reach_x", "reach_y")  # they are never estimated
+NODES = (
     *(f"g{n:02d}" for n in range(1, RADII + 1)),
-    *(f"f{axis}{row}{column}" for axis in "xy" for row in range(GRID) for column in range(GRID)),
+    *(f"f{axis}{row:02d}{column:02d}" for axis in "xy" for row in range(GRID) for column in range(GRID)),
 )
-FIRST_NODE = 5  # of a rich lens's coefficients: k1 to k4 and the reach are before it
-_FIELD = 1 + RADII  # first of the field's coefficients
+NAMES = (*REACHES, *NODES)
+FIRST_NODE = 7  # of a rich lens's coefficients: k1 to k4 and the reaches are before it
 _PAD = 3  # nodes that are 0 around the grid: what is beyond fades to 0
 _LEAST_RADIUS = 1e-6  # |s| below which a direction is on the axis
 
@@ -42,7 +43,7 @@ class Displacement(NamedTuple):
     by_x, by_y : three arrays each
         By X, Y, Z.
     by_coefficient : list of pairs of arrays
-        By each of `NAMES`; the reach, which is never estimated, has zeros. Empty where not asked for.
+        By each of `NAMES`; zeros by the reaches. Empty where not asked for.
     """
 
     x: Array
@@ -57,7 +58,7 @@ def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool =
 
     Parameters
     ----------
-    k : (217,) array
+    k : (n,) array
         The coefficients `NAMES`.
     X, Y, Z : arrays of one shape
         In any unit; the direction alone counts.
@@ -69,12 +70,13 @@ def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool =
     d = np.sqrt(X * X + Y * Y + Z * Z)
     w = d + Z
     sx, sy = X / w, Y / w
-    reach = max(float(k[0]), _LEAST_RADIUS)
+    reach, reach_x, reach_y = np.maximum(k[:3], _LEAST_RADIUS).tolist()
+    profile, nodes = k[3 : 3 + RADII], k[3 + RADII :].reshape(2, GRID, GRID)
     r = np.maximum(np.hypot(sx, sy), _LEAST_RADIUS)
-    radial = _radial(k[1:_FIELD], r, reach / (RADII - 1))
+    radial = _radial(profile, r, reach / (RADII - 1))
     scale = radial.value / r
     bend = (radial.slope - scale) / (r * r)
-    field = _field(k[_FIELD:].reshape(2, GRID, GRID), sx, sy, 2 * reach / (GRID - 3))
+    field = _field(nodes, sx, sy, 2 * reach_x / (GRID - 3), 2 * reach_y / (GRID - 3))
     (fx, fy), (fx_x, fy_x), (fx_y, fy_y) = field.value, field.by_x, field.by_y
     cross = sx * sy * bend
     by_s = (
@@ -90,10 +92,10 @@ def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool =
     if by_coefficients:
         none = np.zeros(shape)
         ox, oy = sx / r, sy / r
-        columns.append((none, none))
+        columns += [(none, none)] * len(REACHES)
         columns += [((ox * b).reshape(shape), (oy * b).reshape(shape)) for b in radial.basis()]
-        nodes = [b.reshape(shape) for b in field.basis()]
-        columns += [(b, none) for b in nodes] + [(none, b) for b in nodes]
+        of_nodes = [b.reshape(shape) for b in field.basis()]
+        columns += [(b, none) for b in of_nodes] + [(none, b) for b in of_nodes]
     return Displacement(
         (scale * sx + fx).reshape(shape), (scale * sy + fy).reshape(shape), by[0], by[1], columns
     )
@@ -146,14 +148,14 @@ class _Field(NamedTuple):
         return inner.reshape(GRID * GRID, n)
 
 
-def _field(f: Array, sx: Array, sy: Array, spacing: float) -> _Field:
+def _field(f: Array, sx: Array, sy: Array, lx: float, ly: float) -> _Field:
     width = GRID + 2 * _PAD
-    nodes = np.zeros((2, width, width))
-    nodes[:, _PAD:-_PAD, _PAD:-_PAD] = f
-    nodes = nodes.reshape(2, -1)
+    square = np.zeros((2, width, width))
+    square[:, _PAD:-_PAD, _PAD:-_PAD] = f
+    nodes = square.reshape(2, -1)
     middle = 0.5 * (GRID - 1)
-    column, wx, dx = _basis(sx / spacing + middle, 1 - _PAD, GRID)
-    row, wy, dy = _basis(sy / spacing + middle, 1 - _PAD, GRID)
+    column, wx, dx = _basis(sx / lx + middle, 1 - _PAD, GRID)
+    row, wy, dy = _basis(sy / ly + middle, 1 - _PAD, GRID)
     # Nodes -3, -2, ... are numbered from 0; a place's first node is the one before it.
     place = (row + (_PAD - 1)) * width + column + (_PAD - 1)
     value, by_x, by_y = (np.zeros((2, len(sx))) for _ in range(3))
@@ -163,7 +165,7 @@ def _field(f: Array, sx: Array, sy: Array, spacing: float) -> _Field:
         value += wy[b] * along
         by_y += dy[b] * along
         by_x += wy[b] * sum(dx[a] * of_row[a] for a in range(4))
-    return _Field(value, by_x / spacing, by_y / spacing, place, wx, wy)
+    return _Field(value, by_x / lx, by_y / ly, place, wx, wy)
 
 
 def _basis(t: Array, lowest: int, highest: int) -> tuple[NDArray[np.intp], Array, Array]:

@@ -50,7 +50,7 @@ def first_root(coefficients: Array) -> float:
 
 
 def _along_radius(distortion: Distortion, theta: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Distorted radii of angles, without tangential terms or a rich lens's field, and whether the image grows there."""
+    """Distorted radii of angles, without tangential terms or a field, and whether the image grows there."""
     names = coefficient_names(distortion.model)
     k = [
         0.0 if name in ("p1", "p2") or name[0] == "f" else value

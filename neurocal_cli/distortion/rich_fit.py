@@ -29,14 +29,13 @@ from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NAMES, RADII
-from neurocal_cli.distortion.similar_lens import farthest_angle
+from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NODES, RADII, REACHES
 from neurocal_cli.geometry import Array, cross_matrix
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 
 __all__ = ["with_displacement"]
 
-_N = len(NAMES) - 1  # nodes
+_N = len(NODES)
 _NODES = slice(5 + FIRST_NODE, 5 + FIRST_NODE + _N)  # of the shared parameters, which begin with A's entries
 _COLUMNS = np.arange(_N) + POSE.stop + FIRST_NODE  # of normal matrices
 _MARGIN = 1.05  # of the reach, beyond the points or the image's corners
@@ -63,10 +62,10 @@ def with_displacement(solution: Solution) -> Solution:
         Its problem has the prior as the restraint; `shared` is the covariance with the prior.
     """
     problem = solution.problem.with_model("rich")
-    problem = replace(problem, fixed=problem.fixed | {"reach"})
+    problem = replace(problem, fixed=problem.fixed | set(REACHES))
     state = solution.state
     if state.model != "rich":
-        k = np.concatenate([state.k, [_reach(problem, state)], np.zeros(_N)])
+        k = np.concatenate([state.k, _reaches(problem, state), np.zeros(_N)])
         state = replace(state, model="rich", k=k)
     start = replace(solution, problem=problem, adjusted=replace(solution.adjusted, state=state), shared=None)
     solution = _by_evidence(start)
@@ -75,17 +74,23 @@ def with_displacement(solution: Solution) -> Solution:
     return solution
 
 
-def _reach(problem: Problem, state: CameraState) -> float:
-    """Of the points, and of the image's corners unless these are much farther out."""
-    far = np.tan(0.5 * farthest_angle(problem.views, state))
-    corners = 0.0
+def _reaches(problem: Problem, state: CameraState) -> Array:
+    """Of the points, and of the image's border unless that is much farther out: |s|, |sx| and |sy|."""
+    views = problem.views
+    seen = (state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]
+    far, border = _extent(seen), np.zeros(3)
     if problem.points.image_size is not None:
-        width, height = problem.points.image_size
-        pixels = np.array([[u, v] for u in (0, width - 1) for v in (0, height - 1)], dtype=float)
-        matrix = problem.matrix(state.entries[0])
-        Z = Camera(Intrinsics.from_matrix(matrix), state.distortion).unproject(pixels)[:, 2]
-        corners = float(np.tan(0.5 * np.arccos(Z[np.isfinite(Z)])).max(initial=0.0))
-    return float(_MARGIN * np.clip(corners, far, _FARTHER * far))
+        u, v = ((side - 1) * np.array([0.0, 0.5, 1.0]) for side in problem.points.image_size)
+        camera = Camera(Intrinsics.from_matrix(problem.matrix(state.entries[0])), state.distortion)
+        rays = camera.unproject(np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2))
+        border = _extent(rays[np.isfinite(rays[:, 0])])
+    return np.asarray(_MARGIN * np.clip(border, far, _FARTHER * far))
+
+
+def _extent(directions: Array) -> Array:
+    """Largest |s|, |sx| and |sy| of directions (N, 3)."""
+    s = directions[:, :2] / (np.linalg.norm(directions, axis=1) + directions[:, 2])[:, None]
+    return np.abs(np.column_stack([np.hypot(*s.T), s])).max(axis=0, initial=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,8 +109,7 @@ class _Prior:
 def _by_evidence(solution: Solution) -> Solution:
     """Adjust, and find the sizes anew, until they stay."""
     problem, adjusted = solution.problem, solution.adjusted
-    batches, free = problem.views.batches, problem.free_camera
-    normal, _ = normal_blocks(batches, adjusted.state)
+    normal, _ = normal_blocks(problem.views.batches, adjusted.state)
     held = _held_out(problem, adjusted.state, normal)
     parts = _parts()
     scale = np.sqrt(normal[:, -1, -1].sum() / problem.views.n_equations) / adjusted.state.entries[0, 0]
@@ -114,7 +118,7 @@ def _by_evidence(solution: Solution) -> Solution:
     for _ in range(_ROUNDS):
         before = sizes if found is None else found.sizes
         found = _sizes(problem, adjusted.state, normal, parts, held, before, scale)
-        rows = np.linalg.cholesky(found.precision).T
+        rows: Array = np.linalg.cholesky(found.precision).T
         problem = replace(problem, restraint=_Prior(rows))
         adjusted = problem.adjust(replace(adjusted, state=adjusted.state))
         normal = adjusted.normal

@@ -31,6 +31,8 @@ from neurocal_cli.bundle_adjustment.view_covariance import counting_views, score
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.target_shape.uncertainty import covariance_basis
@@ -240,16 +242,33 @@ class _AtMinimum:
         view = self.points.view_index
         depth = (self.given.R[view, 2] * self.points.world).sum(axis=1) + self.given.t[view, 2]
         depths = np.array([depth.min(), median(depth), depth.max(), _DISTANT * depth.max()])
+        free, shared = self.free, self.covariance
+        if self.camera.distortion.model == "rich":
+            free, shared = _stored(self.calibration, self.views.pixel_scale)
         return projection_uncertainty(
-            self.views, self.state, self.camera, self.normal, self.free, self.free_poses,
-            self.cost / self.spare, image_grid(self.points.image_size), depths, self.covariance,
+            self.views, self.state, self.camera, self.normal, free, self.free_poses,
+            self.cost / self.spare, image_grid(self.points.image_size), depths, shared,
         )  # fmt: skip
 
 
 def _free(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) which of A's entries and of the distortion coefficients were estimated from these points."""
-    fixed = set(calibration.fixed)
+    """(5 + K,) which of A's entries and of the distortion coefficients the points alone determined.
+
+    A rich lens is judged with its displacement as it is.
+    """
+    fixed = {*calibration.fixed, *NODES}
     coefficients = coefficient_names(calibration.distortion_model)
     if calibration.straight_lines is not None:
         fixed |= set(coefficients)
     return np.array([name not in fixed for name in (*_ORDER, *coefficients)])
+
+
+def _stored(calibration: Calibration, pixel_scale: float) -> tuple[NDArray[np.bool_], Array]:
+    """What was estimated, and the covariance that the calibration holds, with its prior, normalised."""
+    names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
+    place = [names.index(name) for name in calibration.covariance_names]
+    to_entries = np.eye(len(names))
+    to_entries[:5, :5] = np.linalg.inv(calibration.intrinsics.entry_jacobian() * pixel_scale)
+    block = to_entries[:, place] @ calibration.covariance @ to_entries[:, place].T
+    free = np.array([name not in calibration.fixed for name in (*_ORDER, *names[5:])])
+    return free, np.asarray(block[np.ix_(free, free)])
