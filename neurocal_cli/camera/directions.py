@@ -13,8 +13,8 @@ through A. With rho = hypot(X, Y), d = |(X, Y, Z)| and theta = atan2(rho, Z):
                                                                   (Khomutenko, Garcia and Martinet 2016)
     rich           (x', y') = the fisheye's, and a smooth displacement: `rich_lens`
 
-omnidir's before its polynomial, double_sphere's and eucm's are (X, Y) / w. The image grows with theta where w > 0 and dw/dZ > 0, because w is homogeneous
-of degree one. What a model shows beyond that is no image.
+omnidir's before its polynomial, double_sphere's and eucm's are (X, Y) / w. The image grows with theta where
+w > 0 and dw/dZ > 0, because w is homogeneous of degree one. What a model shows beyond that is no image.
 """
 
 from __future__ import annotations

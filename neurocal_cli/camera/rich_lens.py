@@ -22,7 +22,7 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["FIRST_NODE", "GRID", "NAMES", "NODES", "RADII", "REACHES", "Displacement", "displacement"]
 
-RADII, GRID = 16, 10  # nodes of the profile, and of the field in each direction
+RADII, GRID = 16, 12  # nodes of the profile, and of the field in each direction
 REACHES = ("reach", "reach_x", "reach_y")  # they are never estimated
 NODES = (
     *(f"g{n:02d}" for n in range(1, RADII + 1)),

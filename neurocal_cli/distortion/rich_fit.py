@@ -44,6 +44,7 @@ _START = np.array([1.0, 10.0, 1.0, 10.0])  # sizes, in rms residuals
 _LARGEST, _SMALLEST = 1e3, 1e-4  # sizes, likewise
 _HELD = 1e-3  # size of what is held out, likewise
 _TINY, _SAME = 1e-300, 1e-6
+_LEAST_GAMMA, _LONGEST = 1e-6, 1.0  # of a step, in logarithms of the sizes
 _ROUNDS, _PASSES = 4, 60
 _SETTLED, _NEARLY = 0.02, 0.1  # relative changes of the sizes, within a round and between rounds
 
@@ -118,14 +119,14 @@ def _by_evidence(solution: Solution) -> Solution:
     for _ in range(_ROUNDS):
         before = sizes if found is None else found.sizes
         found = _sizes(problem, adjusted.state, normal, parts, held, before, scale)
-        rows: Array = np.linalg.cholesky(found.precision).T
+        rows = np.asarray(np.linalg.cholesky(found.precision).T, dtype=float)
         problem = replace(problem, restraint=_Prior(rows))
         adjusted = problem.adjust(replace(adjusted, state=adjusted.state))
         normal = adjusted.normal
         if np.abs(np.log(found.sizes / before)).max() < _NEARLY:
             break
     assert found is not None
-    last = _sizes(problem, adjusted.state, normal, parts, held, found.sizes, scale, passes=1)
+    last = _sizes(problem, adjusted.state, normal, parts, held, found.sizes, scale, learn=False)
     return replace(
         solution, problem=problem, adjusted=adjusted, shared=last.covariance, by_prior=_N - last.determined
     )
@@ -155,9 +156,9 @@ class _Found:
 
 def _sizes(
     problem: Problem, state: CameraState, normal: Array, parts: list[Array], held: Array,
-    sizes: Array, scale: float, passes: int = _PASSES,
+    sizes: Array, scale: float, learn: bool = True,
 ) -> _Found:  # fmt: skip
-    """MacKay's steps on the quadratic around a state."""
+    """MacKay's steps on the quadratic around a state; or what follows from sizes that are known."""
     free = problem.free_camera
     q = reduced(normal, free, problem.free_poses)
     S, g, cost = q.S.sum(axis=0), q.g.sum(axis=0), float(q.cost.sum())
@@ -166,7 +167,7 @@ def _sizes(
     spare = problem.views.n_equations - problem.n_parameters
     determined = 0.0
     variance = cost / max(spare, 1)
-    for _ in range(passes):
+    for _ in range(_PASSES):
         strength = variance / sizes**2
         P = held * (variance / (_HELD * scale) ** 2) + sum(
             s * K for s, K in zip(strength, parts, strict=True)
@@ -174,20 +175,20 @@ def _sizes(
         H, right = S.copy(), g.copy()
         H[nodes, nodes] += P
         right[nodes] -= P @ w
-        inverse = solve_scaled(H, np.eye(len(H)))
+        inverse, prior = solve_scaled(H, np.eye(len(H))), solve_scaled(P, np.eye(_N))
         step = inverse @ right
-        spread = solve_scaled(P, np.eye(_N)) - inverse[nodes, nodes]
-        gamma = np.maximum([s * (spread * K).sum() for s, K in zip(strength, parts, strict=True)], 1e-6)
         after = w + step[nodes]
-        energy = np.array([after @ K @ after for K in parts])
+        free = strength * [(prior * K).sum() for K in parts]
+        gamma = np.maximum(free - strength * [(inverse[nodes, nodes] * K).sum() for K in parts], _LEAST_GAMMA)
         determined = float(gamma.sum())
-        variance = (cost - 2 * g @ step + step @ S @ step) / max(spare - determined, 1)
-        new = np.clip(np.sqrt(energy / gamma), _SMALLEST * scale, _LARGEST * scale)
-        if passes == 1:
-            break
-        change = np.abs(np.log(new / sizes)).max()
+        last, variance = variance, (cost - 2 * g @ step + step @ S @ step) / max(spare - determined, 1)
+        # MacKay's step, longer for parts of which the data determine little, where it would be too short.
+        change = np.log([after @ K @ after for K in parts] / gamma / sizes**2) * (1 - 0.5 * gamma / free)
+        change = np.clip(change, -_LONGEST, _LONGEST) if learn else np.zeros(len(parts))
+        new = np.clip(sizes * np.exp(change), _SMALLEST * scale, _LARGEST * scale)
+        settled = max(np.abs(np.log(new / sizes)).max(), abs(np.log(variance / last))) < _SETTLED
         sizes = new
-        if change < _SETTLED:
+        if settled:
             break
     return _Found(sizes, P, variance * inverse, determined)
 
