@@ -15,6 +15,7 @@ from neurocal_cli.calibration import camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion, distort
 from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose
+from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array, euler_to_rotation
 
@@ -174,6 +175,7 @@ DISTORTIONS = {
     "omnidir": [0.9, -0.1, 0.03, 1e-3, -2e-3],
     "double_sphere": [-0.2, 0.58],
     "eucm": [0.6, 1.1],
+    "rich": [0.08, -0.03, 0.02, -0.005, 0.5, 0.4, 0.3, *np.random.default_rng(0).normal(0, 1e-3, len(NODES))],
 }
 SIZE = (640, 480)
 every_model = pytest.mark.parametrize("model", list(MODELS))

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
+from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import WIDE, project_directions
 from neurocal_cli.camera.distortion import Distortion
@@ -23,16 +24,31 @@ _RANGES = {
     "omnidir": ((0.1, 2.5), (-0.2, 0.2), (-0.03, 0.03), (-0.001, 0.001), (-0.001, 0.001)),
     "double_sphere": ((-0.4, 0.9), (0.2, 0.8)),
     "eucm": ((0.1, 0.8), (0.5, 2.0)),
-}
+    "rich": (
+        (0.0, 0.02), (0.0, 0.005), (0.0, 0.001), (0.0, 0.0001),
+        (0.6, 1.5), (0.6, 1.5), (0.6, 1.5), *((-0.003, 0.003),) * len(rich_lens.NODES),
+    ),
+}  # fmt: skip
 
 
 def lenses(model: str) -> SearchStrategy[Distortion]:
     """Random lenses of a model."""
+    if len(_RANGES[model]) > 10:
+        low, high = np.transpose(_RANGES[model])
+        return st.integers(0, 10**6).map(
+            lambda seed: Distortion(model, np.random.default_rng(seed).uniform(low, high))
+        )
     return st.tuples(*(st.floats(*pair) for pair in _RANGES[model])).map(lambda k: Distortion(model, k))
 
 
 def directions(theta: Array, phi: Array) -> Array:
     return np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+
+
+def spline(t: float) -> float:
+    """The cubic B-spline around 0."""
+    t = abs(t)
+    return (4 - 6 * t**2 + 3 * t**3) / 6 if t < 1 else max(2 - t, 0) ** 3 / 6
 
 
 def plainly(model: str, k: Array, ray: Array) -> Array:
@@ -53,6 +69,15 @@ def plainly(model: str, k: Array, ray: Array) -> Array:
                 y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
             ]
         )
+    if model == "rich":
+        s = np.array([X, Y]) / (1 + Z)
+        profile, field = k[7 : 7 + rich_lens.RADII], k[7 + rich_lens.RADII :]
+        h, r = k[4] / (rich_lens.RADII - 1), np.hypot(*s)
+        along = sum(g * (spline(r / h - i) - spline(r / h + i)) for i, g in enumerate(profile, 1))
+        middle, step = (rich_lens.GRID - 1) / 2, 2 * k[5:7] / (rich_lens.GRID - 3)
+        x, y = (np.array([spline(t - n) for n in range(rich_lens.GRID)]) for t in s / step + middle)
+        moved = field.reshape(2, rich_lens.GRID, rich_lens.GRID) @ x @ y
+        return plainly("fisheye", k[:4], ray) + along * s / r + moved
     if model == "double_sphere":
         xi, alpha = k
         second = np.sqrt(X * X + Y * Y + (xi + Z) ** 2)
@@ -94,6 +119,8 @@ def test_the_image_grows_up_to_the_largest_angle_and_no_farther(model: str, data
     lens = data.draw(lenses(model))
     if model == "omnidir":
         lens = Distortion(model, lens.coefficients * [1, 1, 1, 0, 0])
+    if model == "rich":  # whose displacement is small, and does not count
+        lens = Distortion(model, lens.coefficients[:7])
     limit = largest_angle(lens)
     theta = np.linspace(0, limit, 2000, endpoint=False)
     x = project_directions(model, lens.coefficients, *directions(theta, 0 * theta).T).x
@@ -109,6 +136,9 @@ def test_derivatives_behind_the_camera_too(model: str) -> None:
     k = {"fisheye": [0.02, -0.01, 0.002, 0], "omnidir": [1.1, -0.1, 0.02, 1e-3, 2e-3]}.get(
         model, [-0.2, 0.6] if model == "double_sphere" else [0.6, 1.1]
     )
+    if model == "rich":
+        k = [0.02, -0.01, 0.002, 0, 1.2, 1.1, 0.9]
+        k = np.append(k, np.random.default_rng(3).normal(0, 0.003, len(rich_lens.NODES)))
     camera = Camera(Intrinsics(300, 310, 320, 240, 1.56), Distortion(model, k))
     rng = np.random.default_rng(2)
     rays = directions(rng.uniform(0.05, 1.8, 50), rng.uniform(0, 2 * np.pi, 50)) * rng.uniform(1, 3, (50, 1))

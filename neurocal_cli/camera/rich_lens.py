@@ -43,7 +43,7 @@ class Displacement(NamedTuple):
     by_x, by_y : three arrays each
         By X, Y, Z.
     by_coefficient : list of pairs of arrays
-        By each of `NAMES`; zeros by the reaches. Empty where not asked for.
+        By each of `NAMES`. Empty where not asked for.
     """
 
     x: Array
@@ -92,7 +92,10 @@ def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool =
     if by_coefficients:
         none = np.zeros(shape)
         ox, oy = sx / r, sy / r
-        columns += [(none, none)] * len(REACHES)
+        grows = -radial.slope * r / reach
+        by_reaches = (ox * grows, oy * grows), (-fx_x * sx / reach_x, -fy_x * sx / reach_x)
+        columns += [(a.reshape(shape), b.reshape(shape)) for a, b in by_reaches]
+        columns.append(((-fx_y * sy / reach_y).reshape(shape), (-fy_y * sy / reach_y).reshape(shape)))
         columns += [((ox * b).reshape(shape), (oy * b).reshape(shape)) for b in radial.basis()]
         of_nodes = [b.reshape(shape) for b in field.basis()]
         columns += [(b, none) for b in of_nodes] + [(none, b) for b in of_nodes]

@@ -20,7 +20,13 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.bundle_adjustment.cross_validation import Minimum, disagreement, held_out
+from neurocal_cli.bundle_adjustment.cross_validation import (
+    FOLDS,
+    Minimum,
+    disagreement,
+    held_out,
+    reduced,
+)
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
@@ -193,7 +199,22 @@ class _AtMinimum:
 
     def _held_out(self) -> float:
         lost = held_out(self._minimum())
+        if self.camera.distortion.model == "rich":
+            lost = self._held_out_with_prior()
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
+
+    def _held_out_with_prior(self) -> Array:
+        """Squared errors of views that are left out, a rich lens's displacement being found without them.
+
+        With everything, points and prior are balanced; without a fold F of the views the minimum is at
+        -(H - S_F)^-1 g_F, where H^-1 is the covariance for noise of unit variance.
+        """
+        free, shared = _stored(self.calibration, self.views.pixel_scale)
+        q, fold = reduced(self.normal, free, self.free_poses), self.repeated.folds(FOLDS)
+        S, g = q.summed((fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float))
+        inverse = shared / (self.cost / self.spare)
+        steps = np.linalg.solve(inverse @ S - np.eye(len(shared)), (g @ inverse)[..., None])[..., 0]
+        return q.at(np.asarray(steps[fold], dtype=float))
 
     def _precision(self) -> tuple[float, float]:
         freedom = np.where(self.views.nearly_flat, 8, 11)
