@@ -22,6 +22,7 @@ from neurocal_cli.verdict.report import verdict_json, verdict_lines
 
 __all__ = [
     "align",
+    "calibration_json",
     "calibration_report",
     "evaluation_json",
     "evaluation_report",
@@ -31,6 +32,7 @@ __all__ = [
     "plural",
     "printable",
     "rounded",
+    "target_json",
     "target_lines",
 ]
 
@@ -138,6 +140,59 @@ def evaluation_json(evaluation: CameraEvaluation, verdict: Verdict | None = None
         "views": {name: number_or_none(view.rmse_px) for name, view in evaluation.views.items()},
         "fitted_views": list(evaluation.fitted_views),
         **({} if verdict is None else {"verdict": verdict_json(verdict)}),
+    }
+
+
+def calibration_json(calibration: Calibration) -> dict[str, Any]:
+    """Turn the summary of a calibration into values that JSON can hold; see `evaluation_json`."""
+    verdict = calibration.verdict
+    return {
+        "camera_name": calibration.camera_name,
+        "n_points": len(calibration.points),
+        "n_rejected": calibration.n_rejected,
+        "unit": calibration.unit,
+        "type": calibration.type,
+        "method": calibration.method,
+        "distortion": calibration.distortion_model,
+        "parameters": _parameters_json(calibration),
+        "rmse_px": number_or_none(calibration.rmse_px),
+        "max_px": number_or_none(calibration.max_px),
+        "views": {name: number_or_none(view.rmse_px) for name, view in calibration.views.items()},
+        "lens_choice": {name: number_or_none(error) for name, error in calibration.lens_choice.items()},
+        "target": target_json(calibration.target, calibration.unit),
+        "converged": bool(calibration.converged),
+        "stop_reason": str.__str__(calibration.stop_reason),
+        "warnings": list(calibration.warnings),
+        **({} if verdict is None else {"verdict": verdict_json(verdict)}),
+    }
+
+
+def _parameters_json(calibration: Calibration) -> dict[str, Any]:
+    values = dict(zip(INTRINSIC_NAMES, calibration.intrinsics.values().tolist(), strict=True))
+    names = coefficient_names(calibration.distortion_model)
+    values |= dict(zip(names, calibration.distortion.tolist(), strict=True))
+    return {
+        name: {
+            "value": value,
+            "std": number_or_none(calibration.std.get(name, math.nan)),
+            "fixed": name in calibration.fixed,
+        }
+        for name, value in values.items()
+    }
+
+
+def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
+    """Turn the target that was found into values that JSON can hold; None where it was taken as given."""
+    if target is None:
+        return None
+    return {
+        "unit": unit,
+        "flat": bool(target.flat),
+        "bend": number_or_none(float(target.bend())),
+        "stretch": number_or_none(float(target.stretch())),
+        "offset_rms": float(np.sqrt((target.offsets**2).sum(axis=1).mean())),
+        "std_rms": number_or_none(float(np.sqrt((target.std**2).mean()))),
+        "n_points": len(target.found),
     }
 
 

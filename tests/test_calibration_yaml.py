@@ -9,14 +9,19 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.made_calibration import made_calibration
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, ViewResult
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
+from neurocal_cli.io.calibration_yaml import (
+    calibration_lines,
+    format_calibration,
+    read_calibration,
+    write_calibration,
+)
 from neurocal_cli.io.yaml_text import number, quoted, text
 from neurocal_cli.io.yaml_tree import parse_yaml
 from neurocal_cli.points import Correspondences
@@ -181,6 +186,27 @@ def test_a_calibration_comes_back_to_the_last_bit(tmp_path_factory, cal):
     assert format_calibration(back) == format_calibration(cal)
 
 
+@pytest.fixture
+def all_files_are_long():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("neurocal_cli.io.calibration_yaml._MOST_POINTS", 0)
+        patch.setattr("neurocal_cli.io.text_columns.LONGEST", 2)
+        patch.setattr("neurocal_cli.io.observations_yaml.LONGEST", 2)
+        yield
+
+
+@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(cal=calibrations())
+def test_so_does_one_whose_tables_are_columns(tmp_path_factory, all_files_are_long, cal):
+    path = tmp_path_factory.getbasetemp() / "cal.yaml"
+    known = dict.fromkeys(POSE_NAMES[:4], 0.5)
+    cal = replace(cal, views={name: replace(view, std=known) for name, view in cal.views.items()})
+    write_calibration(cal, path)
+    assert yaml.load(path.read_text(), yaml.CSafeLoader)["neurocal"]["format"] == 2
+    assert same(cal, read_calibration(path))
+    assert format_calibration(cal, by_rows=True).count("format: 1") == 1
+
+
 @settings(max_examples=20, deadline=None)
 @given(cal=calibrations(), style=st.sampled_from([None, True, False]), slow=st.booleans())
 def test_a_file_written_anew_by_another_program_reads_the_same(tmp_path_factory, cal, style, slow):
@@ -263,7 +289,7 @@ def test_an_unknown_image_size_is_zero_to_ros_and_none_to_us(path):
 
 
 def test_the_text_may_be_indented_into_another_file(path):
-    content = format_calibration(made_calibration(2))
+    content = "\n".join([*calibration_lines(made_calibration(2)), ""])
     rig = "left:\n" + re.sub("^", "  ", content, flags=re.MULTILINE).rstrip(" ")
     assert parse_yaml(rig, "rig")["left"] == parse_yaml(content, "cal")
 
@@ -303,7 +329,7 @@ FAULTS = [
         "",
         ": has no neurocal block, so the poses and points are missing; it can serve as --in",
     ),
-    (r"format: 1", "format: 2", ": neurocal.format is 2, not 1; update neurocal"),
+    (r"format: 1", "format: 3", ": neurocal.format is 3, not 1 or 2; update neurocal"),
     (r"type: 1\n", "type: 5\n", ": neurocal.type must be 1, 2, 3 or 4, found 5"),
     (r"seed: 0", "seed: -1", ": neurocal.seed must be a whole number, 0 or more, found -1"),
     (r"converged: true", "converged: perhaps", ": neurocal.converged must be true or false, found 'perhaps'"),
@@ -346,8 +372,8 @@ FAULTS = [
     (r'\["view00", 0.0, ', '["view00", 1e300, ', ", row 1: X,Y,Z must be finite numbers of a"),
     (r'\["view00", 0.0, ', '["view00", ', ": neurocal.observations.rows[0] must be a list of 6 values"),
     (r"rows:\n[\s\S]*", "rows: []\n", ": neurocal.observations.rows must be at least one row"),
-    (r"type: 1\n", "type: 1\n  type: 1\n", ":13: the key 'type' appears twice"),
-    (r"type: 1\n", "type: &a 1\n  other: *a\n", ":13: aliases (*name) are not read"),
+    (r"type: 1\n", "type: 1\n  type: 1\n", ":15: the key 'type' appears twice"),
+    (r"type: 1\n", "type: &a 1\n  other: *a\n", ":15: aliases (*name) are not read"),
     (r"distortion: none", "distortion: bent", ": neurocal.distortion: distortion model 'bent' is unknown"),
 ]
 
@@ -355,6 +381,34 @@ FAULTS = [
 @pytest.mark.parametrize(("pattern", "replacement", "expected"), FAULTS, ids=[f[2][:50] for f in FAULTS])
 def test_a_fault_is_named_with_its_key_and_remedy(path, good, pattern, replacement, expected):
     content, count = re.subn(pattern, lambda _: replacement, good, count=1)
+    assert count == 1
+    assert complaint(path, content).startswith(expected)
+
+
+LONG_FAULTS = [
+    (r"R_x: \['", "R_x: ['9,", ": neurocal.views must be columns of one length"),
+    (r"R_x: \['", "R_x: ['1e999,", ": neurocal.views must be columns of one length"),
+    (r"R_x: \['2", "R_x: ['x2", ": neurocal.views.R_x[0] must be numbers with commas between them"),
+    (r"R_x: \['2", "R_x: ['3", ": neurocal.views: R11 to R33 and R_x, R_y, R_z disagree"),
+    (r"R_x: \['2\.5", "R_x: ['null", ": neurocal.views.R_x must be n finite numbers"),
+    (r"    rmse_px: .*\n", "", ": the key neurocal.views.rmse_px is missing"),
+    (r'name: \["view00", "view01', 'name: ["view00", "view00', ": neurocal.views.name must be names that"),
+    (r'name: \["view00", "view01', 'name: ["view00", "other', ": neurocal.observations: the view 'view01'"),
+    (r"'0-159'", "'0-200'", ": neurocal.observations.views[0][1] must be numbers below 190"),
+    (r"'0-159'", "'0-15'", ": neurocal.observations.views[0][2] must be 16 numbers"),
+    (r"'0-159'", "'all'", ": neurocal.observations.views[0][1] must be whole numbers and ranges"),
+    (r"'0-159', ", "", ": neurocal.observations.views[0] must be a list of 4 texts"),
+    (r"      Y: .*\n", "", ": neurocal.observations.places must be the columns X, Y, Z"),
+    (r"data: \['1\.0,", "data: ['", ": neurocal.network.V.data must be 24 finite numbers"),
+]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "replacement", "expected"), LONG_FAULTS, ids=[f[2][:50] for f in LONG_FAULTS]
+)
+def test_a_fault_in_columns_is_named_too(path, monkeypatch, pattern, replacement, expected):
+    monkeypatch.setattr("neurocal_cli.io.calibration_yaml._MOST_POINTS", 0)
+    content, count = re.subn(pattern, lambda _: replacement, format_calibration(made_calibration(2)), count=1)
     assert count == 1
     assert complaint(path, content).startswith(expected)
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support.distorted import LENSES
 from support.plain_projection import project
 
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
@@ -15,7 +16,6 @@ from neurocal_cli.calibration import camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion, distort
 from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose
-from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array, euler_to_rotation
 
@@ -164,26 +164,13 @@ def test_a_mirrored_camera_points_on_both_sides_and_a_camera_at_infinity_are_ref
 # Projection, beside the same written plainly
 
 
-DISTORTIONS = {
-    "none": [],
-    "k1": [-0.28],
-    "k1k2": [-0.2286, 0.1904],
-    "k1k2p1p2": [-0.26, 0.06, 2e-3, -1e-3],
-    "plumb_bob": [-0.26, 0.06, 2e-3, -1e-3, 0.03],
-    "rational": [0.4, -0.2, 1e-3, 2e-3, 0.05, 0.7, -0.1, 0.02],
-    "fisheye": [0.08, -0.03, 0.02, -0.005],
-    "omnidir": [0.9, -0.1, 0.03, 1e-3, -2e-3],
-    "double_sphere": [-0.2, 0.58],
-    "eucm": [0.6, 1.1],
-    "rich": [0.08, -0.03, 0.02, -0.005, 0.5, 0.4, 0.3, *np.random.default_rng(0).normal(0, 1e-3, len(NODES))],
-}
 SIZE = (640, 480)
 every_model = pytest.mark.parametrize("model", list(MODELS))
 with_and_without_skew = pytest.mark.parametrize("theta", [np.pi / 2, 1.5])
 
 
 def camera_with(model: str, theta: float = np.pi / 2) -> Camera:
-    return Camera(Intrinsics(500.0, 510.0, 320.0, 240.0, theta), Distortion(model, DISTORTIONS[model]), SIZE)
+    return Camera(Intrinsics(500.0, 510.0, 320.0, 240.0, theta), Distortion(model, LENSES[model]), SIZE)
 
 
 def some_points(n: int = 40) -> Array:
@@ -230,7 +217,7 @@ def test_projecting_is_multiplying_by_p_and_dividing(theta: float) -> None:
 def test_skew_acts_after_distortion(model: str) -> None:
     camera, points = camera_with(model, 1.4), some_points()
     x, y = (points[:, :2] / points[:, 2:]).T
-    distorted = np.column_stack([*distort(model, DISTORTIONS[model], x, y), np.ones(len(x))])
+    distorted = np.column_stack([*distort(model, LENSES[model], x, y), np.ones(len(x))])
     np.testing.assert_allclose(camera.project(points)[0], (distorted @ camera.A.T)[:, :2], rtol=1e-12)
 
 

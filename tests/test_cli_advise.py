@@ -52,7 +52,9 @@ def test_advised_views_are_twice_as_good_as_random_ones() -> None:
 @pytest.mark.slow
 def test_advised_views_are_twice_as_good_as_random_ones_in_a_hundred_sets() -> None:
     ratios = np.array([advised_over_random(seed) for seed in range(100)])
-    assert np.median(ratios) > 2
+    assert np.median(ratios) > 5
+    assert ratios.mean() > 5
+    assert np.mean(ratios > 2) > 0.9
     assert (ratios > 1).all()
 
 

@@ -42,7 +42,7 @@ def refuse_to_work(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> Non
 def test_the_calibration_goes_to_stdout_and_the_summary_to_stderr(points: Path) -> None:
     result = run("calibrate", points)
     assert result.exit_code == 0, result.stderr
-    assert result.stdout.startswith("camera_name: camera\n")
+    assert result.stdout.startswith("%YAML 1.1\n---\ncamera_name: camera\n")
     assert "alpha_u [px]" in result.stderr
     assert "random start" in result.stderr
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.real_data import RealFiles
+from support.wide_cameras import WIDE_LENSES, wide_camera, wide_points
 
 from neurocal_cli import Camera, Correspondences, Intrinsics, Pose, read_points, write_points
 from neurocal_cli.calibration import Verdict
@@ -95,6 +96,29 @@ def test_points_of_both_cameras_come_into_the_same_row(lens: Distortion, pose: P
     X = world() @ pair.matrices.R1.T
     m = np.column_stack([X, np.ones(len(X))]) @ pair.matrices.P1.T
     assert np.abs(left.pixels - m[:, :2] / m[:, 2:]).max() < 1e-9
+
+
+@pytest.mark.parametrize("model", WIDE_LENSES)
+@pytest.mark.parametrize("alpha", [None, 0.0, 1.0])
+def test_rows_of_wide_lenses_agree_and_what_is_behind_is_left_out(model: str, alpha: float | None) -> None:
+    left, right = wide_camera(model), replace(wide_camera(model), name="right")
+    pair = rectified_pair(as_rig(CameraSet((left, right), (VERGING,), unit="mm")), alpha)
+    f = pair.matrices.P1[0, 0]
+    if alpha is None:  # the scale of the middle, whatever the model calls its focal length
+        assert f == pytest.approx(left.project_jacobian(np.array([[0, 0, 1.0]]))[1][0, 1, 1])
+    assert 40 < f < 400
+    X = 900 * wide_points(200, 75)
+    X = np.concatenate([X, [[900.0, 50.0, -60.0]]])  # 94 degrees from the left camera's axis
+    sides = []
+    for side, pose in enumerate((Pose(np.eye(3), np.zeros(3)), VERGING)):
+        pixels, there = (left, right)[side].project(pose.to_camera(X))
+        assert there[-1]
+        ids = [str(k) for k in np.flatnonzero(there)]
+        points = Correspondences(X[there], pixels[there], image_size=left.image_size, point=ids)
+        sides.append(rectify_points(pair, side, points))
+    assert "200" not in sides[0].point  # type: ignore[operator]
+    assert len(sides[0]) > 150
+    assert row_error(pair, *sides).max_px < 1e-7 * f
 
 
 def test_covariances_move_with_the_points() -> None:

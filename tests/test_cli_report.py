@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
+from base64 import b64decode
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -14,9 +15,10 @@ from support.command_line import run
 from support.made_calibration import made_calibration
 from support.rigs import random_rig, sides
 
-from neurocal_cli import write_calibration, write_rig
+from neurocal_cli import write_calibration, write_points, write_rig
 from neurocal_cli.calibration import Rejected, Verdict
 from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map
+from neurocal_cli.io.images import encode_png, parse_image
 from neurocal_cli.io.result_files import write_result
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 
@@ -124,6 +126,95 @@ def test_a_lean_file_and_a_json_file_have_pages(tmp_path: Path) -> None:
     result = run("report", tmp_path / "lean.json")
     assert result.exit_code == 0, result.stderr
     assert "Residuals" not in Page(result.stdout).text
+
+
+def photographs(folder: Path, names: tuple[str, ...], size: tuple[int, int] = (640, 480)) -> Path:
+    """A noisy image for each name, which a JPEG file can hardly shorten."""
+    folder.mkdir(exist_ok=True)
+    grey = np.random.default_rng(0).integers(0, 256, (size[1], size[0]), np.uint8)
+    data = encode_png(grey)
+    for name in names:
+        (folder / f"{name}.png").write_bytes(data)
+    return folder
+
+
+def test_photographs_are_shown_under_the_residuals_within_3_mb(tmp_path: Path) -> None:
+    calibration = made_calibration(50)
+    write_calibration(calibration, tmp_path / "camera.yaml")
+    names = calibration.points.view_names
+    folder = photographs(tmp_path / "images", names[1:])
+    result = run("report", tmp_path / "camera.yaml", "--images", folder)
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr.startswith("note: no image of 1 views, such as view00, in ")
+    assert len(result.stdout.encode()) < 3e6
+    page = Page(result.stdout)
+    assert page.tags.count("image") == 49
+    links = [value for name, value in page.attributes if name in ("src", "href")]
+    assert all(link.startswith("data:image/jpeg;base64,") for link in links)
+    shown = parse_image(b64decode(links[0].partition(",")[2]))
+    assert shown.size[0] / shown.size[1] == pytest.approx(640 / 480, rel=0.02)
+    assert "img-src data:" in result.stdout
+
+
+def test_photographs_of_another_camera_are_refused(camera_file: Path, tmp_path: Path) -> None:
+    other = photographs(tmp_path / "other", ("view01",), (64, 48))
+    result = run("report", camera_file, "--images", other)
+    assert (result.exit_code, result.stdout) == (1, "")
+    assert "view01.png: has 64 x 48 px, but the camera 640 x 480; give the images" in result.stderr
+    nobody = photographs(tmp_path / "nobody", ("a", "b"))
+    result = run("report", camera_file, "--images", nobody)
+    assert result.exit_code == 1
+    assert "no image has the name of a view, such as view00" in result.stderr
+    assert run("report", camera_file, "--images", other, "--images", other).exit_code == 2
+    assert run("report", camera_file, *["--images", other] * 3).exit_code == 2
+
+
+def test_points_left_out_are_crosses() -> None:
+    drawn = residual_map(np.zeros((1, 2)), np.zeros((1, 2)), (640, 480), left_out=np.array([[50.0, 60.0]]))
+    assert 'd="M43.6 53.6L56.4 66.4M43.6 66.4L56.4 53.6" class="out"' in drawn
+
+
+def test_calibrate_makes_the_page_in_the_same_run_and_tells_how(tmp_path: Path) -> None:
+    write_points(made_calibration(3).points, tmp_path / "my points.csv")
+    words = ["calibrate", tmp_path / "my points.csv", "--no-skew", "-o", tmp_path / "camera.yaml"]
+    result = run(*words, "--html", tmp_path / "page.html")
+    assert result.exit_code == 0, result.stderr
+    page = Page((tmp_path / "page.html").read_text())
+    typed = (
+        f"neurocal calibrate '{tmp_path / 'my points.csv'}' --no-skew -o {tmp_path / 'camera.yaml'} --html"
+    )
+    assert typed in page.text
+    assert hashlib.sha256((tmp_path / "my points.csv").read_bytes()).hexdigest() in page.text
+    assert f"numpy {np.__version__}" in page.text
+    before = (tmp_path / "camera.yaml").read_bytes()
+    assert run(*words).exit_code == 0
+    assert (tmp_path / "camera.yaml").read_bytes() == before
+    same = run("report", tmp_path / "camera.yaml").stdout
+    assert (
+        same.split("How to repeat it")[0] == (tmp_path / "page.html").read_text().split("How to repeat it")[0]
+    )
+    result = run(*words, "--html", tmp_path / "camera.yaml")
+    assert result.exit_code == 2
+    result = run(*words[:-2], "--html", tmp_path / "my points.csv")
+    assert result.exit_code == 2
+    assert "is an input and would be overwritten" in result.stderr
+
+
+def test_stereo_makes_the_page_in_the_same_run(tmp_path: Path) -> None:
+    left, right = sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1)
+    write_points(left, tmp_path / "l.csv")
+    write_points(right, tmp_path / "r.csv")
+    words = ["stereo", tmp_path / "l.csv", tmp_path / "r.csv", "--no-skew", "-o", tmp_path / "rig.yaml"]
+    result = run(*words, "--html", tmp_path / "page.html")
+    assert result.exit_code == 0, result.stderr
+    page = Page((tmp_path / "page.html").read_text())
+    for name in ("l.csv", "r.csv"):
+        assert hashlib.sha256((tmp_path / name).read_bytes()).hexdigest() in page.text
+    lefts, rights = (photographs(tmp_path / side, one.view_names, one.image_size or (0, 0))
+                     for side, one in (("left", left), ("right", right)))  # fmt: skip
+    result = run("report", tmp_path / "rig.yaml", "--images", lefts, "--images", rights)
+    assert result.exit_code == 0, result.stderr
+    assert Page(result.stdout).tags.count("image") == left.n_views + right.n_views
 
 
 def test_fifty_views_are_less_than_3_mb(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def test_the_rig_is_the_librarys(files: tuple[Path, Path], tmp_path: Path) -> No
 
 def test_the_summary_says_what_was_found(files: tuple[Path, Path]) -> None:
     result = run("stereo", *files, "--no-skew")
-    assert result.stdout.startswith("left:\n  camera_name: left\n")
+    assert result.stdout.startswith("%YAML 1.1\n---\nleft:\n  camera_name: left\n")
     text = result.stderr
     assert "rig: 4 pairs of views, left 270 points in 5 views, right 216 points in 4 views" in text
     assert "note: only the left camera saw left02" in text

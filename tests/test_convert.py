@@ -220,10 +220,15 @@ def test_a_dictionary_of_mtx_and_dist_is_a_camera(key: str, tmp_path: Path) -> N
 
 REFUSED = {
     '{"K": [600, 0, 320, 0, 600, 240, 0, 0, 1], "lens_dist": [1, 2]}': "the key 'lens_dist' may be the dist",
-    "cam0: {camera_model: ds, intrinsics: [1, 1, 1, 1, 1, 1]}": "the camera model 'ds' is not known",
+    "cam0: {camera_model: pinhole-fov, intrinsics: [1, 1, 1, 1]}": "model 'pinhole-fov' is not known",
+    "cam0: {camera_model: ds, distortion_model: radtan, intrinsics: [1, 1, 1, 1, 1, 1]}": "'radtan' is not",
+    "cam0: {camera_model: omni, distortion_model: none, intrinsics: [1, 1, 1, 1]}": "intrinsics",
     KALIBR.replace("radtan", "fov"): "the distortion model 'fov' is not known",
-    "pinhole: {fx: 1, fy: 1, cx: 1, cy: 1, skew: 0, width: 3, height: 3}\nmodel: omnidirectional_universal\n"
-    "mirror_offset: 1.2\nradial_tangential: {radial: [0, 0], t1: 0, t2: 0}": "'omnidirectional_universal'",
+    "pinhole: {fx: 1, fy: 1, cx: 1, cy: 1, skew: 0}\nmodel: kannala_brandt\n": "'kannala_brandt'",
+    "pinhole: {fx: 1, fy: 1, cx: 1, cy: 1, skew: 0}\nmirror_offset: 1.2": "mirror_offset'",
+    "{K: [9, 0, 3, 0, 9, 2, 0, 0, 1], xi: 1.2}": "has xi of an omnidirectional camera without its distortion",
+    "{K: [9, 0, 3, 0, 9, 2, 0, 0, 1], xi: 1.2, D: [1, 2, 3, 4, 5]}": "and 5 coefficients of the",
+    "{K: [9, 0, 3, 0, 9, 2, 0, 0, 1], xi: 1, D: [1, 2, 3, 4], distortion_model: plumb_bob}": "'plumb_bob'",
     "1 THIN_PRISM_FISHEYE 640 480 1 2 3\n": ":1: the camera model 'THIN_PRISM_FISHEYE' is not known",
     "# a list\n1 OPENCV 640 480 1 2 3\n": ":2: is no line of a OPENCV camera",
     "1 PINHOLE 640 480 1 2 3 4\n2 PINHOLE 640 480 1 2 3 4\n": "holds 2 cameras, but not how they stand",

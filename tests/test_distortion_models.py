@@ -65,7 +65,9 @@ def test_undistort_inverts_distort(model: str, points: tuple[np.ndarray, ...]) -
     assert np.array(back) == pytest.approx(np.array([x, y]), abs=1e-11)
 
 
-@pytest.mark.parametrize("model", [name for name in MODELS if name != "none"])
+@pytest.mark.parametrize(
+    "model", [name for name in MODELS if name not in ("none", "omnidir", "double_sphere", "eucm", "rich")]
+)
 def test_opencv_bends_the_same_way(model: str, points: tuple[np.ndarray, ...]) -> None:
     cv2 = pytest.importorskip("cv2")
     x, y = points

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from consoles import PAGES, ROOT, agrees, blocks, prepare, run, run_page
+from consoles import PAGES, ROOT, agrees, blocks, run_page
 from reference import pages
 
 import neurocal_cli
@@ -152,55 +152,6 @@ def test_the_architecture_page_is_of_this_package() -> None:
     assert modules
     for path in (*way, *(module.replace(".", "/") + ".py" for module in modules)):
         assert (package / path).exists(), path
-
-
-STAND_INS = """
-cp sample_data/flat.csv points.csv
-cp points.csv moved.csv
-cp points.csv other_points.csv
-neurocal calibrate points.csv --distortion k1 -o camera.yaml
-cat > larger.py <<'END'
-import cv2
-for n in range(1, 7):
-    image = cv2.imread(f"sample_data/board0{n}.png")
-    image = cv2.copyMakeBorder(image, 90, 90, 120, 120, cv2.BORDER_REPLICATE)
-    for name in (f"left0{n}.png", f"left0{n}.jpg", "frame.png"):
-        cv2.imwrite(name, image)
-END
-python larger.py
-echo 'planes: [{name: floor, cols: 9, rows: 6, square: 25.0}]' > corner.yaml
-for side in left right; do
-    for name in $side more_$side; do cp sample_data/stereo_$side.csv $name.csv; done
-    neurocal calibrate $side.csv -o $side.yaml
-done
-neurocal stereo left.csv right.csv -o rig.yaml
-cp sample_data/matches.csv matches.csv
-neurocal lens fit sample_data/zoom.csv --distortion none -o lens.yaml
-cat > cameras.csv <<'END'
-zoom,alpha_u,alpha_v,u0,v0
-24,1201,1200,960,541
-35,1749,1748,961,540
-50,2503,2499,962,540
-70,3498,3497,963,538
-END
-"""
-
-
-@pytest.mark.slow
-def test_the_examples_of_the_help_run(tmp_path: Path) -> None:
-    """In a folder that has files of the names that they use."""
-    start = tmp_path / "start"
-    start.mkdir()
-    environment = prepare(start)
-    made = run(["sh", "-euc", STAND_INS], start, environment)
-    assert made.returncode == 0, made.stdout
-    texts = [text.partition("## Examples")[2] for text in pages().values()]
-    examples = dict.fromkeys(line for text in texts for line in text.splitlines() if "neurocal " in line)
-    for number, example in enumerate(examples):
-        folder = tmp_path / str(number)
-        shutil.copytree(start, folder, symlinks=True)
-        ended = run(["sh", "-euc", example], folder, environment)
-        assert ended.returncode == 0, f"$ {example}\n{ended.stdout}"
 
 
 def test_pictures_have_a_script() -> None:

@@ -19,7 +19,7 @@ HOMES = {
     "click": ("commands/",),
     "rich": ("commands/",),
     "matplotlib": (
-        "plots.py",
+        "plots/",
         "target_plot.py",
         "simulation/plots.py",
         "planning/plots.py",
@@ -31,6 +31,7 @@ HOMES = {
         "detection/",
         "simulation/",
         "io/images.py",
+        "io/video.py",
         "io/board_pictures.py",
         "distortion/remapping.py",
     ),

@@ -247,3 +247,12 @@ def test_photographs_calibrate_better_than_with_opencv_corners(real_files: RealF
         pixels.append(measured.pixels.astype(np.float32))
     rms = cv2.calibrateCamera(places_3d, pixels, image.shape[::-1], None, None)[0]
     assert rms < 0.16  # 0.195 with cornerSubPix
+
+
+def test_a_grid_beside_the_board_gives_no_points_and_no_error(real_files: RealFiles) -> None:
+    cv2 = pytest.importorskip("cv2")
+    finding = pytest.importorskip("neurocal_cli.detection.finding.grids")
+    (path,) = real_files("opencv_stereo/right06.jpg")
+    image = cv2.imread(str(path), 0)
+    kept = [len(measure(image, grid).kind) for grid in finding.find_grids(image)]
+    assert kept == [93, 0]

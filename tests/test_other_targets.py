@@ -87,7 +87,10 @@ def test_detect_says_what_the_image_shows(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "said"),
     [
-        (b"\0\0\0\x20ftypisom\0\0", "is a video, but images are wanted; extract some, as with `ffmpeg"),
+        (
+            b"\0\0\0\x20ftypisom\0\0",
+            "is a video that cannot be decoded here, as it is damaged or OpenCV has no codec",
+        ),
         (b"RIFF\0\0\0\0AVI LIST", "is a video"),
         (b"\x1aE\xdf\xa3\0\0", "is a video"),
         (b"\0\0\0\x18ftypheic\0\0", "is a HEIC file, which is not read; save it as PNG"),

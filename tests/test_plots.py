@@ -7,13 +7,21 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+from support.command_line import run
 from support.made_calibration import made_calibration
+from support.rigs import random_rig, sides
 from support.slow_cases import slow_but
 
-from neurocal_cli import NeurocalError
+from neurocal_cli import NeurocalError, write_calibration, write_points
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.plots import draw_calibration
+from neurocal_cli.plots import CAMERA_PANELS, RIG_PANELS, SPACE_PANELS
+from neurocal_cli.plots.pages import draw_calibration, draw_camera, draw_points_in_space, draw_rig
+from neurocal_cli.plots.subject import Subject
+from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
+from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
+from neurocal_cli.stereo.rig import Rig
 
 BEGINNINGS = {"png": b"\x89PNG\r\n", "pdf": b"%PDF", "svg": b"<?xml"}
 
@@ -48,7 +56,64 @@ def test_missing_matplotlib_is_said_with_what_to_install(monkeypatch: pytest.Mon
 def test_drawing_leaves_the_state_of_pyplot_alone() -> None:
     code = (
         "import sys; from support.made_calibration import made_calibration;"
-        "from neurocal_cli.plots import draw_calibration; draw_calibration(made_calibration());"
+        "from neurocal_cli.plots.pages import draw_calibration; draw_calibration(made_calibration());"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, check=True)
+
+
+@pytest.mark.parametrize("panel", slow_but(("uncertainty", "poses"), CAMERA_PANELS))
+def test_each_panel_of_a_camera_is_a_picture(panel: str) -> None:
+    assert draw_calibration(made_calibration(3), "svg", panel).startswith(BEGINNINGS["svg"])
+
+
+def test_a_camera_without_a_calibration_is_drawn_with_the_points_it_was_judged_by() -> None:
+    cal = made_calibration(2)
+    subject = Subject.of(cal.camera, cal.points)
+    assert subject.evidence is None
+    assert b"known only of a calibration" in draw_camera(subject, "svg", "uncertainty").replace(
+        b"&#x20;", b" "
+    )
+    assert draw_camera(subject).startswith(BEGINNINGS["png"])
+
+
+@pytest.fixture(scope="module")
+def rig() -> Rig:
+    return calibrate_stereo(*sides(random_rig(np.random.default_rng(1), "verging", 4), 0.1), skew=False)
+
+
+@pytest.mark.parametrize("panel", [None, *slow_but(("views", "poses"), RIG_PANELS)])
+def test_a_rig_is_drawn(rig: Rig, panel: str | None) -> None:
+    assert draw_rig(rig, "png", panel).startswith(BEGINNINGS["png"])
+
+
+@pytest.mark.parametrize("panel", [None, *slow_but(("depths",), SPACE_PANELS)])
+def test_points_in_space_are_drawn(rig: Rig, panel: str | None) -> None:
+    evaluation = evaluate_stereo(rig.left, rig.right)
+    assert draw_points_in_space(evaluation, None, "png", panel).startswith(BEGINNINGS["png"])
+    if panel is None:
+        evaluation = evaluate_rig(rig)
+        assert draw_points_in_space(evaluation, rig, "png", panel).startswith(BEGINNINGS["png"])
+
+
+def test_the_commands_draw_a_page_and_single_panels(tmp_path: Path) -> None:
+    cal = made_calibration(3)
+    write_points(cal.points, tmp_path / "points.csv")
+    write_calibration(cal, tmp_path / "camera.yaml")
+    words = ["evaluate", "camera", tmp_path / "camera.yaml"]
+    result = run(*words, "--plot", tmp_path / "page.png", "--plot", f"views={tmp_path / 'views.pdf'}")
+    assert result.exit_code == 0, result.stderr
+    assert (tmp_path / "page.png").read_bytes().startswith(BEGINNINGS["png"])
+    assert (tmp_path / "views.pdf").read_bytes().startswith(BEGINNINGS["pdf"])
+    assert len((tmp_path / "page.png").read_bytes()) > 3 * len((tmp_path / "views.pdf").read_bytes())
+    for name, message in (
+        (f"views={tmp_path / 'points.txt'}", "not a picture file"),
+        (tmp_path / "camera.yaml", "not a picture file"),
+        (tmp_path / "no" / "views.png", "no"),
+    ):
+        result = run(*words, "--plot", name)
+        assert result.exit_code in (1, 2)
+        assert message in result.stderr
+    same = ["--plot", tmp_path / "a.png", "--plot", f"views={tmp_path / 'a.png'}"]
+    assert run("calibrate", tmp_path / "points.csv", *same).exit_code == 2
+    assert not (tmp_path / "a.png").exists()

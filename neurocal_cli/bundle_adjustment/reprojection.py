@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
+from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.projection import ENTRIES, project_points, project_with_jacobian
@@ -24,6 +25,7 @@ __all__ = [
     "CameraState",
     "camera_columns",
     "derivatives",
+    "farthest_angle",
     "normal_blocks",
     "predicted_pixels",
     "residuals",
@@ -155,6 +157,12 @@ def predicted_pixels(
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         u, v, seen = project_points(state.entries[0], state.model, state.k, X, Y, Z)
         return np.where(seen[:, None], np.column_stack([u, v]), np.nan), seen
+
+
+def farthest_angle(views: Views, state: CameraState) -> float:
+    """Largest angle of a point from the axis [rad]."""
+    X, Y, Z = ((state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]).T
+    return float(np.arctan2(np.hypot(X, Y), Z).max())
 
 
 def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Array) -> NDArray[np.bool_]:

@@ -18,7 +18,7 @@ _NEWTON_STEPS = 30
 _STEP = 1e-9  # rad; the next step, its square, is rounding
 _ACCURACY = 1e-11  # of the point projected again: more is no inverse
 _HALVINGS = 40
-_SMALLEST = 1e-100  # coefficient; what is less overflows, and has no root near any image
+_SMALLEST = 1e-30  # coefficient; what is less overflows, and has no root near any image
 _REAL = 1e-6  # imaginary part of a double root, over its real part, that rounding makes
 
 

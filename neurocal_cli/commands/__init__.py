@@ -16,8 +16,8 @@ from typing import Any
 import click
 
 from neurocal_cli import __version__
-from neurocal_cli.commands.streams import one_line, say
-from neurocal_cli.errors import NeurocalError
+from neurocal_cli.commands.streams import TYPED, one_line, set_verbosity
+from neurocal_cli.errors import NeurocalError, UsageError
 
 __all__ = ["neurocal"]
 
@@ -72,10 +72,16 @@ class _LazyGroup(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, text in self._summaries.items() if text])
 
-    def make_context(self, *args: Any, **kwargs: Any) -> click.Context:
-        """Parse; ``--help`` is shown here."""
+    def make_context(
+        self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
+    ) -> click.Context:
+        """Parse, and keep what was typed; ``--help`` is shown here."""
+        words = tuple(args)  # parsing takes them away
         with _one_line_errors():
-            return super().make_context(*args, **kwargs)
+            ctx = super().make_context(info_name, args, parent, **extra)
+        if parent is None:
+            ctx.meta[TYPED] = words
+        return ctx
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command."""
@@ -105,7 +111,7 @@ def _one_line_errors() -> Iterator[None]:
         if os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0"):
             raise
         message, exit_code = _explain(error), 1
-    say(f"Error: {one_line(message)}")
+    click.echo(f"Error: {one_line(message)}", err=True)
     raise click.exceptions.Exit(exit_code)
 
 
@@ -129,8 +135,14 @@ def _explain(error: Exception) -> str:
     summaries=_SUMMARIES,
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
+@click.option(
+    "-q", "--quiet", count=True, show_default="no", help="Tell warnings and errors only; twice: errors only."
+)
+@click.option(
+    "-v", "--verbose", is_flag=True, show_default="no", help="Tell also how the work goes, with times."
+)
 @click.version_option(__version__, message="%(prog)s %(version)s", help="Show the version and exit.")
-def neurocal() -> None:
+def neurocal(quiet: int, verbose: bool) -> None:
     """Calibrate cameras with a neural network whose weights are the camera.
 
     The network learns to project known points onto their pixels. Its output weights become the
@@ -138,7 +150,8 @@ def neurocal() -> None:
     no initial guess is needed.
 
     Results go to standard output. Tables, warnings and errors go to standard error. The file name
-    `-` stands for standard input or standard output, so commands can be joined in a pipeline.
+    `-` stands for standard input or standard output, so commands can be joined in a pipeline. --quiet and
+    --verbose stand before the command.
 
     \b
     Examples:
@@ -151,5 +164,9 @@ def neurocal() -> None:
           -o rig.yaml
       neurocal triangulate rig.yaml sample_data/matches.csv -o xyz.csv
       neurocal lens fit sample_data/zoom.csv -o lens.yaml
-      cat points.csv | neurocal calibrate - | neurocal evaluate camera -
+      cat points.csv | neurocal -q calibrate - | neurocal evaluate camera -
+      neurocal -v calibrate points.csv -o camera.yaml
     """  # noqa: D301 - click's mark of a paragraph not to be wrapped
+    if quiet and verbose:
+        raise UsageError("--quiet and --verbose contradict each other; give one of them")
+    set_verbosity(-quiet if quiet else int(verbose))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import TYPE_CHECKING
 
 import click
@@ -10,17 +9,19 @@ import click
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.options import (
     Command,
-    check_plot,
     lean_option,
     output_option,
-    plot_option,
     points_argument,
 )
+from neurocal_cli.commands.pages import html_option, write_page
+from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
+from neurocal_cli.plots import CAMERA_PANELS
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
@@ -36,8 +37,12 @@ _NOT_CONVERGED = 3
 @click.option(
     "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
 )
-@plot_option("the residuals and the learning curve")
+@panels_option(
+    "the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS
+)
+@html_option
 @lean_option
+@summary_option
 @output_option("CAMERA.yaml", "the calibration")
 @click.pass_context
 def calibrate(
@@ -45,8 +50,10 @@ def calibrate(
     points: tuple[str, ...],
     estimation: Estimation,
     camera_name: str,
-    plot: str | None,
+    plots: Plots,
+    html: str | None,
     lean: bool,
+    as_json: bool,
     output: str,
 ) -> None:
     """Calibrate a camera from known points and their pixels.
@@ -73,7 +80,8 @@ def calibrate(
     Examples:
       neurocal calibrate sample_data/flat.csv -o camera.yaml --camera-name left
       neurocal calibrate sample_data/flat.csv --distortion k1 --no-skew \\
-          --plot errors.png -o camera.yaml
+          --plot errors.png --plot poses=poses.svg --html report.html \\
+          -o camera.yaml
       neurocal calibrate sample_data/flat.csv --outliers keep --image-size 640 480 \\
           --lean -o camera.json
       neurocal calibrate sample_data/flat.csv --target free -o camera.yaml
@@ -82,27 +90,31 @@ def calibrate(
           --intrinsics camera.yaml -o poses.yaml
       neurocal calibrate sample_data/flat.csv --type 4 --extrinsics camera.yaml
       neurocal calibrate sample_data/flat.csv --method neuro --starts 40 --seed 1
-      neurocal calibrate sample_data/points.csv --method linear -o linear.yaml
+      neurocal calibrate sample_data/points.csv --method linear --json \\
+          -o linear.yaml
       neurocal calibrate sample_data/points.csv --trainer backprop \\
           --epochs 20000 --rate 0.05 --rate-gamma 0.4
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     estimation.check()
+    check_summary(as_json, output)
     check_one_stdin(*points, *estimation.stdin_candidates)
-    _check_outputs(output, plot, camera_name)
-    check_outputs((output, plot), (*points, estimation.intrinsics, estimation.extrinsics))
+    _check_outputs(output, plots, camera_name)
+    inputs = *points, estimation.intrinsics, estimation.extrinsics
+    check_outputs((output, html, *(file for _, file in plots)), inputs)
     calibration = _estimate(points, estimation, camera_name)
-    _write(calibration, output, plot, lean)
-    _report(calibration)
+    _write(calibration, output, plots, lean)
+    write_page(html, calibration, *inputs)
+    _report(calibration, as_json)
     if not calibration.converged:
         ctx.exit(_NOT_CONVERGED)
 
 
-def _check_outputs(output: str, plot: str | None, camera_name: str) -> None:
+def _check_outputs(output: str, plots: Plots, camera_name: str) -> None:
     if not camera_name.strip() or not camera_name.isprintable():
         raise UsageError("--camera-name must hold printable characters only; give another name")
-    check_plot(plot, output)
+    check_plots(plots, output)
 
 
 def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) -> Calibration:
@@ -119,20 +131,24 @@ def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) 
         return learn(points, **arguments, camera_name=camera_name, progress=progress)
 
 
-def _write(calibration: Calibration, output: str, plot: str | None, lean: bool) -> None:
-    """Write both files, the picture drawn before either is touched."""
+def _write(calibration: Calibration, output: str, plots: Plots, lean: bool) -> None:
+    """Write all files."""
     from neurocal_cli.io.result_files import write_result
 
-    if plot is not None:
-        from neurocal_cli.io.writing import write_whole
-        from neurocal_cli.plots import draw_calibration
+    if plots:
+        from neurocal_cli.plots.pages import draw_camera
+        from neurocal_cli.plots.subject import Subject
 
-        write_whole(plot, draw_calibration(calibration, os.path.splitext(plot)[1][1:].lower()))
+        subject = Subject.of(calibration)
+        write_plots(plots, lambda kind, panel: draw_camera(subject, kind, panel))
     warn(write_result(calibration, output, lean=lean))
 
 
-def _report(calibration: Calibration) -> None:
-    from neurocal_cli.report import calibration_report
+def _report(calibration: Calibration, as_json: bool) -> None:
+    from neurocal_cli.report import calibration_json, calibration_report
 
-    say(calibration_report(calibration))
+    if as_json:
+        print_summary(calibration_json(calibration))
+    else:
+        say(calibration_report(calibration))
     warn(calibration.warnings)

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["convert"]
 
 _FORMATS = ("neurocal", "opencv", "ros", "kalibr", "colmap", "mrcal", "matlab", "json", "npz")
+_MODELS = (
+    "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "omnidir", "double_sphere", "eucm"
+)  # fmt: skip
 _SIZE = click.IntRange(1, 1_000_000)
 
 
@@ -47,6 +50,12 @@ _SIZE = click.IntRange(1, 1_000_000)
     type=click.Choice(_FORMATS),
     show_default="required",
     help="Format to write.",
+)
+@click.option(
+    "--model",
+    type=click.Choice(_MODELS),
+    show_default="the camera's own",
+    help="Write the nearest camera of this distortion model, and say how many pixels it is off.",
 )
 @click.option(
     "--force",
@@ -75,6 +84,7 @@ _SIZE = click.IntRange(1, 1_000_000)
 def convert(
     files: tuple[str, ...],
     target: str,
+    model: str | None,
     force: bool,
     board: str | None,
     cols: int | None,
@@ -102,7 +112,8 @@ def convert(
       npz       the same for NumPy
 
     A distortion model that the format does not have is an error, which says how many pixels the nearest
-    camera is off. --force writes that camera. Programs of OpenCV, ROS, Kalibr, COLMAP and mrcal ignore
+    camera is off. --force writes that camera; --model writes the nearest one of a chosen model, for programs
+    that know that one only. Programs of OpenCV, ROS, Kalibr, COLMAP and mrcal ignore
     skew, so the nearest camera without skew is written for them, and a warning says how many pixels that
     makes. What the format has no place for is listed on standard error.
 
@@ -118,6 +129,8 @@ def convert(
       neurocal convert camera.npz --to kalibr --force --unit mm \\
           --image-size 640 480 -o camchain.yaml
       neurocal convert camchain.yaml --to neurocal | neurocal convert - --to ros
+      neurocal calibrate sample_data/fisheye.csv --no-skew -o fisheye.yaml
+      neurocal convert fisheye.yaml --to ros --model rational -o rational.yaml
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
           --points vertices -o points.csv
       neurocal convert points.csv --to mrcal -o corners.vnl
@@ -131,6 +144,8 @@ def convert(
     target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
     points = _points(files, target_board, unit, image_size)
     if points is not None:
+        if model is not None:
+            raise UsageError("FILE holds points, which have no distortion model; leave out --model")
         _write_points(points, target, output)
         return
     if target_board is not None:
@@ -143,7 +158,7 @@ def convert(
 
     cameras = _completed(read_cameras(files), unit, image_size)
     wanted = FORMATS[target]
-    fitted = fitted_in(cameras, wanted, force)
+    fitted = fitted_in(cameras, wanted, force, model)
     contents = wanted.text(fitted.cameras, os.path.splitext(output)[1].lower())
     note(fitted.remarks)
     warn(fitted.losses)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from neurocal_cli.commands.board_options import board_options, given_board
+from neurocal_cli.commands.frames import videos_as_frames
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note, one_line, say, warn
+from neurocal_cli.commands.streams import check_one_stdin, complain, note, one_line, say, warn
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import NeurocalError, UsageError
 
@@ -19,7 +22,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from neurocal_cli.board import Board
-    from neurocal_cli.detection.batch import Outcome
+    from neurocal_cli.detection.batch import DetectionOptions, Outcome
+    from neurocal_cli.detection.detect import Points
 
 __all__ = ["detect"]
 
@@ -35,7 +39,7 @@ _SECOND = 2  # images of another size, from which on it is no single one that st
     type=INPUT,
     cls=Argument,
     description="Images of one camera (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits), folders of "
-    "images, or file name patterns; - is standard input.",
+    "images, file name patterns, or videos; - is standard input.",
 )
 @board_options("Unit of --square. A board file names its own unit.")
 @click.option(
@@ -65,6 +69,30 @@ _SECOND = 2  # images of another size, from which on it is no single one that st
     show_default="the number of cores",
     help="Number of processes that examine images at the same time.",
 )
+@click.option(
+    "--frames",
+    metavar="N",
+    type=click.IntRange(min=1),
+    default=50,
+    help="Number of frames that are taken of a video at most: sharp ones that differ from each other.",
+)
+@click.option(
+    "--cache",
+    metavar="DIR",
+    type=click.Path(readable=False),
+    show_default="none",
+    help="Keep what is found in each image in this folder, and look there first. The same image is found "
+    "again under any name; a run that was stopped goes on.",
+)
+@click.option(
+    "--watch",
+    metavar="SECONDS",
+    type=FiniteNumber(positive=True),
+    show_default="no",
+    help="Wait for more images, in folders and patterns, until none has come for so long or Ctrl-C is "
+    "pressed. After each image, tell the verdict so far and the view that would help most.",
+)
+@summary_option
 @output_option("POINTS.csv", "the points")
 def detect(
     images: tuple[str, ...],
@@ -77,6 +105,10 @@ def detect(
     gamma: float | None,
     overlay: str | None,
     jobs: int | None,
+    frames: int,
+    cache: str | None,
+    watch: float | None,
+    as_json: bool,
     output: str,
 ) -> None:
     """Detect chessboards in images and measure points on them.
@@ -94,6 +126,9 @@ def detect(
     the direction (nu,nv) across its edge. Images in which no board is detected are listed on standard
     error with the reason.
 
+    Of a video (mp4, avi, mov, mkv and what else OpenCV decodes) those frames are examined that are sharp and
+    differ from each other; each is a view VIDEO_NUMBER.
+
     \b
     Examples:
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
@@ -102,50 +137,88 @@ def detect(
           --points vertices --gamma 1 --jobs 2 --overlay overlays \\
           | neurocal calibrate - -o camera.yaml
       echo "planes: [{name: board, cols: 9, rows: 6, square: 25}]" > board.yaml
-      neurocal detect sample_data/board*.png --board board.yaml -o points.csv
+      neurocal detect sample_data/board*.png --board board.yaml --json \\
+          --cache found --frames 30 -o points.csv
+      neurocal detect sample_data --cols 9 --rows 6 --square 25 --watch 2 -o points.csv
     """  # noqa: D301 - as in the group
     check_one_stdin(*images, board)
+    check_summary(as_json, output)
     compute_in_one_thread()
     target = given_board(board, cols, rows, square, unit)
     if target is None:
         raise UsageError(
             "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
         )
-    outcomes = _examined(images, target, board, output, points, gamma, overlay, jobs)
-    _report(outcomes, target)
+    strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
+    wanted = _wanted(target, points, gamma, overlay, cache, strict)
+    if watch is None:
+        outcomes = _examined(images, wanted, board, output, overlay, jobs, frames)
+    else:
+        outcomes = _watched(images, wanted, board, output, watch)
+    _report(outcomes, target, as_json)
     _write(outcomes, target, overlay, output)
+
+
+def _wanted(
+    board: Board, points: str, gamma: float | None, overlay: str | None, cache: str | None, strict: bool
+) -> DetectionOptions:
+    from neurocal_cli.detection.batch import DetectionOptions
+    from neurocal_cli.detection.memory import Memory
+    from neurocal_cli.io.board_yaml import format_board
+
+    kind: Points = "vertices" if points == "vertices" else "midpoints"
+    memory = None
+    if cache is not None:
+        _check_folder("--cache", cache)
+        memory = Memory(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
+    return DetectionOptions(board, kind, gamma, overlay is not None, strict, memory)
 
 
 def _examined(
     words: tuple[str, ...],
-    board: Board,
+    wanted: DetectionOptions,
     board_file: str | None,
     output: str,
-    points: str,
-    gamma: float | None,
     overlay: str | None,
     jobs: int | None,
+    frames: int,
 ) -> list[tuple[str, Outcome]]:
     """Outcomes of all images, with the names of their views."""
-    from neurocal_cli.detection.batch import DetectionOptions, default_jobs, detect_files
+    from neurocal_cli.detection.batch import default_jobs, detect_files
     from neurocal_cli.io.image_paths import find_images, view_names
 
-    paths = find_images(words)
-    names = view_names(paths)
-    check_outputs((output,), (*paths, board_file))
-    note(_mixed_sizes(paths))
-    if overlay is not None:
-        _check_overlay(overlay, paths)
-    strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
-    wanted = DetectionOptions(
-        board, "vertices" if points == "vertices" else "midpoints", gamma, overlay is not None, strict
-    )
-    outcomes = []
-    with ProgressBar() as progress:
-        for outcome in detect_files(paths, wanted, jobs or default_jobs(len(paths))):
-            outcomes.append(outcome)
-            progress(f"{len(outcomes)} of {len(paths)} images", len(outcomes) / len(paths))
+    given = find_images(words)
+    view_names(given)  # no name twice
+    check_outputs((output,), (*given, board_file))
+    with videos_as_frames(given, frames) as (paths, folder):
+        names = view_names(paths)
+        note(_mixed_sizes(paths))
+        if overlay is not None:
+            _check_overlay(overlay, paths)
+        outcomes = []
+        with ProgressBar() as progress:
+            for outcome in detect_files(paths, wanted, jobs or default_jobs(len(paths))):
+                outcomes.append(replace(outcome, problem=outcome.problem.removeprefix(folder)))
+                progress(f"{len(outcomes)} of {len(paths)} images", len(outcomes) / len(paths))
     return list(zip(names, outcomes, strict=True))
+
+
+def _watched(
+    words: tuple[str, ...], wanted: DetectionOptions, board_file: str | None, output: str, seconds: float
+) -> list[tuple[str, Outcome]]:
+    """Outcomes of the images that have come, with the names of their views."""
+    from neurocal_cli.commands.watching import watch
+    from neurocal_cli.io.image_paths import find_images, view_names
+
+    if "-" in words:
+        raise UsageError("--watch needs folders or patterns; standard input has one image")
+    check_outputs((output,), (board_file,))
+    outcomes = watch(lambda: find_images(words), wanted, seconds)
+    if not outcomes:
+        raise NeurocalError(f"no image came within {seconds:g} seconds; give the folder that they come to")
+    check_outputs((output,), tuple(path for path, _ in outcomes))
+    names = view_names([path for path, _ in outcomes])
+    return [(name, outcome) for name, (_, outcome) in zip(names, outcomes, strict=True)]
 
 
 def _mixed_sizes(paths: Sequence[str]) -> list[str]:
@@ -161,23 +234,27 @@ def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     return [f"the images have {len(sizes)} sizes ({counts}); those of one camera have one"]
 
 
-def _check_overlay(folder: str, paths: Sequence[str]) -> None:
+def _check_folder(option: str, folder: str) -> None:
     if os.path.exists(folder) and not os.path.isdir(folder):
-        raise UsageError(f"--overlay {folder} is a file; give a folder")
+        raise UsageError(f"{option} {folder} is a file; give a folder")
     parent = os.path.realpath(folder)
     while not os.path.exists(parent):
         parent = os.path.dirname(parent)
     if not (os.path.isdir(parent) and os.access(parent, os.W_OK)):
-        raise NeurocalError(f"--overlay {folder}: the folder cannot be made; give another place")
+        raise NeurocalError(f"{option} {folder}: the folder cannot be made; give another place")
+
+
+def _check_overlay(folder: str, paths: Sequence[str]) -> None:
+    _check_folder("--overlay", folder)
     if os.path.realpath(folder) in {os.path.dirname(os.path.realpath(path)) for path in paths if path != "-"}:
         raise UsageError(f"--overlay {folder} is the folder of the images; give another folder")
 
 
-def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board) -> None:
+def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool) -> None:
     """Say what is wrong with which image, and once what is to be known of several."""
     for _, outcome in outcomes:
         if outcome.problem:
-            say(one_line(outcome.problem))
+            complain(outcome.problem)
     remarks: dict[str, list[str]] = {}
     for name, outcome in outcomes:
         for text in outcome.notes:
@@ -191,11 +268,25 @@ def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board) -> None:
             "the image does not show" if len(outcomes) == 1 else f"none of the {len(outcomes)} images shows"
         )
         raise NeurocalError(f"{what} the board; see the reason above")
+    if as_json:
+        print_summary(_summary(outcomes))
+        return
     say(
         f"board detected in {len(found)} of {len(outcomes)} images: "
         f"{sum(len(detection.ids) for detection in found)} points, "
         f"{sum(detection.rejected for detection in found)} rejected"
     )
+
+
+def _summary(outcomes: Sequence[tuple[str, Outcome]]) -> dict[str, Any]:
+    found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
+    return {
+        "n_images": len(outcomes),
+        "n_points": sum(len(detection.ids) for detection in found.values()),
+        "n_rejected": sum(detection.rejected for detection in found.values()),
+        "views": {name: len(detection.ids) for name, detection in found.items()},
+        "without_board": {name: one_line(outcome.problem) for name, outcome in outcomes if outcome.problem},
+    }
 
 
 def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> list[str]:

@@ -10,12 +10,16 @@ import click
 from neurocal_cli.commands.calibration_options import given_camera
 from neurocal_cli.commands.evaluate_stereo import stereo
 from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
+from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
 from neurocal_cli.commands.tables import show
 from neurocal_cli.errors import FormatError
+from neurocal_cli.plots import CAMERA_PANELS
 
 if TYPE_CHECKING:
-    from neurocal_cli.calibration import Verdict
+    from neurocal_cli.calibration import Calibration, Verdict
+    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.evaluation import CameraEvaluation
     from neurocal_cli.points import Correspondences
 
@@ -56,8 +60,9 @@ evaluate.add_command(stereo)
     cls=Argument,
     description="Points to evaluate the camera on; without them, those it was calibrated from.",
 )
+@panels_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @json_option
-def camera(calibration: str, points: str | None, as_json: bool) -> None:
+def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
 
     The residuals of a point are du and dv, its projected pixel minus its observed pixel. The rms error
@@ -78,10 +83,21 @@ def camera(calibration: str, points: str | None, as_json: bool) -> None:
       neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal evaluate camera camera.yaml
       neurocal evaluate camera camera.yaml sample_data/stereo_left.csv --json
+      neurocal evaluate camera camera.yaml --plot errors.png \\
+          --plot uncertainty=trust.pdf
       cat sample_data/flat.csv | neurocal calibrate - | neurocal evaluate camera -
     """  # noqa: D301 - as in the group
     check_one_stdin(calibration, points)
-    evaluation, verdict = _evaluate(calibration, _read_points(points))
+    check_plots(plots)
+    check_outputs((file for _, file in plots), (calibration, points))
+    given = _read_points(points)
+    evaluation, verdict, judged = _evaluate(calibration, given)
+    if plots:
+        from neurocal_cli.plots.pages import draw_camera
+        from neurocal_cli.plots.subject import Subject
+
+        subject = Subject.of(judged, given, evaluation)
+        write_plots(plots, lambda kind, panel: draw_camera(subject, kind, panel))
     _tell(evaluation)
     _show(evaluation, verdict, as_json)
 
@@ -97,7 +113,9 @@ def _read_points(name: str | None) -> Correspondences | None:
     return points
 
 
-def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluation, Verdict | None]:
+def _evaluate(
+    name: str, points: Correspondences | None
+) -> tuple[CameraEvaluation, Verdict | None, Calibration | Camera]:
     """Evaluate a calibration or, given points, any camera file: then all poses are fitted."""
     from neurocal_cli.evaluation import evaluate_camera
     from neurocal_cli.io.calibration_yaml import read_calibration
@@ -109,7 +127,7 @@ def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluati
         evaluation, verdict = evaluate_camera(calibration, points), assess(calibration)
         if verdict is not None and points is not None:
             verdict = judged_by_points(verdict, calibration, evaluation.given_points)
-        return evaluation, verdict
+        return evaluation, verdict, calibration
     except FormatError as error:
         if points is None or name == "-":
             raise
@@ -118,7 +136,7 @@ def _evaluate(name: str, points: Correspondences | None) -> tuple[CameraEvaluati
         except FormatError:
             raise error from None  # no camera file of any kind: tell why it is no calibration
         note([f"only the intrinsic parameters and the distortion are used: {error}"])
-    return evaluate_camera(camera, points), None
+    return evaluate_camera(camera, points), None, camera
 
 
 def _tell(evaluation: CameraEvaluation) -> None:

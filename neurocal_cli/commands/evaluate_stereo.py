@@ -9,14 +9,18 @@ import click
 
 from neurocal_cli.commands.calibration_options import given_camera
 from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
+from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
 from neurocal_cli.commands.tables import show
 from neurocal_cli.errors import FormatError, UsageError
+from neurocal_cli.plots import SPACE_PANELS
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.points import Correspondences
     from neurocal_cli.stereo.evaluation import StereoEvaluation
+    from neurocal_cli.stereo.rig import Rig
 
 __all__ = ["stereo"]
 
@@ -47,8 +51,15 @@ __all__ = ["stereo"]
     help="Triangulation: optimal is least squares on the pixels, linear solves linear equations, midpoint "
     "takes the middle between the two rays.",
 )
+@panels_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @json_option
-def stereo(cameras: tuple[str, ...], points: tuple[str, str] | None, method: str, as_json: bool) -> None:
+def stereo(
+    cameras: tuple[str, ...],
+    points: tuple[str, str] | None,
+    method: str,
+    plots: Plots,
+    as_json: bool,
+) -> None:
     """Measure the triangulation error of two calibrated cameras.
 
     Every point that both cameras saw is triangulated and compared with its true position on the target.
@@ -72,7 +83,7 @@ def stereo(cameras: tuple[str, ...], points: tuple[str, str] | None, method: str
     Examples:
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           -o rig.yaml
-      neurocal evaluate stereo rig.yaml
+      neurocal evaluate stereo rig.yaml --plot space.png --plot depth=depth.svg
       neurocal calibrate sample_data/stereo_left.csv -o left.yaml
       neurocal calibrate sample_data/stereo_right.csv -o right.yaml
       neurocal evaluate stereo left.yaml right.yaml --method linear --json
@@ -82,7 +93,13 @@ def stereo(cameras: tuple[str, ...], points: tuple[str, str] | None, method: str
     if len(cameras) > 2:
         raise UsageError(f"there are {len(cameras)} files; give two calibrations, or one rig")
     check_one_stdin(*cameras, *(points or ()))
-    evaluation = _evaluate(cameras, _read_points(points), method)
+    check_plots(plots)
+    check_outputs((file for _, file in plots), (*cameras, *(points or ())))
+    evaluation, rig = _evaluate(cameras, _read_points(points), method)
+    if plots:
+        from neurocal_cli.plots.pages import draw_points_in_space
+
+        write_plots(plots, lambda kind, panel: draw_points_in_space(evaluation, rig, kind, panel))
     from neurocal_cli.stereo.report import views_alone
 
     note(views_alone(evaluation.alone))
@@ -106,20 +123,21 @@ def _read_points(names: tuple[str, str] | None) -> tuple[Correspondences, Corres
 
 def _evaluate(
     cameras: tuple[str, ...], points: tuple[Correspondences, Correspondences] | None, method: str
-) -> StereoEvaluation:
+) -> tuple[StereoEvaluation, Rig | None]:
     from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
 
     if len(cameras) == 1:
         from neurocal_cli.io.rig_yaml import read_rig
 
-        return evaluate_rig(read_rig(cameras[0]), points, method=method)
+        rig = read_rig(cameras[0])
+        return evaluate_rig(rig, points, method=method), rig
     from neurocal_cli.io.calibration_yaml import read_calibration
 
     if points is None:
         left, right = (read_calibration(name) for name in cameras)
     else:
         left, right = (_camera(name, seen) for name, seen in zip(cameras, points, strict=True))
-    return evaluate_stereo(left, right, points, method=method)
+    return evaluate_stereo(left, right, points, method=method), None
 
 
 def _camera(name: str, points: Correspondences) -> Calibration:

@@ -22,6 +22,7 @@ from neurocal_cli.commands.options import (
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
 
@@ -121,6 +122,7 @@ def lens() -> None:
     help="Seed of the random weights. The same seed gives the same output.",
 )
 @plot_option("each parameter over the settings, with its uncertainty, and the errors")
+@summary_option
 @output_option("LENS.yaml", "the lens")
 @click.pass_context
 def fit(
@@ -134,6 +136,7 @@ def fit(
     no_skew: bool,
     seed: int,
     plot: str | None,
+    as_json: bool,
     output: str,
 ) -> None:
     """Learn how the camera depends on zoom and focus.
@@ -159,17 +162,21 @@ def fit(
       neurocal lens fit sample_data/zoom.csv --distortion k1 --no-skew \\
           --camera still --training alternating --plot lens.png -o lens.yaml
       neurocal lens fit sample_data/zoom.csv --hidden 2 2 --outliers keep --seed 1 \\
-          -o lens.yaml
+          --json -o lens.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     check_one_stdin(*points)
+    check_summary(as_json, output)
     check_plot(plot, output)
     check_outputs((output, plot), points)
     learnt = _learn(points, distortion, training, camera, hidden, outliers, no_skew, seed)
     _write(learnt, output, plot)
-    from neurocal_cli.zoom_lens.report import lens_report
+    from neurocal_cli.zoom_lens.report import lens_json, lens_report
 
-    say(lens_report(learnt))
+    if as_json:
+        print_summary(lens_json(learnt))
+    else:
+        say(lens_report(learnt))
     warn(learnt.warnings)
     if not learnt.converged:
         ctx.exit(_NOT_CONVERGED)

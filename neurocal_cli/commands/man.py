@@ -49,6 +49,7 @@ _FILES = (
 )
 
 _WIDTH = 78  # of lines of the source
+_DATE = "2026-11-22"  # of the manual of this version; not today's, so that pages stay the same
 _ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, an unexpected error shows where in the program it arose."),)
 
 
@@ -105,8 +106,8 @@ def _page(ctx: click.Context, names: list[str]) -> str:
     name = _page_name(ctx)
     lines = [
         r".\" Made by `neurocal man` from the command's help; edit that instead.",
-        f'.TH "{_escape(name.upper())}" 1 "" "neurocal {__version__}" "neurocal manual"',
-        *_section("NAME", [rf"{_escape(name)} \- {_escape(summary[:1].lower() + summary[1:].rstrip('.'))}"]),
+        f'.TH "{_escape(name.upper())}" 1 "{_DATE}" "neurocal {__version__}" "neurocal manual"',
+        *_section("NAME", _name_lines(name, summary)),
         *_section("SYNOPSIS", _synopsis(ctx)),
         *_section("DESCRIPTION", _prose(description) or [_escape(summary)]),
         *_section("COMMANDS", _terms(_subcommands(ctx))),
@@ -119,6 +120,11 @@ def _page(ctx: click.Context, names: list[str]) -> str:
         *_section("SEE ALSO", [", ".join(rf"\fB{_escape(n)}\fR(1)" for n in _neighbours(name, names))]),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _name_lines(name: str, summary: str) -> list[str]:
+    text = rf"{_escape(name)} \- {_escape(summary[:1].lower() + summary[1:].rstrip('.'))}"
+    return textwrap.wrap(text, _WIDTH, break_on_hyphens=False, break_long_words=False)
 
 
 def _split_help(text: str) -> tuple[str, list[str], list[str]]:

@@ -152,6 +152,6 @@ def check_plot(plot: str | None, output: str | None = None) -> None:
         )
     if output not in (None, "-") and os.path.realpath(str(output)) == os.path.realpath(plot):
         raise UsageError("-o and --plot name the same file; give two different files")
-    from neurocal_cli.plots import check_available
+    from neurocal_cli.plots.figure import check_available
 
     check_available()

@@ -8,7 +8,7 @@ from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from neurocal_cli.commands.streams import is_terminal
+from neurocal_cli.commands.streams import is_terminal, tell_more, verbose
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -21,17 +21,22 @@ _PATIENCE = 0.5  # seconds before the bar appears; shorter work shows nothing
 class ProgressBar(AbstractContextManager["ProgressBar"]):
     """Called with a stage and the fraction done, draws a bar on stderr once the work takes long.
 
-    Without a terminal it does nothing, and rich is not imported.
+    Without a terminal it does nothing, and rich is not imported. Where the user asked how the work goes, each
+    stage is a line instead.
     """
 
     def __init__(self) -> None:
-        self._visible = is_terminal(sys.stderr)
+        self._visible = is_terminal(sys.stderr) and not verbose()
+        self._stage = ""
         self._start = time.monotonic()
         self._bar: Progress | None = None
         self._task: TaskID | None = None
 
     def __call__(self, stage: str, fraction: float) -> None:
         """Show how far the work is."""
+        if stage != self._stage:
+            self._stage = stage
+            tell_more(f"{time.monotonic() - self._start:7.2f} s  {stage}")
         if not self._visible or time.monotonic() - self._start < _PATIENCE:
             return
         if self._bar is None:
@@ -54,3 +59,4 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
     ) -> None:
         if self._bar is not None:
             self._bar.stop()
+        tell_more(f"{time.monotonic() - self._start:7.2f} s  {'done' if kind is None else 'stopped'}")

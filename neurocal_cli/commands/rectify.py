@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber
+from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, json_option
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note, one_line, say, warn
+from neurocal_cli.commands.streams import check_one_stdin, complain, note, say, warn
+from neurocal_cli.commands.summaries import print_summary
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
@@ -67,6 +68,7 @@ _SIDES = ("left", "right")
     show_default="no",
     help="Also write DIR/maps.npz: tables for cv2.remap, and R1, R2, P1, P2, Q.",
 )
+@json_option
 @click.option(
     "-o",
     "--output",
@@ -83,6 +85,7 @@ def rectify(
     interpolation: str,
     side_by_side: bool,
     maps: bool,
+    as_json: bool,
     output: str,
 ) -> None:
     """Rectify pairs of images and points of two cameras.
@@ -111,7 +114,7 @@ def rectify(
           > camchain.yaml
       neurocal rectify camchain.yaml "sample_data/board0[123].png" \\
           "sample_data/board0[456].png" --alpha 0 --interpolation linear \\
-          --side-by-side -o pairs
+          --side-by-side --json -o pairs
     """  # noqa: D301 - as in the group
     check_one_stdin(rig, *files)
     if alpha is not None and not 0 <= alpha <= 1:
@@ -123,7 +126,7 @@ def rectify(
     sides = _sides(files)
     _check_outputs(sides, output)
     found = _read_rig(rig)
-    work = _Work(found, alpha, interpolation, output, side_by_side)
+    work = _Work(found, alpha, interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
     if maps:
         work.write_maps()
@@ -131,6 +134,8 @@ def rectify(
         work.rectify_points(sides)
     elif files:
         work.rectify_images(sides)
+    if as_json:
+        print_summary(work.summary)
 
 
 def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -188,13 +193,16 @@ class _Work:
     interpolation: str
     output: str
     side_by_side: bool
+    as_json: bool
     pair: RectifiedPair = field(init=False)
     remappings: list[Remapping] = field(default_factory=list)
+    summary: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         from neurocal_cli.stereo.rectified_pair import rectified_pair
 
         self.pair = rectified_pair(self.rig, self.alpha)
+        self.summary["along"] = "rows" if self.pair.axis == 0 else "columns"
 
     @staticmethod
     def is_points(path: str) -> bool:
@@ -205,12 +213,14 @@ class _Work:
 
     def tell_rows_of_rig(self) -> None:
         """Say how well the rows of the points agree from which the rig was found."""
+        from neurocal_cli.report import number_or_none
         from neurocal_cli.stereo.rectified_pair import row_error_of_rig
 
         error = row_error_of_rig(self.rig, self.pair)
         if error is not None:
             rows = "rows" if self.pair.axis == 0 else "columns"
-            say(f"{rows} of the rig's own {error.n_points} points differ by {error.rms_px:.3g} px rms")
+            self._tell(f"{rows} of the rig's own {error.n_points} points differ by {error.rms_px:.3g} px rms")
+            self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
         verdict = self.rig.verdict
         if verdict is not None and verdict.word == "poor":
             warn([f"the rig is poor: {'; '.join(verdict.reasons[:1])}"])
@@ -218,6 +228,7 @@ class _Work:
     def rectify_points(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
         """Move the points of both cameras and write them."""
         from neurocal_cli.io.points_csv import format_points, read_points
+        from neurocal_cli.report import number_or_none
         from neurocal_cli.stereo.rectified_pair import rectify_points, row_error
 
         if len(sides[0]) > 1:
@@ -225,13 +236,24 @@ class _Work:
         moved = []
         for side, (path,) in enumerate(sides):
             notes: list[str] = []
-            moved.append(rectify_points(self.pair, side, read_points(path, notes=notes)))
+            points = read_points(path, notes=notes)
+            moved.append(rectify_points(self.pair, side, points))
+            if len(moved[-1]) < len(points):
+                notes.append(
+                    f"{points.source}: {len(points) - len(moved[-1])} of {len(points)} points are left out, "
+                    "which are 90 degrees from the rectified camera's axis or more"
+                )
             note(notes)
         for name, (path,), points in zip(_SIDES, sides, moved, strict=True):
             self._write(os.path.join(name, os.path.basename(path)), format_points(points))
         error = row_error(self.pair, moved[0], moved[1])
         rows = "rows" if self.pair.axis == 0 else "columns"
-        say(
+        self.summary["points"] = {
+            "n_points": error.n_points,
+            "rms_px": number_or_none(error.rms_px),
+            "max_px": number_or_none(error.max_px),
+        }
+        self._tell(
             f"{rows} of the {error.n_points} points given differ by {error.rms_px:.3g} px rms, "
             f"{error.max_px:.3g} px at most"
         )
@@ -248,11 +270,12 @@ class _Work:
                 except (InputError, FormatError) as error:
                     if len(pairs) == 1:
                         raise
-                    say(one_line(str(error)))
+                    complain(str(error))
                 progress(f"{number} of {len(pairs)} pairs", number / len(pairs))
         if not done:
             raise NeurocalError(f"none of the {len(pairs)} pairs could be rectified; see the reasons above")
-        say(f"rectified {done} of {len(pairs)} pair{'s' * (len(pairs) != 1)}")
+        self.summary["images"] = {"pairs": len(pairs), "rectified": done}
+        self._tell(f"rectified {done} of {len(pairs)} pair{'s' * (len(pairs) != 1)}")
 
     def _rectify_pair(self, pair: tuple[str, str]) -> None:
         from neurocal_cli.io.images import encode_image, encode_png, read_picture
@@ -295,6 +318,10 @@ class _Work:
         matrices = self.pair.matrices
         tree |= {key: getattr(matrices, key) for key in ("R1", "R2", "P1", "P2", "Q")}
         self._write("maps.npz", npz_bytes(tree))
+
+    def _tell(self, text: str) -> None:
+        if not self.as_json:
+            say(text)
 
     def _write(self, name: str, content: str | bytes) -> None:
         from neurocal_cli.io.writing import write_whole

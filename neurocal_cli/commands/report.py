@@ -6,13 +6,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command
+from neurocal_cli.commands.options import INPUT, Argument, Command, output_option
 from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.streams import note
+from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
+    from neurocal_cli.calibration import Calibration
     from neurocal_cli.io.tree_fields import Field
 
 __all__ = ["report"]
+
+_MOST_BYTES = 1_400_000  # of all photographs; as text in the page they take a third more
 
 
 @click.command(cls=Command)
@@ -24,29 +29,40 @@ __all__ = ["report"]
     description="What neurocal calibrate, stereo or lens fit wrote; - is standard input.",
 )
 @click.option(
-    "-o",
-    "--output",
-    metavar="REPORT.html",
-    type=click.Path(writable=False, readable=False, allow_dash=True),
-    default="-",
-    show_default="standard output",
-    help="Write the page to this file.",
+    "--images",
+    metavar="DIR",
+    multiple=True,
+    type=click.Path(readable=False),
+    show_default="none",
+    help="Show the photographs of the views, with the residuals over them: a folder or a pattern such as "
+    "'left*.png', whose files have the names of the views. For a rig give it twice, left and right, or once "
+    "for both.",
 )
-def report(result: str, output: str) -> None:
+@output_option("REPORT.html", "the page")
+def report(result: str, images: tuple[str, ...], output: str) -> None:
     """Show a calibration, a rig or a zoom lens as one HTML page.
 
     The page begins with the verdict. It has all parameters with their standard deviations, the residuals of
     all points and of each view as drawings, a table of the views that can be sorted, what was left out, the
-    warnings, and how to repeat the result. It is one file, loads nothing from elsewhere, and is readable in
-    the dark, on a telephone and on paper.
+    warnings, and how to repeat the result. With --images it shows the photographs too. It is one file, loads
+    nothing from elsewhere, and is readable in the dark, on a telephone and on paper.
+
+    `neurocal calibrate --html` and `neurocal stereo --html` make the same page in the same run. Only they
+    know the command and the files that the result was made from. The result's own file does not hold them,
+    so that it is the same wherever it is made.
 
     \b
     Examples:
       neurocal calibrate sample_data/flat.csv -o camera.yaml
       neurocal report camera.yaml -o report.html
+      neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
+          | neurocal calibrate - -o board.yaml
+      neurocal report board.yaml --images sample_data -o board.html
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           | neurocal report - -o rig.html
     """  # noqa: D301 - as in the group
+    if len(images) > 2:
+        raise UsageError("--images is for one folder, or for the left and the right one of a rig")
     check_outputs((output,), (result,))
     import hashlib
 
@@ -56,21 +72,52 @@ def report(result: str, output: str) -> None:
 
     data, source = read_bytes(result)
     root = parse_tree(decode(data, source, "a calibration"), source)
-    write_whole(output, _page(root, source, hashlib.sha256(data).hexdigest()))
+    write_whole(output, _page(root, {source: hashlib.sha256(data).hexdigest()}, images))
 
 
-def _page(root: Field, source: str, digest: str) -> str:
+def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
     """The page of what the file holds."""
+    from neurocal_cli.html_report.origin import Origin
     from neurocal_cli.html_report.reports import calibration_page, lens_page, rig_page
 
-    if "stereo" in root:
-        from neurocal_cli.io.rig_yaml import rig_from_field
-
-        return rig_page(rig_from_field(root), source, digest)
     if "neurocal_lens" in root:
         from neurocal_cli.io.lens_yaml import lens_from_field
 
-        return lens_page(lens_from_field(root), source, digest)
+        if images:
+            raise UsageError("the page of a zoom lens shows no photographs; leave out --images")
+        return lens_page(lens_from_field(root), Origin(files))
+    if "stereo" in root:
+        from neurocal_cli.io.rig_yaml import rig_from_field
+
+        rig = rig_from_field(root)
+        words = images * (3 - len(images)) if images else ()
+        shown = [
+            _photographs(camera, word, 2) for camera, word in zip((rig.left, rig.right), words, strict=False)
+        ]
+        origin = Origin(files, versions=_versions(root["left"]))
+        return rig_page(rig, origin, (shown[0], shown[1]) if shown else None)
     from neurocal_cli.io.calibration_tree import calibration_from_field
 
-    return calibration_page(calibration_from_field(root), source, digest)
+    calibration = calibration_from_field(root)
+    if len(images) > 1:
+        raise UsageError("the file is of one camera; give --images once")
+    origin = Origin(files, versions=_versions(root))
+    return calibration_page(calibration, origin, _photographs(calibration, images[0], 1) if images else None)
+
+
+def _versions(root: Field) -> dict[str, str]:
+    """The version that the file says it was written by."""
+    block = root["neurocal"]
+    return {"neurocal": block["version"].text()} if "version" in block else {}
+
+
+def _photographs(calibration: Calibration, word: str, cameras: int) -> dict[str, bytes]:
+    """Small pictures of the views' photographs; the page is for all cameras."""
+    from neurocal_cli.io.thumbnails import photographs_of, thumbnails
+
+    views = calibration.points.view_names
+    images = photographs_of(views, word)
+    missing = [view for view in views if view not in images]
+    if missing:
+        note([f"no image of {len(missing)} views, such as {missing[0]}, in {word}"])
+    return thumbnails(images, calibration.image_size, _MOST_BYTES // cameras)

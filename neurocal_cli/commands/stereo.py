@@ -13,16 +13,18 @@ from neurocal_cli.commands.options import (
     INPUT,
     Argument,
     Command,
-    check_plot,
     lean_option,
     output_option,
-    plot_option,
 )
+from neurocal_cli.commands.pages import html_option, write_page
+from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
+from neurocal_cli.plots import RIG_PANELS
 
 if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
@@ -75,8 +77,10 @@ _NOT_CONVERGED = 3
     show_default="none",
     help="Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
-@plot_option("the residuals and the learning curve")
+@panels_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
+@html_option
 @lean_option
+@summary_option
 @output_option("RIG.yaml", "the rig")
 @click.pass_context
 def stereo(
@@ -88,8 +92,10 @@ def stereo(
     right_intrinsics: str | None,
     alpha: float | None,
     ros: tuple[str, str] | None,
-    plot: str | None,
+    plots: Plots,
+    html: str | None,
     lean: bool,
+    as_json: bool,
     output: str,
 ) -> None:
     """Calibrate two cameras and the pose of the right one relative to the left one.
@@ -114,7 +120,8 @@ def stereo(
     \b
     Examples:
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
-          -o rig.yaml --plot errors.png --ros left.yaml right.yaml --alpha 0
+          -o rig.yaml --plot errors.png --html rig.html --ros left.yaml right.yaml \\
+          --alpha 0
       neurocal calibrate sample_data/stereo_left.csv -o left.yaml
       neurocal calibrate sample_data/stereo_right.csv -o right.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
@@ -124,22 +131,25 @@ def stereo(
           --no-skew --distortion k1 --outliers keep --target given --image-size 640 480 \\
           --method neuro --starts 40 --seed 1 | neurocal evaluate stereo -
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
-          --type 2 --image-center 319.5 239.5 -o rig.yaml
+          --type 2 --image-center 319.5 239.5 --json -o rig.yaml
       neurocal stereo sample_data/stereo_left.csv sample_data/stereo_right.csv \\
           --trainer backprop --epochs 20000 --rate 0.05 --rate-gamma 0.4 \\
           -o rig.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
+    check_summary(as_json, output)
     sides = _side(estimation, left_intrinsics), _side(estimation, right_intrinsics)
     # Each camera is checked for its own type; here type 3 is what both files of known cameras make it.
     (replace(estimation, type="1") if estimation.type == "3" else estimation).check()
     check_one_stdin(left, right, left_intrinsics, right_intrinsics)
-    check_plot(plot, output)
+    check_plots(plots, output)
     _check_outputs(output, ros)
-    check_outputs((output, plot, *(ros or ())), (left, right, left_intrinsics, right_intrinsics))
+    inputs = left, right, left_intrinsics, right_intrinsics
+    check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
     rig = _estimate((left, right), sides, estimation)
-    _write(rig, output, alpha, ros, plot, lean)
-    _report(rig)
+    _write(rig, output, alpha, ros, plots, lean)
+    write_page(html, rig, *inputs)
+    _report(rig, as_json)
     if not rig.converged:
         ctx.exit(_NOT_CONVERGED)
 
@@ -200,26 +210,29 @@ def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], esti
 
 
 def _write(
-    rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plot: str | None, lean: bool
+    rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plots: Plots, lean: bool
 ) -> None:
-    """Write all files, the picture drawn before any is touched."""
+    """Write all files."""
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.io.rig_yaml import format_ros_pair
     from neurocal_cli.io.writing import write_whole
 
-    if plot is not None:
-        from neurocal_cli.plots import draw_rig
+    if plots:
+        from neurocal_cli.plots.pages import draw_rig
 
-        write_whole(plot, draw_rig(rig, os.path.splitext(plot)[1][1:].lower()))
+        write_plots(plots, lambda kind, panel: draw_rig(rig, kind, panel))
     if ros is not None:
         for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
             write_whole(name, text)
     warn(write_result(rig, output, lean=lean, alpha=alpha))
 
 
-def _report(rig: Rig) -> None:
-    from neurocal_cli.stereo.report import rig_report, views_alone
+def _report(rig: Rig, as_json: bool) -> None:
+    from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
 
     note(views_alone(rig.alone))
-    say(rig_report(rig))
+    if as_json:
+        print_summary(rig_json(rig))
+    else:
+        say(rig_report(rig))
     warn(rig.warnings)

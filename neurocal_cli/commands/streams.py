@@ -3,13 +3,42 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextvars import ContextVar
 from typing import TextIO
 
 import click
 
 from neurocal_cli.errors import UsageError
 
-__all__ = ["check_one_stdin", "is_terminal", "note", "one_line", "say", "warn"]
+__all__ = [
+    "TYPED",
+    "check_one_stdin",
+    "complain",
+    "is_terminal",
+    "note",
+    "one_line",
+    "say",
+    "set_verbosity",
+    "tell_more",
+    "verbose",
+    "warn",
+]
+
+
+TYPED = "neurocal.typed"  # where a context keeps the words of the command line
+
+# -1: warnings only, -2: not even these, 1: how the work goes as well. Errors are always told.
+_VERBOSITY: ContextVar[int] = ContextVar("verbosity", default=0)
+
+
+def set_verbosity(level: int) -> None:
+    """Choose what is told until the end of this command."""
+    _VERBOSITY.set(level)
+
+
+def verbose() -> bool:
+    """Whether the user asked how the work goes."""
+    return _VERBOSITY.get() > 0
 
 
 def one_line(text: str) -> str:
@@ -19,8 +48,15 @@ def one_line(text: str) -> str:
 
 
 def say(text: str) -> None:
-    """Show a text that is not a result."""
-    click.echo(text, err=True)
+    """Show a text that is not a result, unless the user wants quiet."""
+    if _VERBOSITY.get() >= 0:
+        click.echo(text, err=True)
+
+
+def complain(text: str) -> None:
+    """Tell on one line what is wrong with a part of the input."""
+    if _VERBOSITY.get() >= -1:
+        click.echo(one_line(text), err=True)
 
 
 def note(texts: Iterable[str]) -> None:
@@ -32,7 +68,13 @@ def note(texts: Iterable[str]) -> None:
 def warn(texts: Iterable[str]) -> None:
     """Tell what may make the result worse than it looks."""
     for text in texts:
-        say(f"warning: {one_line(text)}")
+        complain(f"warning: {text}")
+
+
+def tell_more(text: str) -> None:
+    """Tell how the work goes, to who asked for it."""
+    if verbose():
+        click.echo(one_line(text), err=True)
 
 
 def is_terminal(stream: TextIO | None) -> bool:

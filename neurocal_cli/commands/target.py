@@ -9,6 +9,7 @@ import click
 from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option, plot_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import say
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.errors import InputError
 
 __all__ = ["target"]
@@ -23,8 +24,9 @@ __all__ = ["target"]
     description="A calibration that `neurocal calibrate` wrote; - is standard input.",
 )
 @plot_option("the heights of the board's points and their shifts")
+@summary_option
 @output_option("BOARD.yaml", "the board")
-def target(camera: str, plot: str | None, output: str) -> None:
+def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
     """Write the board as it was found.
 
     No board is exactly as its file says: paper curls, and printers stretch. `neurocal calibrate --target
@@ -37,15 +39,16 @@ def target(camera: str, plot: str | None, output: str) -> None:
     \b
     Examples:
       neurocal calibrate sample_data/bent.csv -o camera.yaml
-      neurocal target camera.yaml -o board.yaml --plot board.png
+      neurocal target camera.yaml -o board.yaml --plot board.png --json
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
     """  # noqa: D301 - as in the group
     check_plot(plot, output)
+    check_summary(as_json, output)
     check_outputs((output, plot), (camera,))
 
     from neurocal_cli.io.board_yaml import write_board
     from neurocal_cli.io.calibration_yaml import read_calibration
-    from neurocal_cli.report import target_lines
+    from neurocal_cli.report import target_json, target_lines
     from neurocal_cli.target import board_of
 
     calibration = read_calibration(camera)
@@ -61,4 +64,7 @@ def target(camera: str, plot: str | None, output: str) -> None:
         kind = os.path.splitext(plot)[1][1:].lower()
         write_whole(plot, draw_target(calibration.target, calibration.unit, kind))
     write_board(board_of(calibration.target, calibration.unit), output)
-    say("\n".join(target_lines(calibration.target, calibration.unit)))
+    if as_json:
+        print_summary(target_json(calibration.target, calibration.unit) or {})
+    else:
+        say("\n".join(target_lines(calibration.target, calibration.unit)))

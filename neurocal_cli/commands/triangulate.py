@@ -11,6 +11,7 @@ import click
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -50,9 +51,10 @@ _MANY_OFF = 0.5  # share of the points that no bad luck explains
     show_default="5 sigma",
     help="Flag points whose pixels must be moved by more than this for their rays to meet.",
 )
+@summary_option
 @output_option("XYZ.csv", "the points")
 def triangulate(
-    inputs: tuple[str, ...], sigma: float | None, epipolar_limit: float | None, output: str
+    inputs: tuple[str, ...], sigma: float | None, epipolar_limit: float | None, as_json: bool, output: str
 ) -> None:
     """Compute points in space from their pixels in the left and the right image.
 
@@ -77,7 +79,7 @@ def triangulate(
           -o rig.yaml
       neurocal triangulate rig.yaml sample_data/matches.csv -o xyz.csv
       neurocal triangulate rig.yaml sample_data/matches.csv --sigma 0.3 \\
-          --epipolar-limit 2
+          --epipolar-limit 2 --json -o xyz.csv
       cat sample_data/matches.csv | neurocal triangulate rig.yaml - > xyz.csv
     """  # noqa: D301 - as in the group
     if len(inputs) not in (2, 3):
@@ -88,6 +90,7 @@ def triangulate(
     if sigma is not None and sigma > _LARGEST_SIGMA:
         raise UsageError(f"--sigma is {sigma:g}; give the standard deviation of the pixels, such as 0.3")
     check_one_stdin(*inputs)
+    check_summary(as_json, output)
     check_outputs((output,), inputs)
     rig = _rig(inputs[:-1])
     from neurocal_cli.io.matches_csv import read_matches
@@ -106,7 +109,7 @@ def triangulate(
     write_chunks(
         output, format_space_points(tally.triangulated(matches), unit=rig.unit, sigma=sigma, limit=limit)
     )
-    tally.tell()
+    tally.tell(as_json)
 
 
 def _sigma(rig: Rig) -> float:
@@ -165,14 +168,18 @@ class _Tally:
                     self.outside += len(pixels) - int(inside.sum())
             yield found, batch.point
 
-    def tell(self) -> None:
-        """Say what came out, on stderr."""
+    def tell(self, as_json: bool) -> None:
+        """Say what came out, on stderr; as JSON on stdout."""
         parts = [f"{self.points} point{'s' * (self.points != 1)}"]
         if self.off:
             parts.append(f"{self.off} more than {self.limit:.3g} px off their epipolar lines")
         if self.behind:
             parts.append(f"{self.behind} behind a camera or at infinity")
-        say(", ".join(parts))
+        if as_json:
+            counts = {"n_points": self.points, "n_off": self.off, "n_behind": self.behind}
+            print_summary({**counts, "n_outside": self.outside, "epipolar_limit_px": self.limit})
+        else:
+            say(", ".join(parts))
         if self.outside:
             warn(
                 [f"{self.outside} pixels lie outside the images; check that the pixels are of these cameras"]

@@ -13,9 +13,11 @@ from neurocal_cli.board import Board
 from neurocal_cli.detection.detect import Detection, Points, detect_points, wanted_sizes
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.identity.messages import NoBoardError
+from neurocal_cli.detection.memory import Memory, Remembered
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
-from neurocal_cli.io.images import Image, encode_png, read_image
+from neurocal_cli.io.files import read_bytes
+from neurocal_cli.io.images import Image, encode_png, parse_image
 from neurocal_cli.processes import start_worker, usable_cores, work_through
 
 __all__ = ["DetectionOptions", "Outcome", "default_jobs", "detect_file", "detect_files", "keep_memory"]
@@ -37,6 +39,8 @@ class DetectionOptions:
         Whether to draw what was found.
     strict : bool
         Raise unexpected errors instead of reporting them as the problem of one image.
+    memory : Memory, optional
+        Where what was found is kept, and looked up.
     """
 
     board: Board
@@ -44,6 +48,7 @@ class DetectionOptions:
     gamma: float | None = None
     overlay: bool = False
     strict: bool = False
+    memory: Memory | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +101,18 @@ def detect_files(paths: Sequence[str], options: DetectionOptions, jobs: int = 1)
 def detect_file(path: str, options: DetectionOptions) -> Outcome:
     """Detect the board in one image file; errors become the outcome's problem."""
     try:
-        image = read_image(path)
+        data, source = read_bytes(path)
+        known = None if options.memory is None else options.memory.recall(data)
+        if known is not None:
+            return _named(path, source, known)
+        image = parse_image(data, source)
     except NeurocalError as error:
         return Outcome(path, problem=str(error))
     try:
-        return _detected(path, image, options)
+        found = _detected(image, options)
+        if options.memory is not None:
+            options.memory.keep(data, found)
+        return _named(path, source, found)
     except NeurocalError as error:
         problem = str(error)
     except MemoryError:
@@ -112,7 +124,13 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
     return Outcome(path, problem=f"{image.source}: {problem}", notes=image.notes)
 
 
-def _detected(path: str, image: Image, options: DetectionOptions) -> Outcome:
+def _named(path: str, source: str, found: Remembered) -> Outcome:
+    """What was found, with the name of the image that it was found in."""
+    problem = found["problem"] and f"{source}: {found['problem']}"
+    return Outcome(path, **{**found, "problem": problem})
+
+
+def _detected(image: Image, options: DetectionOptions) -> Remembered:
     grids = find_grids(image.grey, wanted_sizes(options.board))
     overlay: bytes | None = None
     try:
@@ -121,10 +139,26 @@ def _detected(path: str, image: Image, options: DetectionOptions) -> Outcome:
         if options.overlay:
             overlay = encode_png(draw_failure(image.grey, grids, str(error)))
         shown = error.shown if isinstance(error, NoBoardError) else None
-        return Outcome(path, None, f"{image.source}: {error}", image.notes, overlay, shown)
+        return _remembered(None, str(error), image.notes, overlay, shown)
     if options.overlay:
         overlay = encode_png(draw_detection(image.grey, found))
-    return Outcome(path, found, "", (*image.notes, *_remarks(found, options.board)), overlay)
+    return _remembered(found, "", (*image.notes, *_remarks(found, options.board)), overlay, None)
+
+
+def _remembered(
+    detection: Detection | None,
+    problem: str,
+    notes: tuple[str, ...],
+    overlay: bytes | None,
+    shown: tuple[int, int] | None,
+) -> Remembered:
+    return {
+        "detection": detection,
+        "problem": problem,
+        "notes": notes,
+        "overlay": overlay,
+        "shown": shown,
+    }
 
 
 def _remarks(found: Detection, board: Board) -> Iterator[str]:

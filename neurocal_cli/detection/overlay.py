@@ -55,7 +55,7 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     picture : (height, width, 3) uint8 array
         Red, green, blue.
     """
-    residuals = [plane_residuals(measured) for measured in detection.measured]
+    residuals = [plane_residuals(measured, detection.image_size) for measured in detection.measured]
     lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals])
     square = min(_square(one.grid) for one in detection.located)
     scale = _enlargement(lengths, square)

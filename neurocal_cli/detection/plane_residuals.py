@@ -6,21 +6,26 @@ import cv2
 import numpy as np
 
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Measured
+from neurocal_cli.detection.wide_lens import fit_wide_lens
 from neurocal_cli.geometry import Array
 
 __all__ = ["plane_residuals"]
 
+_FEWEST_WIDE = 12  # points for the lens of equal angles
 _POINTS_A_TERM = 6  # least number of points for each coefficient of the polynomial; for pictures only
 
 
-def plane_residuals(measured: Measured) -> Array:
-    """Measured pixels minus those of a homography and a polynomial fitted to them.
+def plane_residuals(measured: Measured, size: tuple[int, int] | None = None) -> Array:
+    """Measured pixels minus those of a plane and a polynomial fitted to them.
 
-    The polynomial models the distortion; its degree is five, or less for few points.
+    The plane is seen through a pinhole or a lens of equal angles, whichever is nearer. The polynomial models
+    what the real lens does differently; its degree is five, or less for few points.
 
     Parameters
     ----------
     measured : Measured
+    size : (width, height), optional [px]
+        Of the image; without it, only a pinhole.
 
     Returns
     -------
@@ -34,7 +39,10 @@ def plane_residuals(measured: Measured) -> Array:
     if H is None:
         return np.zeros_like(measured.pixels)
     seen = np.column_stack([grid, np.ones(len(grid))]) @ H.T
-    left = measured.pixels - seen[:, :2] / seen[:, 2:]
+    left = np.asarray(measured.pixels - seen[:, :2] / seen[:, 2:], dtype=float)
+    if size is not None and len(grid) >= _FEWEST_WIDE:
+        wide = fit_wide_lens(grid, measured.pixels, size).residual
+        left = wide if (wide**2).sum() < (left**2).sum() else left
     degree = max((d for d in range(1, 6) if _POINTS_A_TERM * (d + 1) * (d + 2) <= 2 * len(grid)), default=0)
     x, y = ((grid - grid.mean(axis=0)) / max(float(np.ptp(grid)), 1.0)).T
     terms = np.stack([x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)], axis=-1)

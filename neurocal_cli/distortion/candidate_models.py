@@ -14,14 +14,14 @@ from neurocal_cli.bundle_adjustment.observability import refuse_undetermined, re
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import coefficient_names, distort, pinhole_coefficients
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
-from neurocal_cli.distortion.similar_lens import farthest_angle, similar_states
+from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
@@ -109,7 +109,9 @@ def supported(problem: Problem, model: str) -> Problem | None:
     return with_model
 
 
-def fit_candidates(problem: Problem, state: CameraState, by_views: bool) -> dict[str, Candidate]:
+def fit_candidates(
+    problem: Problem, state: CameraState, by_views: bool, wanted: str | None = None
+) -> dict[str, Candidate]:
     """Fit every model, beginning with a state of any of them.
 
     Parameters
@@ -118,8 +120,10 @@ def fit_candidates(problem: Problem, state: CameraState, by_views: bool) -> dict
     state : CameraState
     by_views : bool
         Whether views are left out in cross-validation, or points.
+    wanted : str, optional
+        The model that counts; the others are only on the way to it, and need not be monotonic.
     """
-    return _Chain(problem, by_views, _reach(problem.views, state)).all_from(state)
+    return _Chain(problem, by_views, _reach(problem.views, state), wanted=wanted).all_from(state)
 
 
 def judged_again(
@@ -146,12 +150,14 @@ class _Chain:
     reach : float
         Of the points.
     repeated : RepeatedPoses, optional
+    wanted : str, optional
     """
 
     problem: Problem
     by_views: bool
     reach: float
     repeated: RepeatedPoses | None = None
+    wanted: str | None = None
 
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
         fitted: dict[str, Candidate] = {}
@@ -206,7 +212,13 @@ class _Chain:
     def _monotonic(self, fitted: list[Candidate]) -> list[Candidate]:
         """The same models, monotonic in the corners which the points do not reach."""
         lowest = min((c.cost for c in fitted), default=0.0)
-        near = [c.not_monotonic == "image" and not c.noise and c.cost <= _BEHIND * lowest for c in fitted]
+        near = [
+            c.not_monotonic == "image"
+            and not c.noise
+            and c.cost <= _BEHIND * lowest
+            and self.wanted in (None, c.problem.distortion.model)
+            for c in fitted
+        ]
         if not any(near) or falls_short(self.problem.views, fitted):
             return fitted
         return [self._made_monotonic(c) if bad else c for c, bad in zip(fitted, near, strict=True)]

@@ -37,13 +37,13 @@ def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[Came
     problem, best = solution.problem, solution.adjusted
     if not problem.free_distortion:
         return solution
-    views = problem.views
+    views, wanted = problem.views, problem.distortion.model
     cov = covariance(best.normal, problem.free_camera, problem.free_poses, views.n_equations)
     weak = is_weak(problem, best.state, cov)
     if best.converged and not weak and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
         return solution
     for start in (best.state, *more_starts()):
-        found = fit_candidates(problem, start, by_views=False).get(problem.distortion.model)
+        found = fit_candidates(problem, start, by_views=False, wanted=wanted).get(wanted)
         if found is None or not found.adjusted.cost.sum() < best.cost.sum():
             continue
         adjusted = problem.adjust(found.adjusted)

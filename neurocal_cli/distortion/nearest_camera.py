@@ -1,7 +1,9 @@
 """The camera of another distortion model, or without skew, that is nearest to a given one.
 
 Nearest means the smallest mean squared distance of pixels: the rays of pixels all over the image are
-projected by the new camera, and its parameters follow by least squares. Its pose does not change.
+projected by the new camera, and its parameters follow by least squares. Its pose does not change. A model
+that is not wide has no place for rays at the side or behind: it is fitted as far as 79 degrees from the axis,
+and the share of the image that it loses is told.
 """
 
 from __future__ import annotations
@@ -9,17 +11,32 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
+from neurocal_cli.camera.directions import WITH_XI
+from neurocal_cli.camera.distortion import WIDE, Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
-__all__ = ["NearestCamera", "image_rays", "nearest_camera", "with_model"]
+__all__ = ["Distance", "NearestCamera", "image_rays", "nearest_camera", "with_model"]
 
 _GRID = 25  # pixels along each side of the image
 _FEWEST = 50  # of them must see something
+_STEEPEST = 5.0  # tangent of 79 degrees, to which models that are not wide are fitted
+_STARTS, _STEPS = 3, 100
+_FINE = 80  # pixels along each side of which the share that is lost is counted
+
+
+@dataclass(frozen=True)
+class Distance:
+    """Distance of a camera's pixels from those of another [px]."""
+
+    rms_px: float
+    max_px: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,13 +46,18 @@ class NearestCamera:
     Attributes
     ----------
     camera : Camera
-    rms_px, max_px : float [px]
-        Distance of its pixels from those of the original, over the image.
+    over_image : Distance
+        All over the image, as far as the new camera shows it.
+    at_points : Distance, optional
+        At the pixels that were given.
+    lost : float
+        Share of the pixels of the image that see something, and that the new camera does not show.
     """
 
     camera: Camera
-    rms_px: float
-    max_px: float
+    over_image: Distance
+    at_points: Distance | None
+    lost: float
 
 
 def with_model(distortion: Distortion, model: str) -> Distortion | None:
@@ -43,11 +65,11 @@ def with_model(distortion: Distortion, model: str) -> Distortion | None:
     if distortion.model == model:
         return distortion
     if distortion.is_identity:
-        return Distortion(model) if not Distortion(model).coefficients.any() and model != "fisheye" else None
+        return Distortion(model) if model not in WIDE else None
+    if distortion.wide or model in WIDE:
+        return None
     names, values = coefficient_names(distortion.model), distortion.coefficients
     target = coefficient_names(model)
-    if (distortion.model == "fisheye") != (model == "fisheye"):
-        return None
     kept = dict(zip(names, values.tolist(), strict=True))
     if any(value for name, value in kept.items() if name not in target):
         return None
@@ -62,12 +84,8 @@ def image_rays(camera: Camera) -> tuple[Array, Array]:
     InputError
         Nearly none sees anything.
     """
-    # Without a size the principal point is taken for the middle.
-    width, height = camera.image_size or tuple(2 * np.maximum(camera.A[:2, 2], 1.0) + 1)
-    u, v = np.meshgrid(np.linspace(0, width - 1, _GRID), np.linspace(0, height - 1, _GRID))
-    pixels = np.column_stack([u.ravel(), v.ravel()])
-    rays = camera.unproject(pixels)
-    seen = np.isfinite(rays).all(axis=1) & (rays[:, 2] > 0)
+    pixels, rays = _grid(camera, np.linspace(0, 1, _GRID))
+    seen = np.isfinite(rays).all(axis=1)
     if seen.sum() < _FEWEST:
         raise InputError(
             "the distortion model maps nearly no pixel of the image to a ray; correct the camera"
@@ -75,7 +93,7 @@ def image_rays(camera: Camera) -> tuple[Array, Array]:
     return pixels[seen], rays[seen]
 
 
-def nearest_camera(camera: Camera, model: str, skew: bool) -> NearestCamera:
+def nearest_camera(camera: Camera, model: str, skew: bool, points: Array | None = None) -> NearestCamera:
     """Fit a camera of another model.
 
     Parameters
@@ -85,6 +103,8 @@ def nearest_camera(camera: Camera, model: str, skew: bool) -> NearestCamera:
         One of `MODELS`.
     skew : bool
         Whether the new camera may have the skew of the old one; else its axes are perpendicular.
+    points : (N, 2) array, optional [px]
+        Pixels, say those that the camera was calibrated with, at which the distance is told too.
 
     Returns
     -------
@@ -93,28 +113,128 @@ def nearest_camera(camera: Camera, model: str, skew: bool) -> NearestCamera:
     Raises
     ------
     InputError
-        A camera that maps nearly no pixel of its image.
+        A camera that maps nearly no pixel of its image, or nothing that the model can show.
     """
-    from scipy.optimize import least_squares
-
     pixels, rays = image_rays(camera)
-    # A11, A12, A22, A13, A23 and the coefficients; the skew is no parameter, but a given number.
-    slant = camera.A[0, 1] if skew else 0.0
+    ahead = _reached(model, rays)
+    if ahead.sum() < _FEWEST:
+        raise InputError(
+            f"the model {model} shows nearly nothing of what this camera sees; choose a wide one"
+        )
+    found = [
+        _descended(camera, model, start, skew, rays[ahead], pixels[ahead])
+        for start in _starts(camera, model, rays[ahead])
+    ]
+    best = min((one for one in found if one is not None), key=lambda one: one[1], default=None)
+    if best is None:
+        raise InputError(f"no camera of the model {model} is near this one; choose another model")
+    near = best[0]
+    at_points = None
+    if points is not None and len(points):
+        towards = camera.unproject(points)
+        good = np.isfinite(towards).all(axis=1)
+        good &= _shown(near, towards)
+        at_points = _distance(near, towards[good], points[good]) if good.any() else None
+    return NearestCamera(near, _distance(near, rays[ahead], pixels[ahead]), at_points, _lost(camera, near))
+
+
+def _reached(model: str, rays: Array) -> NDArray[np.bool_]:
+    """Which rays a model is fitted to."""
+    if model in WIDE:
+        return np.ones(len(rays), dtype=bool)
+    return np.asarray(np.hypot(rays[:, 0], rays[:, 1]) < _STEEPEST * rays[:, 2])
+
+
+def _shown(near: Camera, rays: Array) -> NDArray[np.bool_]:
+    return np.asarray(near.sees(rays) & _reached(near.distortion.model, rays))
+
+
+def _lost(camera: Camera, near: Camera) -> float:
+    """Share of the image that the new camera does not show."""
+    rays = _grid(camera, (np.arange(_FINE) + 0.5) / _FINE)[1]
+    seen = np.isfinite(rays[:, 0])
+    return float(1 - _shown(near, rays[seen]).mean())
+
+
+def _grid(camera: Camera, share: Array) -> tuple[Array, Array]:
+    """Pixels at shares of the image's width and height, and their rays."""
+    # Without a size the principal point is taken for the middle.
+    width, height = camera.image_size or tuple(2 * np.maximum(camera.A[:2, 2], 1.0) + 1)
+    u, v = np.meshgrid(share * (width - 1), share * (height - 1))
+    pixels = np.column_stack([u.ravel(), v.ravel()])
+    return pixels, camera.unproject(pixels)
+
+
+def _distance(camera: Camera, rays: Array, pixels: Array) -> Distance:
+    distance = np.hypot(*(camera.project(rays)[0] - pixels).T)
+    return Distance(float(np.sqrt(np.mean(distance**2))), float(distance.max()))
+
+
+def _starts(camera: Camera, model: str, rays: Array) -> list[Array]:
+    """A11, A12, A22, A13, A23 and the coefficients of cameras to begin with."""
     exact = with_model(camera.distortion, model)
     k = pinhole_coefficients(model) if exact is None else exact.coefficients
-    free = [0, 2, 3, 4, *range(5, 5 + len(k))]
-    start = np.array([*camera.entries, *k])[free]
+    starts = [np.array([*camera.entries, *k])]
+    if exact is None:
+        farthest = float(np.arctan2(np.hypot(rays[:, 0], rays[:, 1]), rays[:, 2]).max())
+        lens = camera.distortion
+        state = CameraState(
+            np.array([camera.entries]), np.eye(3)[None], np.zeros((1, 3)), lens.model, lens.coefficients
+        )
+        starts += [
+            np.array([*similar.entries[0], *similar.k]) for similar in similar_states(state, model, farthest)
+        ]
+    return starts[:_STARTS]
 
-    def built(p: Array) -> Camera:
-        A = np.array([[p[0], slant, p[2]], [0.0, p[1], p[3]], [0.0, 0.0, 1.0]])
+
+def _descended(
+    camera: Camera, model: str, start: Array, skew: bool, rays: Array, pixels: Array
+) -> tuple[Camera, float] | None:
+    """The nearest camera from a start, and its sum of squares; None where the start does not show all."""
+    from scipy.optimize import least_squares
+
+    # The skew is no parameter, but a given share of A11.
+    slant = camera.A[0, 1] / camera.A[0, 0] if skew else 0.0
+    free = [0, 2, 3, 4, *range(5, len(start))]
+
+    def built(p: Array) -> Camera | None:
+        # A step may lead to what is no camera.
+        if not (p[:2] > 0).all():
+            return None
+        A = np.array([[p[0], slant * p[0], p[2]], [0.0, p[1], p[3]], [0.0, 0.0, 1.0]])
         return Camera(Intrinsics.from_matrix(A), Distortion(model, p[4:]), camera.image_size, camera.name)
 
+    def entries(p: Array) -> Array:
+        # With xi the scale in the middle, p / (1 + xi), is what the image tells.
+        p = p.copy()
+        p[:2] *= 1 + p[4] if model in WITH_XI else 1.0
+        return p
+
     def error(p: Array) -> Array:
-        return (built(p).project(rays)[0] - pixels).ravel()
+        now = built(entries(p))
+        # What is not seen is nan, and the solver steps back.
+        return np.full(2 * len(rays), np.nan) if now is None else (now.project(rays)[0] - pixels).ravel()
 
     def slopes(p: Array) -> Array:
-        return built(p).project_jacobian(rays)[0][:, :, free].reshape(-1, len(free))
+        full = entries(p)
+        now = built(full)
+        assert now is not None  # only where the error is finite
+        J = now.project_jacobian(rays)[0]
+        J[:, :, 0] += slant * J[:, :, 1]
+        J = J[:, :, free]
+        if model in WITH_XI:
+            J[:, :, 4] += J[:, :, :2] @ p[:2]
+            J[:, :, :2] *= 1 + p[4]
+        return np.asarray(J.reshape(-1, len(free)))
 
-    fit = least_squares(error, start, slopes, x_scale="jac", method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    distance = np.hypot(*error(fit.x).reshape(-1, 2).T)
-    return NearestCamera(built(fit.x), float(np.sqrt(np.mean(distance**2))), float(distance.max()))
+    first = start[free]
+    first[:2] /= 1 + first[4] if model in WITH_XI else 1.0
+    if not np.isfinite(error(first)).all():
+        return None
+    with np.errstate(all="ignore"):
+        fit = least_squares(
+            error, first, slopes, x_scale="jac", method="trf", xtol=1e-12, ftol=1e-10, gtol=1e-15,
+            max_nfev=_STEPS,
+        )  # fmt: skip
+    near = built(entries(fit.x))
+    return None if near is None else (near, float(fit.cost))

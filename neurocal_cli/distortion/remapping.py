@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.distortion.undistortion import sources, undistorted_camera
+from neurocal_cli.distortion.undistorted_view import Undistorted
+from neurocal_cli.distortion.undistortion import chosen_view, sources
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
@@ -37,9 +38,11 @@ class Remapping:
 
     Parameters
     ----------
-    camera, new : Camera
-        With and without distortion.
+    camera : Camera
+    new : Camera or Panorama
+        Without distortion. Without an image size of its own, the result has that of the images.
     size : (width, height) [px]
+        Of the images.
     interpolation : str
         One of `INTERPOLATIONS`.
     R : (3, 3) array, optional
@@ -54,18 +57,19 @@ class Remapping:
     def __init__(
         self,
         camera: Camera,
-        new: Camera,
+        new: Undistorted,
         size: tuple[int, int],
         interpolation: str = "cubic",
         R: Array | None = None,
     ) -> None:
-        if max(size) > _LONGEST:
-            raise InputError(
-                f"images of {size[0]} x {size[1]} px cannot be undistorted: a side has at most {_LONGEST} "
-                "px; "
-                "cut them into parts"
-            )
-        self.camera, self.new, self.size = camera, new, size
+        new_size = new.image_size or size
+        for width, height in (size, new_size):
+            if max(width, height) > _LONGEST:
+                raise InputError(
+                    f"images of {width} x {height} px cannot be undistorted: a side has at most {_LONGEST} "
+                    "px; cut them into parts"
+                )
+        self.camera, self.new, self.size, self.new_size = camera, new, size, new_size
         self.R = R
         self._how = INTERPOLATIONS[interpolation]
         self._kept: list[Sources] = []
@@ -73,7 +77,7 @@ class Remapping:
     def __call__(
         self, image: NDArray[np.uint8] | NDArray[np.uint16]
     ) -> NDArray[np.uint8] | NDArray[np.uint16]:
-        """Undistorted image of the same size and type; black where it has no source.
+        """Undistorted image of the same type; black where it has no source.
 
         Parameters
         ----------
@@ -91,7 +95,7 @@ class Remapping:
                 "original images of this camera"
             )
         whole: NDArray[Any] = np.ascontiguousarray(image)
-        undistorted = np.empty_like(image, order="C")
+        undistorted = np.empty((*self.new_size[::-1], *image.shape[2:]), image.dtype)
         for rows, u, v in self._sources():
             part = cv2.remap(whole, u, v, self._how, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
             undistorted[rows] = part.reshape(undistorted[rows].shape)
@@ -107,7 +111,7 @@ class Remapping:
         if self._kept:
             yield from self._kept
             return
-        width, height = self.size
+        width, height = self.new_size
         rows = max(1, _AT_ONCE // width)
         keep = width * height <= _KEPT
         blocks = []
@@ -130,6 +134,8 @@ def undistort_image(
     camera: Camera | Calibration,
     alpha: float | None = None,
     interpolation: str = "cubic",
+    to: str = "plane",
+    fov: float | None = None,
 ) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Undistort an image.
 
@@ -138,8 +144,12 @@ def undistort_image(
     image : (height, width) or (height, width, channels) uint8 or uint16 array
     camera : Camera or Calibration
     alpha : float, optional
-        See `undistortion.new_matrix`; None keeps the camera's own matrix.
+        See `undistortion.new_matrix`; None keeps the camera's own matrix. For a plane without `fov`.
     interpolation : {"nearest", "linear", "cubic", "lanczos"}
+    to : {"plane", "cylinder", "equirectangular"}
+    fov : float, optional [degrees]
+        Field of view from left to right. By default a plane keeps the scale of the middle of the image; the
+        others show all that the image does from left to right.
 
     Returns
     -------
@@ -156,4 +166,4 @@ def undistort_image(
     height, width = image.shape[:2]
     camera = camera_of(camera)
     size = camera.image_size or (width, height)
-    return Remapping(camera, undistorted_camera(camera, alpha, size), size, interpolation)(image)
+    return Remapping(camera, chosen_view(camera, alpha, to, fov, size), size, interpolation)(image)

@@ -194,11 +194,16 @@ def _sizes(
 
 
 def _parts() -> list[Array]:
-    """(n, n) matrices: bending and squares of the profile, bending and squares of the field."""
+    """(n, n) matrices: bending and squares of the profile, bending and squares of the field.
+
+    The field's bending is of third order, the sum of squared third derivatives: beyond the points it goes on
+    with the curvature that it has there, and the band is as wide as that is uncertain.
+    """
     profile = np.diff(np.eye(RADII + 1), 2, axis=0)[:, 1:]  # the node on the axis is 0
-    line, one = np.diff(np.eye(GRID), 2, axis=0), np.eye(GRID)
-    slope = np.diff(one, axis=0)
-    field = np.concatenate([np.kron(one, line), np.kron(line, one), np.sqrt(2) * np.kron(slope, slope)])
+    one = np.eye(GRID)
+    first, second, third = (np.diff(one, order, axis=0) for order in (1, 2, 3))
+    mixed = np.concatenate([np.kron(first, second), np.kron(second, first)])
+    field = np.concatenate([np.kron(one, third), np.kron(third, one), np.sqrt(3) * mixed])
     bending, squares = np.kron(np.eye(2), field.T @ field), np.eye(2 * GRID * GRID)
     parts = []
     for first, block in ((0, profile.T @ profile), (0, np.eye(RADII)), (RADII, bending), (RADII, squares)):

@@ -14,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
-from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE, WITH_XI
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.projection import project_points
 from neurocal_cli.geometry import Array
 
-__all__ = ["farthest_angle", "similar_states"]
+__all__ = ["similar_states"]
 
 # Repeated by tests/test_wide_lenses.py (slow): random lenses of all models arrive at the minimum from here.
 _ANGLES = 60
@@ -30,12 +29,6 @@ _XI = {"omnidir": np.linspace(0.1, 3.0, 30), "double_sphere": np.linspace(-0.6, 
 _PARTS = {"omnidir": (0.7, 1.1, 1.4, 1.8), "double_sphere": (-0.1, 0.15)}
 _ALPHA = np.linspace(0.2, 0.9, 29)
 _BETA = np.geomspace(0.3, 3.0, 21)
-
-
-def farthest_angle(views: Views, state: CameraState) -> float:
-    """Largest angle of a point from the axis [rad]."""
-    X, Y, Z = ((state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]).T
-    return float(np.arctan2(np.hypot(X, Y), Z).max())
 
 
 def similar_states(state: CameraState, model: str, farthest: float) -> list[CameraState]:

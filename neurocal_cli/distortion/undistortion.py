@@ -1,10 +1,12 @@
 """Undistortion of points, and the source pixels of undistorted images.
 
-A pixel m of a camera A with distortion becomes the pixel m' of a camera A' without:
+A pixel m of a camera with distortion becomes the pixel m' where its ray is seen on a plane, a cylinder or a
+sphere (`panorama`). On a plane, with A' without distortion, that is
 
     x = undistort(A^-1 m),   m' = A' x
 
-A' is A itself, skew included, unless alpha says otherwise (`new_matrix`).
+A' is A itself, skew included, unless alpha says otherwise (`new_matrix`) or the lens is a wide one
+(`undistorted_view`).
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.measured_directions import unit
 from neurocal_cli.calibration import Calibration, camera_of
@@ -19,14 +22,18 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.monotonic import monotonic_radius
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.camera.projection import image_points_with_jacobian
+from neurocal_cli.camera.projection import image_points_with_jacobian, project_points
+from neurocal_cli.camera.unprojection import largest_angle
+from neurocal_cli.distortion.undistorted_view import Undistorted, plane_like, undistorted_view
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
 __all__ = [
+    "chosen_view",
     "map_points",
     "new_matrix",
+    "shown",
     "sources",
     "undistort_pixels",
     "undistort_points",
@@ -49,7 +56,7 @@ def undistorted_camera(
     ----------
     camera : Camera
     alpha : float, optional
-        See `new_matrix`; None keeps the camera's own matrix.
+        See `new_matrix`; None keeps the camera's own matrix, of a wide lens its scale in the middle.
     size : (width, height), optional [px]
         Of the images, for alpha; else the camera's.
 
@@ -59,7 +66,7 @@ def undistorted_camera(
         No image size for alpha, or a distortion that leaves no picture.
     """
     size = size or camera.image_size
-    intrinsics = camera.intrinsics
+    intrinsics = plane_like(camera)
     if alpha is not None:
         if size is None:
             raise InputError(
@@ -70,56 +77,63 @@ def undistorted_camera(
     return Camera(intrinsics, Distortion(), size, camera.name)
 
 
-def undistort_pixels(camera: Camera, new: Camera, pixels: Array, R: Array | None = None) -> Array:
-    """Undistorted pixels, (N, 2); ``nan`` where the distortion does not reach a pixel.
+def undistort_pixels(camera: Camera, new: Undistorted, pixels: Array, R: Array | None = None) -> Array:
+    """Undistorted pixels, (N, 2); ``nan`` where there are none.
 
     R (3, 3) is from the camera's frame to that of the new one, where it is turned as well.
     """
-    x, y = camera.normalised_points(*pixels.T)
-    return np.column_stack(new.image_points(*_turned(R, x, y)))
+    rays = camera.unproject(pixels)
+    return new.project(rays if R is None else rays @ R.T)[0]
 
 
-def _turned(R: Array | None, x: Array, y: Array) -> tuple[Array, Array]:
-    """Normalised points of a camera that is turned by R; ``nan`` behind it."""
-    if R is None:
-        return x, y
-    X, Y, Z = np.tensordot(R, np.stack([x, y, np.ones_like(x)]), axes=1)
-    with np.errstate(all="ignore"):
-        return np.where(Z > 0, X / Z, np.nan), np.where(Z > 0, Y / Z, np.nan)
-
-
-def sources(camera: Camera, new: Camera, u: Array, v: Array, R: Array | None = None) -> tuple[Array, Array]:
+def sources(
+    camera: Camera, new: Undistorted, u: Array, v: Array, R: Array | None = None
+) -> tuple[Array, Array]:
     """Source pixels of pixels (u, v) of an undistorted image; ``nan`` where there are none.
 
     Parameters
     ----------
-    camera, new : Camera
-        With and without distortion.
+    camera : Camera
+    new : Camera or Panorama
+        Without distortion.
     u, v : arrays of one shape [px]
     R : (3, 3) array, optional
         From the camera's frame to that of the new one, where it is turned as well.
     """
-    x, y = new.normalised_points(u, v)
+    X, Y, Z = _directions(new, u, v)
+    if R is not None:
+        X, Y, Z = np.tensordot(R.T, np.stack([X, Y, Z]), axes=1)
     with np.errstate(all="ignore"):
-        x, y = _turned(None if R is None else R.T, x, y)
-        u, v, _, _, (ux, uy, vx, vy), _ = image_points_with_jacobian(
-            camera.entries, camera.model, camera.distortion.coefficients, x, y
-        )
-        valid = (x * x + y * y < monotonic_radius(camera.distortion) ** 2) & (ux * vy > uy * vx)
+        if camera.distortion.wide:
+            u, v, seen = project_points(camera.entries, camera.model, camera.distortion.coefficients, X, Y, Z)
+            valid = seen & (np.arctan2(np.hypot(X, Y), Z) < largest_angle(camera.distortion))
+        else:
+            x, y = X / Z, Y / Z
+            u, v, _, _, (ux, uy, vx, vy), _ = image_points_with_jacobian(
+                camera.entries, camera.model, camera.distortion.coefficients, x, y
+            )
+            valid = (x * x + y * y < monotonic_radius(camera.distortion) ** 2) & (ux * vy > uy * vx) & (Z > 0)
     return np.where(valid, u, np.nan), np.where(valid, v, np.nan)
 
 
-def _distorted_by_undistorted(camera: Camera, new: Camera, pixels: Array, R: Array | None) -> Array:
+def _directions(new: Undistorted, u: Array, v: Array) -> tuple[Array, Array, Array]:
+    if not isinstance(new, Camera):
+        return new.directions(u, v)
+    x, y = new.normalised_points(u, v)
+    return x, y, np.ones_like(x)
+
+
+def _distorted_by_undistorted(camera: Camera, new: Undistorted, pixels: Array, R: Array | None) -> Array:
     """(N, 2, 2) derivative of the distorted pixels by the undistorted ones (N, 2)."""
-    x, y = new.normalised_points(*pixels.T)
-    inner = np.linalg.inv(new.A[:2, :2])
+    u, v = pixels.T
+    rays = np.column_stack(_directions(new, u, v))
+    if isinstance(new, Camera):
+        slopes = np.vstack([np.linalg.inv(new.A[:2, :2]), np.zeros(2)])
+    else:
+        slopes = new.slopes(u, v)
     if R is not None:
-        Z = R[0, 2] * x + R[1, 2] * y + R[2, 2]
-        x, y = _turned(R.T, x, y)
-        # Of the point (X, Y) / Z, of which X, Y, Z are R^T (x, y, 1).
-        ahead = R.T[:2, :2] - np.stack([x, y], axis=-1)[:, :, None] * R.T[2, :2]
-        inner = ahead / Z[:, None, None] @ inner
-    return np.asarray(camera.image_jacobian(x, y) @ inner)
+        rays, slopes = rays @ R, R.T @ slopes
+    return np.asarray(camera.project_jacobian(rays)[1] @ slopes)
 
 
 def new_matrix(camera: Camera, size: tuple[int, int], alpha: float) -> Intrinsics:
@@ -206,7 +220,11 @@ def _outer(camera: Camera, corner: Array) -> tuple[Array, Array]:
 
 
 def undistort_points(
-    points: Correspondences, camera: Camera | Calibration, alpha: float | None = None
+    points: Correspondences,
+    camera: Camera | Calibration,
+    alpha: float | None = None,
+    to: str = "plane",
+    fov: float | None = None,
 ) -> Correspondences:
     """Undistort points.
 
@@ -216,19 +234,58 @@ def undistort_points(
         Their covariances and the image centre, where given, are transformed as well.
     camera : Camera or Calibration
     alpha : float, optional
-        See `new_matrix`; None keeps the camera's own matrix.
+        See `new_matrix`; None keeps the camera's own matrix. For a plane without `fov`.
+    to : {"plane", "cylinder", "equirectangular"}
+    fov : float, optional [degrees]
+        Field of view from left to right; see `undistorted_view`.
 
     Raises
     ------
     InputError
-        A pixel that the distortion does not reach, named by its file and line.
+        A pixel that the distortion does not reach, or that a plane cannot show, named by its file and line.
     """
     camera = camera_of(camera)
-    return map_points(points, camera, undistorted_camera(camera, alpha, points.image_size))
+    return map_points(points, camera, chosen_view(camera, alpha, to, fov, points.image_size))
+
+
+def chosen_view(
+    camera: Camera,
+    alpha: float | None,
+    to: str,
+    fov: float | None,
+    size: tuple[int, int] | None,
+    new_size: tuple[int, int] | None = None,
+) -> Undistorted:
+    """The camera of undistorted pixels, by alpha, or by shape, field of view and size.
+
+    Raises
+    ------
+    InputError
+        Both of them, or no image size where one is needed.
+    """
+    if to == "plane" and fov is None and new_size is None:
+        return undistorted_camera(camera, alpha, size)
+    if alpha is not None:
+        raise InputError("alpha is of a plane whose field of view and size are not given; leave it out")
+    size = size or camera.image_size
+    if size is None:
+        raise InputError(
+            "a field of view needs the size of the images, which neither the camera nor the points have; add "
+            "image_size"
+        )
+    return undistorted_view(camera, size, to, fov, new_size)
+
+
+def shown(
+    points: Correspondences, camera: Camera, new: Undistorted, R: Array | None = None
+) -> NDArray[np.bool_]:
+    """Which points are not beyond the edge of what a plane can show; those that no camera sees count too."""
+    rays = camera.unproject(points.pixels)
+    return ~np.isfinite(rays[:, 0]) | new.project(rays if R is None else rays @ R.T)[1]
 
 
 def map_points(
-    points: Correspondences, camera: Camera, new: Camera, R: Array | None = None
+    points: Correspondences, camera: Camera, new: Undistorted, R: Array | None = None
 ) -> Correspondences:
     """Move points to where another camera at the same place sees them.
 
@@ -236,26 +293,33 @@ def map_points(
     ----------
     points : Correspondences
         Their covariances and the image centre, where given, are transformed as well.
-    camera, new : Camera
-        With and without distortion.
+    camera : Camera
+    new : Camera or Panorama
+        Without distortion.
     R : (3, 3) array, optional
         From the camera's frame to that of the new one, where it is turned as well.
 
     Raises
     ------
     InputError
-        A pixel that the distortion does not reach, named by its file and line.
+        A pixel that the distortion does not reach, or that a plane cannot show, named by its file and line.
     """
     pixels = undistort_pixels(camera, new, points.pixels, R)
     lost = ~np.isfinite(pixels[:, 0])
     if lost.any():
         row = int(np.argmax(lost))
         u, v = points.pixels[row]
+        if np.isfinite(camera.unproject(points.pixels[row])).all():
+            raise InputError(
+                f"{points.place(row)}: the pixel ({u:g}, {v:g}) sees 90 degrees from the axis or more, which "
+                "no plane shows; choose a cylinder, or remove the row"
+            )
         raise InputError(
             f"{points.place(row)}: the distortion maps nothing to the pixel ({u:g}, {v:g}); correct "
             "or remove the row, and check that the camera belongs to these points"
         )
-    undistorted = replace(points, pixels=pixels)
+    size = points.image_size and new.image_size
+    undistorted = replace(points, pixels=pixels, image_size=size)
     if points.covariance is not None:
         # To first order C' = M C M^T, with M the derivative of the undistorted pixel by the distorted one.
         M = np.linalg.inv(_distorted_by_undistorted(camera, new, pixels, R))

@@ -5,6 +5,7 @@ Colours are those of the page, so that they are right in the light and in the da
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Sequence
 from html import escape
 
@@ -19,9 +20,16 @@ _LONG = 0.04  # of the image's width, for a residual of three times the rms
 
 
 def residual_map(
-    pixels: Array, residuals: Array, size: tuple[int, int], scale: float | None = None, bold: float = 1.0
+    pixels: Array,
+    residuals: Array,
+    size: tuple[int, int],
+    scale: float | None = None,
+    bold: float = 1.0,
+    *,
+    left_out: Array | None = None,
+    photograph: bytes | None = None,
 ) -> str:
-    """Residuals as lines from their points, enlarged, in the frame of the image.
+    """Residuals as lines from their points, enlarged, in the frame of the image or over its photograph.
 
     Parameters
     ----------
@@ -31,6 +39,10 @@ def residual_map(
         How many times residuals are enlarged; `enlargement` of these by default.
     bold : float
         How many times lines are thicker, for a small drawing.
+    left_out : (M, 2) array, optional [px]
+        Points that are drawn as crosses.
+    photograph : bytes, optional
+        A JPEG file that shows the image.
     """
     width, height = size
     scale = enlargement(residuals, size) if scale is None else scale
@@ -42,10 +54,33 @@ def residual_map(
     dots = "".join(f"M{u:.1f} {v:.1f}h0" for u, v in pixels[::step])
     return (
         f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="residuals, {scale:.3g} times enlarged">'
-        f'<rect width="{width}" height="{height}" class="frame"/>'
+        f'<rect width="{width}" height="{height}" class="frame"/>{_photograph(photograph, size)}'
         f'<path d="{dots}" class="dots" stroke-width="{bold * width / 160:.2f}"/>'
-        f'<path d="{path}" class="lines" stroke-width="{bold * width / 450:.2f}"/></svg>'
+        f'<path d="{path}" class="lines" stroke-width="{bold * width / 450:.2f}"/>'
+        f"{_crosses(left_out, width)}</svg>"
     )
+
+
+def _photograph(jpeg: bytes | None, size: tuple[int, int]) -> str:
+    """The image, whose pixel centres are whole numbers."""
+    if jpeg is None:
+        return ""
+    data = b64encode(jpeg).decode()
+    return (
+        f'<image x="-.5" y="-.5" width="{size[0]}" height="{size[1]}" href="data:image/jpeg;base64,{data}"/>'
+    )
+
+
+def _crosses(pixels: Array | None, width: int) -> str:
+    if pixels is None or not len(pixels):
+        return ""
+    arm = width / 100
+    path = "".join(
+        f"M{u - arm:.1f} {v - arm:.1f}L{u + arm:.1f} {v + arm:.1f}"
+        f"M{u - arm:.1f} {v + arm:.1f}L{u + arm:.1f} {v - arm:.1f}"
+        for u, v in pixels
+    )
+    return f'<path d="{path}" class="out" stroke-width="{width / 300:.2f}"/>'
 
 
 def enlargement(residuals: Array, size: tuple[int, int]) -> float:

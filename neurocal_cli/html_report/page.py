@@ -34,10 +34,13 @@ th:first-child,td:first-child{text-align:left}
 th button{all:unset;cursor:pointer;text-decoration:underline dotted}th button:focus-visible{outline:2px solid}
 .figures{display:grid;gap:1rem;grid-template-columns:repeat(auto-fit,minmax(min(100%,300px),1fr))}
 .views{display:grid;gap:.6rem;grid-template-columns:repeat(auto-fill,minmax(min(100%,170px),1fr))}
+.wider{grid-template-columns:repeat(auto-fill,minmax(min(100%,250px),1fr))}
 figure{margin:0;break-inside:avoid}figcaption{color:var(--soft);font-size:.85rem;overflow-wrap:anywhere}
 svg{display:block;width:100%;height:auto;fill:var(--ink)}.views svg{cursor:zoom-in}
 .frame{fill:var(--card);stroke:var(--edge);vector-effect:non-scaling-stroke}
 .dots{stroke:var(--accent);stroke-linecap:round;fill:none}.lines{stroke:var(--line);fill:none}
+.out{stroke:var(--poor);fill:none}image{opacity:.6}
+image~.dots{stroke:#00b7ff}image~.lines,image~.out{stroke:#ff1f4b}
 .axis{stroke:var(--soft);stroke-width:.03;fill:none}.bar{fill:var(--accent)}
 dialog{width:min(96vw,1200px);border:1px solid var(--edge);background:var(--paper);color:var(--ink)}
 dialog::backdrop{background:#000a}dl{display:grid;grid-template-columns:auto 1fr;gap:.2rem 1rem}
@@ -78,7 +81,7 @@ def page(title: str, parts: Iterable[str]) -> str:
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width,initial-scale=1">\n'
         '<meta http-equiv="Content-Security-Policy" '
-        "content=\"default-src 'none';style-src 'unsafe-inline';script-src 'unsafe-inline'\">\n"
+        "content=\"default-src 'none';img-src data:;style-src 'unsafe-inline';script-src 'unsafe-inline'\">\n"
         f"<title>{escape(title)}</title>\n<style>{_STYLE}</style></head>\n<body>\n<h1>{escape(title)}</h1>\n"
         + "\n".join(parts)
         + f'\n<p class="soft">neurocal {__version__}</p>\n<dialog></dialog>\n'

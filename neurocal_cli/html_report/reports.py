@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from html import escape
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.geometry import Array
 from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map, scatter
+from neurocal_cli.html_report.origin import Origin
 from neurocal_cli.html_report.page import definitions, figure, page, section, table, verdict_block
 from neurocal_cli.report import parameter_rows, printable
 from neurocal_cli.stereo.report import camera_rows, rig_rows
@@ -23,29 +25,34 @@ __all__ = ["calibration_page", "lens_page", "rig_page"]
 _MOST_REJECTED = 200  # rows
 
 
-def calibration_page(calibration: Calibration, source: str, digest: str) -> str:
+def calibration_page(
+    calibration: Calibration, origin: Origin, photographs: Mapping[str, bytes] | None = None
+) -> str:
     """The page of one camera.
 
     Parameters
     ----------
     calibration : Calibration
-    source : str
-        Name of its file.
-    digest : str
-        SHA-256 of the file.
+    origin : Origin
+    photographs : dict of bytes by view, optional
+        JPEG files that show the images.
     """
     size = _size(calibration)
     head = f"{size}, {len(calibration.views)} views, {len(calibration.points)} points, distortion model "
     parts = [
         f'<p class="soft">{escape(head + calibration.distortion_model)}</p>',
         verdict_block(calibration.verdict, _facts(calibration.verdict)),
-        *_camera_parts(calibration),
-        _repeat(_command(calibration), calibration, source, digest),
+        *_camera_parts(calibration, photographs or {}),
+        _repeat(_command(calibration), calibration, origin),
     ]
     return page(f"Calibration of {printable(calibration.camera_name)}", parts)
 
 
-def rig_page(rig: Rig, source: str, digest: str) -> str:
+def rig_page(
+    rig: Rig,
+    origin: Origin,
+    photographs: tuple[Mapping[str, bytes], Mapping[str, bytes]] | None = None,
+) -> str:
     """The page of two cameras; see `calibration_page`."""
     head = f"{len(rig.pairs)} pairs of views, baseline {rig.baseline:.6g} {printable(rig.unit)}"
     pairs = [["pair", "left rms [px]", "right rms [px]"]]
@@ -63,15 +70,16 @@ def rig_page(rig: Rig, source: str, digest: str) -> str:
         section("Pairs left out", table(left_out) if len(left_out) > 1 else ""),
         _warnings(rig.warnings),
     ]
-    for side, camera in (("Left camera", rig.left), ("Right camera", rig.right)):
+    sides = ("Left camera", rig.left), ("Right camera", rig.right)
+    for (side, camera), images in zip(sides, photographs or ({}, {}), strict=True):
         parts.append(section(side, " "))
-        parts += _camera_parts(camera, parameters=False)
+        parts += _camera_parts(camera, images, parameters=False)
     command = "neurocal stereo LEFT.csv RIGHT.csv" + _options(rig.left)
-    parts.append(_repeat(command, rig.left, source, digest))
+    parts.append(_repeat(command, rig.left, origin))
     return page("Calibration of two cameras", parts)
 
 
-def lens_page(lens: ZoomLens, source: str, digest: str) -> str:
+def lens_page(lens: ZoomLens, origin: Origin) -> str:
     """The page of a zoom lens; see `calibration_page`."""
     verdict = judge_lens(lens)
     parts = [
@@ -79,19 +87,15 @@ def lens_page(lens: ZoomLens, source: str, digest: str) -> str:
         section("Summary", f'<div class="wide"><pre>{escape(lens_report(lens))}</pre></div>'),
         section(
             "How to repeat it",
-            definitions(
-                {
-                    "command": f"neurocal lens fit POINTS.csv --seed {lens.seed} -o LENS.yaml",
-                    "file": printable(source),
-                    "SHA-256 of the file": digest,
-                }
-            ),
+            _origin(f"neurocal lens fit POINTS.csv --seed {lens.seed} -o LENS.yaml", origin, {}),
         ),
     ]
     return page("Calibration of a zoom lens", parts)
 
 
-def _camera_parts(calibration: Calibration, parameters: bool = True) -> list[str]:
+def _camera_parts(
+    calibration: Calibration, photographs: Mapping[str, bytes], parameters: bool = True
+) -> list[str]:
     """Sections on one camera: parameters, pictures, views, what was left out, warnings."""
     parts = [section("Parameters", table(parameter_rows(calibration)))] if parameters else []
     residuals = _residuals(calibration)
@@ -114,7 +118,7 @@ def _camera_parts(calibration: Calibration, parameters: bool = True) -> list[str
             figure(error_bars(names, errors, calibration.rmse_px), "Error of each view, in their order."),
         ]
         parts.append(section("Residuals", f'<div class="figures">{"".join(drawings)}</div>'))
-        parts += _view_parts(calibration, residuals, size, scale)
+        parts += _view_parts(calibration, residuals, size, scale, photographs)
     parts += [_rejected(calibration), _warnings(calibration.warnings)]
     return parts
 
@@ -131,7 +135,13 @@ def _residuals(calibration: Calibration) -> Array:
     return np.asarray(np.nan_to_num(calibration.camera.project(X)[0] - points.pixels))
 
 
-def _view_parts(calibration: Calibration, residuals: Array, size: tuple[int, int], scale: float) -> list[str]:
+def _view_parts(
+    calibration: Calibration,
+    residuals: Array,
+    size: tuple[int, int],
+    scale: float,
+    photographs: Mapping[str, bytes],
+) -> list[str]:
     points = calibration.points
     unit = printable(calibration.unit)
     rows = [["view", "points", "rms [px]", "max [px]", f"distance [{unit}]", "tilt [deg]"]]
@@ -145,16 +155,29 @@ def _view_parts(calibration: Calibration, residuals: Array, size: tuple[int, int
             [printable(name), str(int(own.sum())), f"{view.rmse_px:.4f}", f"{lengths.max():.4f}",
              f"{distance:.5g}", f"{tilt:.1f}"]
         )  # fmt: skip
-        drawing = residual_map(points.pixels[own], residuals[own], size, scale, bold=2.2)
+        image = photographs.get(name)
+        drawing = residual_map(
+            points.pixels[own], residuals[own], size, scale, bold=2.2,
+            left_out=_left_out(calibration, name), photograph=image,
+        )  # fmt: skip
         figures.append(figure(drawing, f"{printable(name)}: {view.rmse_px:.3f} px"))
     return [
         section("Views", table(rows, sortable=True)),
         section(
             "Residuals of each view",
-            f'<p class="soft">All {scale:.3g} times enlarged; a click shows one large.</p>',
-            f'<div class="views">{"".join(figures)}</div>',
+            f'<p class="soft">All {scale:.3g} times enlarged; a click shows one large. Crosses are '
+            "points that were left out.</p>",
+            f'<div class="views{" wider" if photographs else ""}">{"".join(figures)}</div>',
         ),
     ]
+
+
+def _left_out(calibration: Calibration, view: str) -> Array:
+    """(M, 2) pixels of a view's points that were left out."""
+    points = calibration.rejected.points
+    if points is None or view not in points.view_names:
+        return np.zeros((0, 2))
+    return points.pixels[points.view_index == points.view_names.index(view)]
 
 
 def _rejected(calibration: Calibration) -> str:
@@ -213,15 +236,20 @@ def _command(calibration: Calibration) -> str:
     return f"neurocal calibrate POINTS.csv{_options(calibration)}"
 
 
-def _repeat(command: str, calibration: Calibration, source: str, digest: str) -> str:
-    entries = {
-        "command": command,
-        "how it ended": calibration.stop_reason,
-        "file": printable(source),
-        "SHA-256 of the file": digest,
-    }
+def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:
     text = (
-        "The same points, options and seed give the same file, byte for byte, with the same version. The "
+        "The same points, options and seed give the same file, byte for byte, with the same versions. The "
         "file holds its points; neurocal evaluate camera judges it again."
     )
-    return section("How to repeat it", definitions(entries), f'<p class="soft">{text}</p>')
+    facts = {"seed": str(calibration.seed), "how it ended": calibration.stop_reason}
+    return section("How to repeat it", _origin(command, origin, facts), f'<p class="soft">{text}</p>')
+
+
+def _origin(likely: str, origin: Origin, facts: Mapping[str, str]) -> str:
+    """The run; where it is not known, the command that would give the like."""
+    entries = {"command" if origin.command else "a command that gives the like": origin.command or likely}
+    entries |= facts
+    if origin.versions:
+        entries["versions"] = ", ".join(f"{name} {number}" for name, number in origin.versions.items())
+    entries |= {f"SHA-256 of {printable(name)}": digest for name, digest in origin.files.items()}
+    return definitions(entries)

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
-from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, ViewResult
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.geometry import Array, euler_to_rotation
-from neurocal_cli.io.calibration_yaml import FORMAT
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.calibration_yaml import FORMATS
 from neurocal_cli.io.distortion_names import own_length
 from neurocal_cli.io.named_entries import read_named
+from neurocal_cli.io.observations_yaml import read_observations
 from neurocal_cli.io.rejected_yaml import read_rejected
 from neurocal_cli.io.target_yaml import read_target
+from neurocal_cli.io.text_columns import read_numbers
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.verdict_yaml import read_verdict
+from neurocal_cli.io.views_yaml import read_views
 from neurocal_cli.points import Correspondences
 
 __all__ = [
@@ -26,10 +27,6 @@ __all__ = [
     "neurocal_block",
     "poses_from_field",
 ]
-
-_NUMBER_COLUMNS = ("X", "Y", "Z", "u", "v")
-_COVARIANCE_COLUMNS = ("suu", "suv", "svv")
-_ACROSS_COLUMNS = ("nu", "nv")
 
 # camera_matrix repeats the parameters for ROS; a difference beyond rounding means an edit of one.
 _SAME = 1e-6
@@ -49,7 +46,7 @@ def calibration_from_field(root: Field) -> Calibration:
         A key that is missing or wrong.
     """
     block = neurocal_block(root)
-    views = _views(block)
+    views = read_views(block["views"])
     fit = block["fit"]
     points = _points(root, block, set(views), fit["n_points"].integer() == 0)
     if fit["n_points"].integer() != len(points):
@@ -108,9 +105,10 @@ def neurocal_block(root: Field) -> Field:
             )
         raise FormatError("has no neurocal block; give a file that calibrate wrote", root.source)
     block = root["neurocal"]
-    if block["format"].integer() != FORMAT:
+    if block["format"].integer() not in FORMATS:
         raise FormatError(
-            f"{block.path}.format is {block['format'].integer()}, not {FORMAT}; update neurocal",
+            f"{block.path}.format is {block['format'].integer()}, not {' or '.join(map(str, FORMATS))}; "
+            "update neurocal",
             root.source,
         )
     return block
@@ -143,7 +141,7 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
 
 def poses_from_field(root: Field) -> dict[str, Pose]:
     """Read the pose of each view of a neurocal file."""
-    return {name: view.pose for name, view in _views(neurocal_block(root)).items()}
+    return {name: view.pose for name, view in read_views(neurocal_block(root)["views"]).items()}
 
 
 def _type(field: Field) -> int:
@@ -151,41 +149,6 @@ def _type(field: Field) -> int:
     if number not in (1, 2, 3, 4):
         field.fail("1, 2, 3 or 4")
     return number
-
-
-def _views(block: Field) -> dict[str, ViewResult]:
-    views: dict[str, ViewResult] = {}
-    for entry in block["views"].items():
-        name = entry["name"].text()
-        if name in views:
-            entry["name"].fail("a name that no other view has")
-        views[name] = _view(entry)
-    return views
-
-
-def _view(entry: Field) -> ViewResult:
-    values: list[float] = []
-    std: dict[str, float] = {}
-    for group, names in (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:])):
-        field = entry[group]
-        for name in names:
-            estimate = field[name]
-            values.append(estimate["value"].number())
-            if "std" in estimate.value:
-                std[name] = estimate["std"].number_or_nan()
-    R = euler_to_rotation(*values[:3])
-    if "R" in entry:
-        exact = entry["R"].array(3, 3)
-        if np.abs(exact - R).max() > _SAME:
-            raise FormatError(f"{entry.path}: R and rotation disagree; correct the one edited", entry.source)
-        R = exact
-    return ViewResult(
-        pose=Pose(R, np.array(values[3:])),
-        std=std,
-        n_points=entry["n_points"].integer() if "n_points" in entry else 0,
-        rmse_px=entry["rmse_px"].number_or_nan(),
-        fixed="fixed" in entry and entry["fixed"].boolean(),
-    )
 
 
 def _covariance(block: Field) -> tuple[tuple[str, ...], Array]:
@@ -221,9 +184,9 @@ def _network(field: Field | None) -> NetworkRecord | None:
         return None
     return NetworkRecord(
         W=field["W"].array(3, 3),
-        V={view: entry.array(3, 4) for view, entry in read_named(field["V"]).items()},
+        V=_matrices(field["V"], 3, 4),
         S1=field["S1"].array(3, 3),
-        S2={view: entry.array(4, 4) for view, entry in read_named(field["S2"]).items()},
+        S2=_matrices(field["S2"], 4, 4),
         starts=field["starts"].integer(),
         agreed=field["agreed"].integer(),
         iterations=field["iterations"].integer(),
@@ -233,6 +196,17 @@ def _network(field: Field | None) -> NetworkRecord | None:
         rmse_after=field["rmse_after"].number_or_nan(),
         curve=tuple(field["curve"].array(-1, unknown=True).tolist()),
     )
+
+
+def _matrices(field: Field, *shape: int) -> dict[str, Array]:
+    """Read a matrix for each view; in a long file the names, and all numbers as texts."""
+    data = field.get("data") if isinstance(field.value, dict) else None
+    if data is None or "views" not in field or not all(isinstance(e.value, str) for e in data.items()):
+        return {view: entry.array(*shape) for view, entry in read_named(field).items()}
+    names = [entry.text() for entry in field["views"].items()]
+    numbers = Field(read_numbers(list(data.items())), data.source, data.path)
+    stack = numbers.array(len(names) * shape[0] * shape[1]).reshape(-1, *shape)
+    return dict(zip(names, stack, strict=True))
 
 
 def _straight_lines(field: Field | None) -> StraightLines | None:
@@ -250,75 +224,20 @@ def _straight_lines(field: Field | None) -> StraightLines | None:
 
 def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspondences:
     observations = block["observations"]
-    columns = _columns(observations)
-    if none and not columns:  # a camera that a lens gave
-        return Correspondences.none(_image_size(root), block["unit"].text() if "unit" in block else "mm")
-    numbers = _numbers(observations, columns, _NUMBER_COLUMNS)
-    labels = {name: _labels(observations, columns, name) for name in ("view", "point") if name in columns}
-    strange = set(labels.get("view", ())) - views if "view" in columns else set()
+    unit = block["unit"].text() if "unit" in block else "mm"
+    center = block.get("image_center")
+    u0_v0 = None if center is None else tuple(center.array(2).tolist())
+    points = read_observations(observations, unit, _image_size(root), u0_v0, none)
+    strange = set() if points.view is None else set(points.view_names) - views
     if strange:
         raise FormatError(
             f"{observations.path}: the view {min(strange)[:60]!r} is not in {block.path}.views; "
             "calibrate again or correct its name",
             root.source,
         )
-    center = block.get("image_center")
-    has_covariance = all(name in columns for name in _COVARIANCE_COLUMNS)
-    has_across = all(name in columns for name in _ACROSS_COLUMNS)
-    try:
-        return Correspondences(
-            numbers[:, :3],
-            numbers[:, 3:],
-            view=labels.get("view"),
-            point=labels.get("point"),
-            covariance=_numbers(observations, columns, _COVARIANCE_COLUMNS) if has_covariance else None,
-            across=_numbers(observations, columns, _ACROSS_COLUMNS) if has_across else None,
-            image_size=_image_size(root),
-            image_center=None if center is None else tuple(center.array(2).tolist()),
-            unit=block["unit"].text() if "unit" in block else "mm",
-            source=root.source,
-        )
-    except InputError as error:
-        raise FormatError(str(error)) from error
+    return points
 
 
 def _image_size(root: Field) -> tuple[int, int] | None:
     width, height = (root[key].integer() if key in root else 0 for key in ("image_width", "image_height"))
     return (width, height) if width and height else None
-
-
-def _columns(observations: Field) -> dict[str, list[Any]]:
-    """Turn the table into columns by name."""
-    names = [name.text() for name in observations["columns"].items()]
-    missing = [name for name in _NUMBER_COLUMNS if name not in names]
-    if missing or len(set(names)) < len(names):
-        observations["columns"].fail(
-            f"a list of different names with {', '.join(_NUMBER_COLUMNS)} among them"
-        )
-    rows = observations["rows"]
-    if not isinstance(rows.value, list):
-        rows.fail("a list of rows")
-    for k, row in enumerate(rows.value):
-        if type(row) is not list or len(row) != len(names):
-            Field(row, rows.source, f"{rows.path}[{k}]").fail(f"a list of {len(names)} values")
-    return dict(zip(names, map(list, zip(*rows.value, strict=True)), strict=True)) if rows.value else {}
-
-
-def _numbers(observations: Field, columns: dict[str, list[Any]], names: tuple[str, ...]) -> Array:
-    if not columns:
-        observations["rows"].fail("at least one row")
-    blocks = [
-        Field(columns[name], observations.source, f"{observations.path}.rows, column {name},").array(-1)
-        for name in names
-    ]
-    return np.column_stack(blocks)
-
-
-def _labels(observations: Field, columns: dict[str, list[Any]], name: str) -> list[str]:
-    labels = columns[name]
-    if set(map(type, labels)) <= {str}:
-        return labels
-    return [
-        Field(label, observations.source, f"{observations.path}.rows[{k}], {name},").text()
-        for k, label in enumerate(labels)
-    ]

@@ -3,12 +3,14 @@
 The file is a ROS camera_info file with a block ``neurocal``; numbers read back to the last bit. Mappings
 are written as blocks with flow collections inside, one entry a line however long it gets, so the lines can
 be indented to become a part of another file, such as a rig's.
+
+A long file, of more views or points than PyYAML reads within seconds, has its tables as texts of numbers; see
+`text_columns`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from operator import add
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,35 +18,56 @@ import numpy as np
 from neurocal_cli import __version__
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines
 from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
-from neurocal_cli.geometry import Array, rotation_to_euler
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_info import camera_info_lines
 from neurocal_cli.io.named_entries import named_lines
+from neurocal_cli.io.observations_yaml import observation_lines
 from neurocal_cli.io.rejected_yaml import rejected_lines
 from neurocal_cli.io.target_yaml import target_lines
+from neurocal_cli.io.text_columns import column_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
+from neurocal_cli.io.views_yaml import alike, view_lines
 from neurocal_cli.io.yaml_text import flow, flows, mapping, number, quoted, text
-from neurocal_cli.points import Correspondences
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["FORMAT", "calibration_lines", "format_calibration", "read_calibration", "write_calibration"]
+__all__ = [
+    "FORMATS",
+    "HEADER",
+    "calibration_lines",
+    "format_calibration",
+    "read_calibration",
+    "write_calibration",
+]
 
-FORMAT = 1  # of the neurocal block; a change that older readers cannot follow makes it 2
+FORMATS = (1, 2)  # of the neurocal block: tables by rows, and of long files by columns
+
+# Without these two lines OpenCV 4 opens no YAML; 1.1 is the version that PyYAML and ROS read.
+HEADER = ("%YAML 1.1", "---")
+
+_MOST_VIEWS = 100
+_MOST_POINTS = 5000
 
 
-def format_calibration(cal: Calibration) -> str:
+def format_calibration(cal: Calibration, by_rows: bool = False) -> str:
     """Text of a calibration file.
 
     The same calibration gives the same text; it holds no dates and no paths.
+
+    Parameters
+    ----------
+    cal : Calibration
+    by_rows : bool
+        Whether even long tables have a row for each view and point.
 
     Raises
     ------
     InputError
         A name that UTF-8 cannot hold.
     """
-    return "\n".join([*calibration_lines(cal), ""])
+    return "\n".join([*HEADER, *calibration_lines(cal, by_rows=by_rows), ""])
 
 
 def write_calibration(cal: Calibration, path: str | Path) -> None:
@@ -72,36 +95,45 @@ def read_calibration(path: str | Path) -> Calibration:
     return calibration_from_field(read_tree(path))
 
 
-def calibration_lines(cal: Calibration, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:
-    """Lines of the file, without line ends.
+def calibration_lines(
+    cal: Calibration, rectified: tuple[Array, Array] | None = None, by_rows: bool = False
+) -> Iterator[str]:
+    """Lines of the file without its header and without line ends.
 
     Parameters
     ----------
     cal : Calibration
     rectified : (3, 3) and (3, 4) arrays, optional
         Rectification and projection matrix of a camera on a rig, in ROS's meaning.
+    by_rows : bool
+        See `format_calibration`.
     """
+    long = not by_rows and _is_long(cal)
     yield from camera_info_lines(
         cal.camera_name, cal.image_size, cal.K, cal.distortion_model, cal.distortion, rectified
     )
     yield "neurocal:"
     for lines in (
-        _record_lines(cal),
+        _record_lines(cal, long),
         _parameter_lines(cal),
-        _view_lines(cal),
-        _network_lines(cal.network),
+        view_lines(cal.views, cal.K, long),
+        _network_lines(cal.network, long),
         verdict_lines(cal.verdict),
-        rejected_lines(cal.rejected),
-        target_lines(cal.target),
+        rejected_lines(cal.rejected, long),
+        target_lines(cal.target, long),
     ):
         yield from (f"  {line}" for line in lines)
     if cal.straight_lines is not None:
         yield f"  straight_lines: {_straight_lines(cal.straight_lines)}"
-    yield from _observation_lines(cal.points)
+    yield from (f"  {line}" for line in observation_lines(cal.points, long))
 
 
-def _record_lines(cal: Calibration) -> Iterator[str]:
-    yield f"format: {FORMAT}"
+def _is_long(cal: Calibration) -> bool:
+    return (len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS) and alike(cal.views)
+
+
+def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
+    yield f"format: {FORMATS[long]}"
     yield f"version: {text(__version__)}"
     yield f"type: {cal.type}"
     yield f"method: {text(cal.method)}"
@@ -143,54 +175,15 @@ def _parameter_lines(cal: Calibration) -> Iterator[str]:
         yield f"  - {quoted(warning)}"
 
 
-def _view_lines(cal: Calibration) -> Iterator[str]:
-    views = list(cal.views.values())
-    if not views:
-        yield "views: []"
-        return
-    R, t = np.stack([view.pose.R for view in views]), np.stack([view.pose.t for view in views])
-    P = cal.K @ np.concatenate([R, t[:, :, None]], axis=2)
-    pose = _estimates(np.hstack([rotation_to_euler(R), t]), [view.std for view in views])
-    error = flows(np.array([view.rmse_px for view in views], dtype=float))
-    yield "views:"
-    for name, view, entries, matrix, rmse, rotation in zip(
-        cal.views, views, pose, flows(P), error, flows(R), strict=True
-    ):
-        yield f"  - name: {text(name)}"
-        yield f"    rotation: {{{', '.join(entries[:3])}}}"
-        yield f"    translation: {{{', '.join(entries[3:])}}}"
-        yield f"    projection_matrix: {matrix}"
-        yield f"    rmse_px: {rmse}"
-        yield f"    n_points: {view.n_points}"
-        yield f"    R: {rotation}"  # the angles give it back but for the last bit
-        if view.fixed:
-            yield "    fixed: true"
-
-
-def _estimates(values: Array, stds: Sequence[Mapping[str, float]]) -> Iterator[list[str]]:
-    """Entries ``R_x: {value: ..., std: ...}`` of each view's pose; values (V, 6)."""
-    width = len(POSE_NAMES)
-    value = flows(values.ravel())
-    std = flows(np.array([[std.get(name, np.nan) for name in POSE_NAMES] for std in stds]).ravel())
-    for k, known in enumerate(stds):
-        row = zip(
-            POSE_NAMES, value[k * width : (k + 1) * width], std[k * width : (k + 1) * width], strict=True
-        )
-        yield [
-            f"{name}: {{value: {v}, std: {s}}}" if name in known else f"{name}: {{value: {v}}}"
-            for name, v, s in row
-        ]
-
-
-def _network_lines(network: NetworkRecord | None) -> Iterator[str]:
+def _network_lines(network: NetworkRecord | None, long: bool) -> Iterator[str]:
     if network is None:
         yield "network: null"
         return
     yield "network:"
-    yield from _matrix_lines("V", network.V)
+    yield from _matrix_lines("V", network.V, long)
     yield f"  W: {flow(network.W)}"
     yield f"  S1: {flow(network.S1)}"
-    yield from _matrix_lines("S2", network.S2)
+    yield from _matrix_lines("S2", network.S2, long)
     for name in ("starts", "agreed", "iterations", "refine_iterations"):
         yield f"  {name}: {int(getattr(network, name))}"
     for name in ("loss", "rmse_before", "rmse_after"):
@@ -208,32 +201,11 @@ def _straight_lines(found: StraightLines) -> str:
     )
 
 
-def _matrix_lines(name: str, matrices: Mapping[str, Array]) -> Iterator[str]:
-    texts = flows(np.array(list(matrices.values())))
-    yield from (f"  {line}" for line in named_lines(name, matrices, texts))
-
-
-def _observation_lines(points: Correspondences) -> Iterator[str]:
-    columns = ["view", "X", "Y", "Z", "u", "v"]
-    blocks = [points.world, points.pixels]
-    # The rows are further in than their key: OpenCV's FileStorage wants that.
-    heads = [f"      - [{quoted(name)}, " for name in points.view_names]
-    heads = [heads[k] for k in points.view_index.tolist()]
-    if points.point is not None:
-        columns.insert(1, "point")
-        labels = np.asarray(points.point).tolist()
-        ids = {label: f"{quoted(str(label))}, " for label in set(labels)}
-        heads = [head + ids[label] for head, label in zip(heads, labels, strict=True)]
-    if points.covariance is not None:
-        columns += ["suu", "suv", "svv"]
-        blocks.append(points.covariance)
-    if points.across is not None:
-        columns += ["nu", "nv"]
-        blocks.append(points.across)
-    yield "  observations:"
-    yield f"    columns: [{', '.join(columns)}]"
-    yield "    rows:" if heads else "    rows: []"
-    if not heads:
-        return
-    numbers = flow(np.hstack(blocks))[2:-1].split(", [")
-    yield "\n".join(map(add, heads, numbers))
+def _matrix_lines(name: str, matrices: Mapping[str, Array], long: bool) -> Iterator[str]:
+    stack = np.array(list(matrices.values()))
+    if long:
+        yield f"  {name}:"
+        columns: dict[str, Array | list[str]] = {"views": list(matrices), "data": stack.ravel()}
+        yield from (f"    {line}" for line in column_lines(columns))
+    else:
+        yield from (f"  {line}" for line in named_lines(name, matrices, flows(stack)))

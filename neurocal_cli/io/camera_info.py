@@ -6,11 +6,17 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from neurocal_cli.distortion.panorama import Panorama
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.distortion_names import to_ros
-from neurocal_cli.io.yaml_text import flow, mapping, text
+from neurocal_cli.io.yaml_text import flow, mapping, number, text
 
-__all__ = ["camera_info_lines", "format_camera_info"]
+__all__ = ["camera_info_lines", "format_camera_info", "format_panorama"]
+
+_FORMULAS = {
+    "cylinder": "u = f atan2(X, Z) + u0, v = f Y / hypot(X, Z) + v0",
+    "equirectangular": "u = f atan2(X, Z) + u0, v = f atan2(Y, hypot(X, Z)) + v0",
+}
 
 
 def camera_info_lines(
@@ -51,6 +57,22 @@ def camera_info_lines(
 def format_camera_info(name: str, size: tuple[int, int] | None, A: Array) -> str:
     """Text of the file of a camera without a lens; `read_intrinsics` reads it."""
     return "\n".join([*camera_info_lines(name, size, A, "none", np.zeros(0)), ""])
+
+
+def format_panorama(panorama: Panorama) -> str:
+    """Text of the file of a picture on a cylinder or a sphere, without a camera matrix, which it has not."""
+    width, height = panorama.image_size
+    lines = [
+        f"# A point (X, Y, Z) is seen at {_FORMULAS[panorama.shape]}.",
+        f"camera_name: {text(panorama.name)}",
+        f"image_width: {width}",
+        f"image_height: {height}",
+        f"projection: {panorama.shape}",
+        f"f: {number(panorama.f)}  # px per radian",
+        f"u0: {number(panorama.u0)}",
+        f"v0: {number(panorama.v0)}",
+    ]
+    return "\n".join([*lines, ""])
 
 
 def _matrix(matrix: Array) -> str:

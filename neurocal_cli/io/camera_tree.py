@@ -50,6 +50,7 @@ _DISTORTION_KEYS = (
 _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
 _SIZE_KEYS = ("imageSize", "image_size", "img_size", "resolution")
+_BOOFCV = ("pinhole", "pinhole_radial_tangential", "omnidirectional_universal")
 # Speak of distortion and are not its coefficients.
 _OTHERS = ("distortion_model", "dist_model", "distortion_type")
 
@@ -71,6 +72,8 @@ def camera_from_tree(root: Field, side: str = "", whole: bool = True) -> Camera:
     InputError, FormatError
         No camera matrix, or one that is none; a distortion that cannot be read.
     """
+    if "projection" in root and "f" in root:
+        raise InputError("is the file of an undistorted panorama; give the camera of the original images")
     intrinsics = _intrinsics(root, side)
     model, coefficients = _distortion(root, side, whole)
     name = next((root[key].text() for key in _ended(("camera_name",), side) if key in root), "camera")
@@ -92,10 +95,11 @@ def boofcv_camera(root: Field) -> Camera:
     """
     pinhole = root["pinhole"]
     model = root["model"].text() if "model" in root else ""
-    if "mirror_offset" in root or model not in ("", "pinhole", "pinhole_radial_tangential"):
+    omni = model == "omnidirectional_universal"
+    if ("mirror_offset" in root) != omni or model not in (*_BOOFCV, ""):
         raise InputError(
             f"BoofCV's model {model[:40] or 'with a mirror_offset'!r} is not known; calibrate with "
-            "pinhole_radial_tangential, or from the points"
+            f"{' or '.join(_BOOFCV[1:])}, or from the points"
         )
     fx, fy, cx, cy, skew = (pinhole[name].number() for name in ("fx", "fy", "cx", "cy", "skew"))
     lens = root.get("radial_tangential")
@@ -107,7 +111,12 @@ def boofcv_camera(root: Field) -> Camera:
         k1, k2, k3 = [*radial, 0.0, 0.0, 0.0][:3]
         coefficients[:] = k1, k2, lens["t1"].number(), lens["t2"].number(), k3
     K = np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-    distortion = Distortion(*from_ros("plumb_bob", coefficients))
+    if omni:
+        if coefficients[4]:
+            raise InputError("a third radial coefficient of an omnidirectional camera is not known; use two")
+        distortion = Distortion("omnidir", np.array([root["mirror_offset"].number(), *coefficients[:4]]))
+    else:
+        distortion = Distortion(*from_ros("plumb_bob", coefficients))
     return Camera(Intrinsics.from_matrix(K), distortion, image_size(pinhole, ""))
 
 
@@ -178,15 +187,31 @@ def _distortion(root: Field, side: str, whole: bool) -> tuple[str, Array]:
     if field is None:
         if whole:
             _refuse_unread(root)
+        if _first(root, _ended(("xi",), side)) is not None:
+            raise InputError("has xi of an omnidirectional camera without its distortion; add D, or zeros")
         return "none", np.zeros(0)
     coefficients = matrix_data(field, -1)
     stated = _first(root, (*_ended(("distortion_model",), side), "distortion_model"))
+    xi = _first(root, _ended(("xi",), side))
+    if xi is not None:
+        return _omnidirectional(xi, coefficients, "omnidir" if stated is None else stated.text())
     if stated is not None:
         model = stated.text() or "plumb_bob"
     else:
         fisheye = "fisheye_model" in root and root["fisheye_model"].value in (1, True)
         model = "equidistant" if fisheye else "plumb_bob"
     return from_ros(model, coefficients)
+
+
+def _omnidirectional(xi: Field, coefficients: Array, model: str) -> tuple[str, Array]:
+    """OpenCV's omnidirectional camera, whose xi stands beside its coefficients."""
+    value = xi.number() if isinstance(xi.value, (int, float)) else float(matrix_data(xi, 1)[0])
+    if model != "omnidir" or len(coefficients) != 4:
+        raise InputError(
+            f"has xi of an omnidirectional camera, and {len(coefficients)} coefficients of the distortion "
+            f"model {model[:40]!r}; give k1, k2, p1, p2, and omnidir or no model"
+        )
+    return "omnidir", np.array([value, *coefficients])
 
 
 def _refuse_unread(root: Field) -> None:

@@ -45,7 +45,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
     if str(path) == "-":
         return _read_stdin(), "<stdin>"
     source = one_line(path)
-    with _reading_failures(source), open(path, "rb") as file:
+    with reading_failures(source), open(path, "rb") as file:
         _protect(file)
         return file.read(), source
 
@@ -59,13 +59,13 @@ def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
         with _stdin_failures():
             yield from _whole_lines(sys.stdin.buffer, size)
         return
-    with _reading_failures(one_line(path)):
+    with reading_failures(one_line(path)):
         file = open(path, "rb")  # noqa: SIM115 - the caller's own errors are not the file's
     _protect(file)
     with file:
         blocks = _whole_lines(file, size)
         while True:
-            with _reading_failures(one_line(path)):
+            with reading_failures(one_line(path)):
                 block = next(blocks, None)
             if block is None:
                 return
@@ -92,7 +92,7 @@ def _whole_lines(file: IO[bytes], size: int) -> Iterator[bytes]:
 
 
 @contextmanager
-def _reading_failures(source: str) -> Iterator[None]:
+def reading_failures(source: str) -> Iterator[None]:
     """Turn what can go wrong with a file into a line."""
     try:
         yield

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 from neurocal_cli.errors import FormatError
 
-__all__ = ["Header", "read_header"]
+__all__ = ["Header", "is_video_header", "read_header"]
 
 _EXIF_MARK = b"Exif\0\0"
 _ORIENTATION, _WIDTH, _HEIGHT = 274, 256, 257
@@ -83,7 +83,7 @@ def read_header(data: bytes, source: str) -> Header:
         raise FormatError("is empty; give an image", source)
     reader = next((read for mark, read in _READERS if re.match(mark, data, re.DOTALL)), None)
     if reader is None:
-        other = next((what for mark, what in _OTHERS if re.match(mark, data, re.DOTALL)), None)
+        other = _other(data)
         if other == _VIDEO:
             raise FormatError(
                 "is a video, but images are wanted; extract some, as with "
@@ -102,6 +102,16 @@ def read_header(data: bytes, source: str) -> Header:
     if header.width <= 0 or header.height <= 0:
         raise FormatError(f"has {header.width} x {header.height} px; give an image with pixels", source)
     return header
+
+
+def is_video_header(head: bytes) -> bool:
+    """Whether a file that begins with these bytes is a video."""
+    return _other(head) == _VIDEO
+
+
+def _other(data: bytes) -> str | None:
+    """What a file is that is no image of a known kind."""
+    return next((what for mark, what in _OTHERS if re.match(mark, data, re.DOTALL)), None)
 
 
 def _png(data: bytes) -> Header:

@@ -22,11 +22,13 @@ __all__ = [
     "MOST_PIXELS",
     "Image",
     "Picture",
+    "captured_stderr",
     "encode_image",
     "encode_png",
     "parse_image",
     "read_image",
     "read_picture",
+    "shrink",
 ]
 
 MOST_PIXELS = 200_000_000  # larger than any camera's; a file that states more is refused
@@ -42,7 +44,7 @@ _TURNS = {
 }
 _SIXTEEN_BITS = (".png", ".tif", ".tiff", ".pgm", ".ppm", ".pnm")
 _JPEG = (".jpg", ".jpeg", ".jpe")
-_QUALITY = [cv2.IMWRITE_JPEG_QUALITY, 95]
+_QUALITY = 95
 _STDERR = 2
 _ONE_AT_A_TIME = threading.Lock()  # the program's stderr is one
 
@@ -178,7 +180,18 @@ def encode_png(picture: NDArray[np.uint8]) -> bytes:
     return data.tobytes()
 
 
-def encode_image(pixels: NDArray[np.uint8] | NDArray[np.uint16], ending: str) -> bytes:
+def shrink(grey: NDArray[np.uint8] | NDArray[np.uint16], width: int) -> NDArray[np.uint8]:
+    """An image of 8 bits that is no wider than so many pixels."""
+    eight = (grey // 257 if grey.dtype == np.uint16 else grey).astype(np.uint8, copy=False)
+    if eight.shape[1] <= width:
+        return eight
+    height = max(1, round(eight.shape[0] * width / eight.shape[1]))
+    return np.asarray(cv2.resize(eight, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def encode_image(
+    pixels: NDArray[np.uint8] | NDArray[np.uint16], ending: str, quality: int = _QUALITY
+) -> bytes:
     """Picture as the bytes of an image file.
 
     Parameters
@@ -186,7 +199,9 @@ def encode_image(pixels: NDArray[np.uint8] | NDArray[np.uint16], ending: str) ->
     pixels : (height, width) or (height, width, 3) uint8 or uint16 array
         Colours in the order red, green, blue.
     ending : str
-        Of the file's name: .png, .tif and so on; JPEG is written with a quality of 95.
+        Of the file's name: .png, .tif and so on.
+    quality : int
+        Of a JPEG file, up to 100.
 
     Raises
     ------
@@ -200,7 +215,7 @@ def encode_image(pixels: NDArray[np.uint8] | NDArray[np.uint16], ending: str) ->
     if pixels.ndim == 3 and ending.lower() == ".pgm":
         raise InputError("a colour image cannot be written to a .pgm file; use .ppm or .png")
     ordered = pixels[..., ::-1] if pixels.ndim == 3 else pixels
-    settings = _QUALITY if ending.lower() in _JPEG else []
+    settings = [cv2.IMWRITE_JPEG_QUALITY, quality] if ending.lower() in _JPEG else []
     try:
         done, data = cv2.imencode(ending.lower(), np.ascontiguousarray(ordered), settings)
     except cv2.error as error:
@@ -212,7 +227,7 @@ def encode_image(pixels: NDArray[np.uint8] | NDArray[np.uint16], ending: str) ->
 
 def _decoded(data: bytes, header: Header, source: str, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
     """Pixels of a file that looks whole; the decoder's complaints stay off the user's screen."""
-    with _captured_stderr() as complaints:
+    with captured_stderr() as complaints:
         try:
             pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
         except cv2.error:
@@ -240,7 +255,7 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> NDArray[np
 
 
 @contextmanager
-def _captured_stderr() -> Iterator[list[str]]:
+def captured_stderr() -> Iterator[list[str]]:
     """Catch what the C libraries below OpenCV write to stderr, past Python; yields its lines."""
     lines: list[str] = []
     with _ONE_AT_A_TIME, tempfile.TemporaryFile() as file:

@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.named_entries import named_lines, read_named
+from neurocal_cli.io.text_columns import read_table, table_lines
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import number, quoted
+from neurocal_cli.io.yaml_text import quoted
 from neurocal_cli.points import Correspondences
 
 __all__ = ["read_rejected", "rejected_lines"]
@@ -19,7 +21,7 @@ __all__ = ["read_rejected", "rejected_lines"]
 _NUMBERS = ("X", "Y", "Z", "u", "v", "error_px")
 
 
-def rejected_lines(rejected: Rejected) -> Iterator[str]:
+def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
     """Lines of the block ``rejected``; none where nothing was."""
     if not len(rejected) and not rejected.views:
         return
@@ -32,20 +34,15 @@ def rejected_lines(rejected: Rejected) -> Iterator[str]:
         yield "  columns: []"
         yield "  rows: []"
         return
-    columns = ["view", *_NUMBERS]
-    if points.point is not None:
-        columns.insert(1, "point")
+    columns: dict[str, NDArray[Any] | list[str]] = {}
     if points.lines is not None:
-        columns.insert(0, "line")
-    yield f"  columns: [{', '.join(columns)}]"
-    yield "  rows:"
-    for row in range(len(points)):
-        cells = [] if points.lines is None else [str(int(points.lines[row]))]
-        cells.append(quoted(points.view_names[points.view_index[row]]))
-        if points.point is not None:
-            cells.append(quoted(str(points.point[row])))
-        values = [*points.world[row].tolist(), *points.pixels[row].tolist(), float(rejected.error_px[row])]
-        yield f"      - [{', '.join([*cells, *map(number, values)])}]"
+        columns["line"] = points.lines
+    columns["view"] = [points.view_names[k] for k in points.view_index.tolist()]
+    if points.point is not None:
+        columns["point"] = [str(label) for label in points.point]
+    numbers = np.column_stack([points.world, points.pixels, rejected.error_px])
+    columns |= {name: numbers[:, k] for k, name in enumerate(_NUMBERS)}
+    yield from (f"  {line}" for line in table_lines(columns, long))
 
 
 def read_rejected(field: Field | None, unit: str) -> Rejected:
@@ -59,21 +56,19 @@ def read_rejected(field: Field | None, unit: str) -> Rejected:
     if field is None:
         return Rejected()
     views = {name: entry.text() for name, entry in read_named(field["views"]).items()}
-    names = [name.text() for name in field["columns"].items()]
-    if not names:
+    columns = read_table(field, frozenset(("view", "point")))
+    if not columns:
         return Rejected(views=views)
-    rows = [list(row.items()) for row in field["rows"].items()]
-    if set(names) - {"line", "point"} != {"view", *_NUMBERS} or any(len(row) != len(names) for row in rows):
+    if set(columns) - {"line", "point"} != {"view", *_NUMBERS}:
         field.fail(f"a table with view, {', '.join(_NUMBERS)}")
-    columns: dict[str, Any] = dict(zip(names, zip(*rows, strict=True), strict=True))
-    numbers = np.array([[cell.number_or_nan() for cell in columns[name]] for name in _NUMBERS])
+    numbers = np.array([columns[name].array(-1, unknown=True) for name in _NUMBERS])
     try:
         points = Correspondences(
             numbers[:3].T,
             numbers[3:5].T,
-            view=[cell.text() for cell in columns["view"]],
-            point=[cell.text() for cell in columns["point"]] if "point" in columns else None,
-            lines=np.array([cell.integer() for cell in columns["line"]]) if "line" in columns else None,
+            view=[cell.text() for cell in columns["view"].items()],
+            point=[cell.text() for cell in columns["point"].items()] if "point" in columns else None,
+            lines=np.array([n.integer() for n in columns["line"].items()]) if "line" in columns else None,
             unit=unit,
             source=field.source,
         )

@@ -61,13 +61,14 @@ def write_result(
         fitted = fitted_in(_cameras(result), OPENCV, force=False)
         write_whole(path, OPENCV.text(fitted.cameras, ending)[""])
         return (*fitted.losses, *fitted.remarks)
+    by_rows = ending == ".json"  # which loads at once however long it is
     if isinstance(result, Rig):
         from neurocal_cli.io.rig_yaml import format_rig
 
-        text = format_rig(result, alpha)
+        text = format_rig(result, alpha, by_rows)
     else:
-        text = format_calibration(result)
-    write_whole(path, _as_json(text) if ending == ".json" else text)
+        text = format_calibration(result, by_rows)
+    write_whole(path, _as_json(text) if by_rows else text)
     return ()
 
 

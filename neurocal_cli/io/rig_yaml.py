@@ -15,7 +15,7 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_tree import calibration_from_field
-from neurocal_cli.io.calibration_yaml import calibration_lines
+from neurocal_cli.io.calibration_yaml import HEADER, calibration_lines
 from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.verdict_yaml import read_verdict, verdict_lines
@@ -31,7 +31,7 @@ _METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0
 _SAME = 1e-6  # E, F and the baseline follow from R, t and the cameras; more means an edit of one
 
 
-def format_rig(rig: Rig, alpha: float | None = None) -> str:
+def format_rig(rig: Rig, alpha: float | None = None, by_rows: bool = False) -> str:
     """Text of a rig file; the same rig gives the same text.
 
     Parameters
@@ -39,8 +39,10 @@ def format_rig(rig: Rig, alpha: float | None = None) -> str:
     rig : Rig
     alpha : float, optional
         Of the rectification, see `rectify`.
+    by_rows : bool
+        Whether even long tables have a row for each view and point.
     """
-    return "\n".join([*_rig_lines(rig, rectify(rig, alpha)), ""])
+    return "\n".join([*HEADER, *_rig_lines(rig, rectify(rig, alpha), by_rows), ""])
 
 
 def write_rig(rig: Rig, path: str | Path, alpha: float | None = None) -> None:
@@ -75,15 +77,13 @@ def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
     return first, second
 
 
-def _rig_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
+def _rig_lines(rig: Rig, rectified: Rectification | None, by_rows: bool) -> Iterator[str]:
     matrices: tuple[tuple[Array, Array] | None, ...] = (None, None)
     if rectified is not None:
         matrices = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
     for name, camera, pair in zip(("left", "right"), (rig.left, rig.right), matrices, strict=True):
         yield f"{name}:"
-        for line in calibration_lines(camera, pair):
-            # A table of rows is one long text.
-            yield "\n".join(f"  {part}" for part in line.split("\n"))
+        yield from (f"  {line}" for line in calibration_lines(camera, pair, by_rows))
     yield "stereo:"
     yield f"  format: {FORMAT}"
     yield f"  unit: {text(rig.unit)}"

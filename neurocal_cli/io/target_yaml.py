@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from neurocal_cli.io.text_columns import read_table, table_lines
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flow, mapping, number, quoted
+from neurocal_cli.io.yaml_text import mapping, number
 from neurocal_cli.target import Target
 
 __all__ = ["read_target", "target_lines"]
@@ -16,7 +18,7 @@ __all__ = ["read_target", "target_lines"]
 _NUMBERS = ("X", "Y", "Z", "X_given", "Y_given", "Z_given", "sX", "sY", "sZ")
 
 
-def target_lines(target: Target | None) -> Iterator[str]:
+def target_lines(target: Target | None, long: bool) -> Iterator[str]:
     """Lines of the block ``target``; none where the target was taken as given."""
     if target is None:
         return
@@ -24,18 +26,13 @@ def target_lines(target: Target | None) -> Iterator[str]:
     yield f"  flat: {str(target.flat).lower()}"
     yield f"  evidence: {number(target.evidence)}"
     yield f"  sizes: {mapping(**{name: number(size) for name, size in target.sizes.items()})}"
-    columns = ["plane", *_NUMBERS]
-    heads = [f"    - [{plane}, " for plane in target.plane.tolist()]
+    columns: dict[str, NDArray[Any] | list[str]] = {}
     if target.point is not None:
-        columns.insert(0, "point")
-        heads = [
-            f"    - [{quoted(str(label))}, {plane}, "
-            for label, plane in zip(target.point.tolist(), target.plane.tolist(), strict=True)
-        ]
-    yield f"  columns: [{', '.join(columns)}]"
-    yield "  rows:"
-    rows = flow(np.hstack([target.found, target.given, target.std]))[2:-1].split(", [")
-    yield from (head + row for head, row in zip(heads, rows, strict=True))
+        columns["point"] = [str(label) for label in target.point]
+    columns["plane"] = target.plane
+    numbers = np.hstack([target.found, target.given, target.std])
+    columns |= {name: numbers[:, k] for k, name in enumerate(_NUMBERS)}
+    yield from (f"  {line}" for line in table_lines(columns, long, indent=2))
 
 
 def read_target(field: Field | None) -> Target | None:
@@ -48,21 +45,18 @@ def read_target(field: Field | None) -> Target | None:
     """
     if field is None:
         return None
-    names = [name.text() for name in field["columns"].items()]
-    rows = [list(row.items()) for row in field["rows"].items()]
-    wanted = {"plane", *_NUMBERS}
-    if not rows or set(names) - {"point"} != wanted or any(len(row) != len(names) for row in rows):
+    columns = read_table(field, frozenset(("point",)))
+    if set(columns) - {"point"} != {"plane", *_NUMBERS}:
         field.fail(f"a table with plane, {', '.join(_NUMBERS)}")
-    columns: dict[str, Any] = dict(zip(names, zip(*rows, strict=True), strict=True))
-    numbers = np.array([[cell.number() for cell in columns[name]] for name in _NUMBERS]).T
+    numbers = np.array([columns[name].array(-1) for name in _NUMBERS]).T
     sizes = {name: field["sizes"][name].number() for name in field["sizes"].keys()}  # noqa: SIM118
     return Target(
         found=numbers[:, :3],
         given=numbers[:, 3:6],
         std=numbers[:, 6:],
-        plane=np.array([cell.integer() for cell in columns["plane"]], dtype=np.intp),
+        plane=np.array([cell.integer() for cell in columns["plane"].items()], dtype=np.intp),
         sizes=sizes,
         flat=field["flat"].boolean(),
         evidence=field["evidence"].number(),
-        point=np.array([cell.text() for cell in columns["point"]]) if "point" in columns else None,
+        point=np.array([cell.text() for cell in columns["point"].items()]) if "point" in columns else None,
     )

@@ -10,7 +10,7 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
@@ -20,7 +20,7 @@ from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
 from neurocal_cli.distortion.rich_fit import with_displacement
-from neurocal_cli.distortion.similar_lens import farthest_angle, similar_states
+from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
 from neurocal_cli.initialisation.neuro import solve

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
+from neurocal_cli.bundle_adjustment.covariance import Covariance
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
 from neurocal_cli.bundle_adjustment.outlier_views import seen_from_behind
 from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
@@ -17,11 +17,10 @@ from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeate
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import translations
-from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
-from neurocal_cli.target_shape.uncertainty import covariance_basis
+from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covariance
 
 __all__ = ["calibration_of"]
 
@@ -42,14 +41,15 @@ def calibration_of(
     views, state = problem.views, adjusted.state
     errors = point_residuals(views, state)  # (N, 2), by view
     repeated = repeated_poses(views, state, errors)
-    asked = problem.free_camera, problem.free_poses
-    basis = covariance_basis(
-        solution.target, views, state, *asked, problem.points.world, adjusted.normal, solution.shared
-    )
-    cov = covariance(basis.normal, *asked, basis.n_equations + solution.by_prior, basis.shared)
-    refuse_undetermined(problem, state, cov)
-    if solution.shared is None:
-        cov = counting_views(cov, basis.normal, *asked, basis.n_equations, repeated, basis.moves_without)
+    known = camera_covariance(
+        CameraSeen(
+            views, state, adjusted.normal, problem.free_camera, problem.free_poses, repeated,
+            problem.points.world, solution.target, tuple(solution.model_errors or ()), solution.shared,
+            solution.by_prior,
+        )
+    )  # fmt: skip
+    refuse_undetermined(problem, state, known.plain)
+    cov = known.found
     A = problem.matrix(state.entries[0])
     intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     if problem.type != 3 and not problem.free[1]:

@@ -58,7 +58,7 @@ def with_target(
     if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected
     found = _found(solution, choice, None)
-    if found is None or (choice == "auto" and _other_reason(solution)):
+    if found is None or (choice == "auto" and _other_reason(solution, found)):
         return solution, rejected
     best: tuple[Solution, Rejected] = solution, rejected
     for _ in range(_ROUNDS):
@@ -78,8 +78,11 @@ def with_target(
     return best
 
 
-def _other_reason(solution: Solution) -> bool:
-    """Whether stated sigmas, given parameters, two cameras or a zoom that moves are why, not the target."""
+def _other_reason(solution: Solution, found: Found) -> bool:
+    """Whether stated sigmas, given parameters, two cameras or a zoom that moves are why, not the target.
+
+    Two cameras still contradict each other where the target was found; a bent board looks like two before.
+    """
     problem, points = solution.problem, solution.problem.points
     place = np.array([problem.views.names.index(name) for name in points.view_names])
     predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
@@ -90,10 +93,9 @@ def _other_reason(solution: Solution) -> bool:
     asked = asked_for(problem.views, solution.state, problem.fixed, problem.free_poses)
     if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
         return True
-    free = problem.free_camera
-    return bool(problem.free.any()) and (
-        view_groups(problem.views, solution.state, solution.adjusted.normal, free) is not None
-    )
+    new, adjusted = found.fits[0]
+    groups = view_groups(new.views, adjusted.state, adjusted.normal, new.free_camera)
+    return bool(problem.free.any()) and groups is not None
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:

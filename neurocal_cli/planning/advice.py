@@ -141,7 +141,9 @@ def _state(calibration: Calibration) -> tuple[Array, Array, NDArray[np.bool_], f
     for k, name in enumerate(points.view_names):
         pose, own = calibration.views[name].pose, points.world[points.view_index == k]
         known += view_information(camera, free, pose, own)
-        depths.append(float(np.median(pose.to_camera(own)[:, 2])))
+        seen = pose.to_camera(own)
+        depth = np.linalg.norm(seen, axis=1) if camera.distortion.wide else seen[:, 2]
+        depths.append(float(np.median(depth)))
     places = pixel_changes(camera, free, image_grid(camera.image_size), _FROM_TO * np.median(depths))
     rms = calibration.rmse_px if np.isfinite(calibration.rmse_px) else 0.0
     return known, places, free, max(rms / np.sqrt(2.0), _LEAST_SIGMA)

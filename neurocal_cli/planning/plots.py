@@ -8,7 +8,7 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.planning.advice import Advice
-from neurocal_cli.plots import picture, style
+from neurocal_cli.plots.figure import picture, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.plots import picture, style
+from neurocal_cli.plots.figure import picture, style
 from neurocal_cli.simulation.noise import NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
 from neurocal_cli.simulation.report import FIG_1

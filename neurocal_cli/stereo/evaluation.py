@@ -47,6 +47,8 @@ class StereoEvaluation:
         Views of the left and of the right camera without a pair, which are not used.
     fitted : tuple of str
         Views of the left camera whose poses were estimated from the same points.
+    models : (left, right) str
+        Distortion models of the cameras.
     warnings : tuple of str
     judgement : Verdict or callable, optional
         The verdict, or what reaches it; see `verdict`.
@@ -59,6 +61,7 @@ class StereoEvaluation:
     pairs: tuple[tuple[str, str], ...]
     alone: tuple[tuple[str, ...], tuple[str, ...]]
     fitted: tuple[str, ...]
+    models: tuple[str, str]
     warnings: tuple[str, ...] = ()
     judgement: Verdict | Callable[[], Verdict | None] | None = None
 
@@ -168,6 +171,7 @@ class _Evaluator:
             self.views.both,
             (self.views.left_only, self.views.right_only),
             tuple(a for a, _ in self.new),
+            (self.cameras[0].distortion_model, self.cameras[1].distortion_model),
             tuple(self.warnings),
             self.judgement,
         )

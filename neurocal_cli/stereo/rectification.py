@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
+from neurocal_cli.distortion.undistorted_view import plane_like
 from neurocal_cli.errors import UsageError
 from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
 from neurocal_cli.stereo.rig import Rig
@@ -19,6 +20,7 @@ from neurocal_cli.stereo.rig import Rig
 __all__ = ["Rectification", "rectify"]
 
 _GRID = 9  # samples along each side of the image, as in OpenCV
+_WIDEST = 5.0  # tangent of 79 degrees: the widest angle that scales an image
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +75,7 @@ def rectify(rig: Rig, alpha: float | None = None) -> Rectification | None:
     rotations = turn @ half, turn @ half.T
     cameras = rig.left, rig.right
     along = float((rotations[1] @ rig.t)[axis])
-    f = 0.5 * float(sum(camera.K[1 - axis, 1 - axis] for camera in cameras))
+    f = 0.5 * float(sum(plane_like(camera.camera).A[1 - axis, 1 - axis] for camera in cameras))
     centres = [_centre(camera, R, f, size) for camera, R in zip(cameras, rotations, strict=True)]
     centre = 0.5 * (centres[0] + centres[1])  # one for both: disparity 0 at infinity
     if alpha is not None:
@@ -94,16 +96,21 @@ def _shortest_turn(a: Array, b: Array) -> Array:
 
 
 def _rectified(camera: Calibration, R: Array, pixels: Array) -> Array:
-    """Normalised rectified points of pixels, (N, 2); nan where the distortion does not reach a pixel."""
-    x, y = camera.camera.normalised_points(*pixels.T)
-    rays = np.column_stack([x, y, np.ones_like(x)]) @ R.T
+    """Normalised rectified points of pixels, (N, 2); nan where the distortion does not reach a pixel.
+
+    And where its ray is behind the rectified image plane.
+    """
+    rays = camera.camera.unproject(pixels) @ R.T
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(rays[:, 2:] > 0, rays[:, :2] / rays[:, 2:], np.nan)
 
 
 def _centre(camera: Calibration, R: Array, f: float, size: tuple[int, int]) -> Array:
-    """Principal point that centres the image's corners in the rectified image."""
+    """Principal point that centres the corners of the image in the rectified one, its middle if wide."""
     last = np.array(size, dtype=float) - 1
+    if camera.camera.distortion.wide:  # the corners are far out, or behind
+        middle = _rectified(camera, R, last[None] / 2)[0]
+        return np.asarray(0.5 * last - f * (middle if np.isfinite(middle).all() else 0.0))
     corners = _rectified(camera, R, np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * last)
     if not np.isfinite(corners).all():  # beyond the distortion: the middles of the sides
         corners = _rectified(camera, R, np.array([[0.5, 0], [0.5, 1], [0, 0.5], [1, 0.5]]) * last)
@@ -121,13 +128,20 @@ def _scale(
     fill, hold = [], []
     for camera, R in cameras:
         u, v = np.meshgrid(grid, grid)
-        image = f * _rectified(camera, R, np.column_stack([u.ravel(), v.ravel()]) * last).reshape(
-            _GRID, _GRID, 2
-        )
+        image = _rectified(camera, R, np.column_stack([u.ravel(), v.ravel()]) * last).reshape(_GRID, _GRID, 2)
+        image = f * image.clip(-_WIDEST, _WIDEST)
+        # What is behind sets no limit.
+        most = f * _WIDEST
         inner = np.array(
             [
-                [np.nanmax(image[:, 0, 0]), np.nanmax(image[0, :, 1])],
-                [np.nanmin(image[:, -1, 0]), np.nanmin(image[-1, :, 1])],
+                [
+                    np.fmax.reduce(image[:, 0, 0], initial=-most),
+                    np.fmax.reduce(image[0, :, 1], initial=-most),
+                ],
+                [
+                    np.fmin.reduce(image[:, -1, 0], initial=most),
+                    np.fmin.reduce(image[-1, :, 1], initial=most),
+                ],
             ]
         )
         outer = np.array([np.nanmin(image, axis=(0, 1)), np.nanmax(image, axis=(0, 1))])

@@ -9,7 +9,7 @@ import numpy as np
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.distortion.undistortion import map_points
+from neurocal_cli.distortion.undistortion import map_points, shown
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -92,6 +92,8 @@ def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
 def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> Correspondences:
     """Points of one camera, 0 left or 1 right, where its rectified camera sees them.
 
+    Those of a wide lens that are behind the rectified image plane are left out.
+
     Raises
     ------
     InputError
@@ -103,7 +105,8 @@ def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> C
             f"{points.source}: the image_size is {points.image_size}, but the camera's is {size}; give the "
             "points of this camera"
         )
-    moved = map_points(points, pair.originals[side], pair.cameras[side], pair.rotations[side])
+    views = pair.originals[side], pair.cameras[side], pair.rotations[side]
+    moved = map_points(points.select(shown(points, *views)), *views)
     return replace(moved, image_size=size)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
-from neurocal_cli.report import align, number_or_none, plural, printable, rounded
+from neurocal_cli.report import align, calibration_json, number_or_none, plural, printable, rounded
 from neurocal_cli.stereo.evaluation import StereoEvaluation
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError
@@ -16,6 +16,7 @@ from neurocal_cli.verdict.report import verdict_json, verdict_lines
 
 __all__ = [
     "camera_rows",
+    "rig_json",
     "rig_report",
     "rig_rows",
     "stereo_evaluation_json",
@@ -62,6 +63,8 @@ def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[st
         values = [getattr(way, name) for way in ways]
         overall.append([label, *(_share(v) if name == "relative" else _figure(v) for v in values)])
     overall.append(["points", *(str(way.n_points) for way in ways)])
+    for side, model in zip(("left", "right"), evaluation.models, strict=True):
+        overall.append([f"{side} distortion model", model, *([""] * (len(ways) - 1))])
     last = ways[-1]
     depths = [[f"depth [{unit}]", "points", f"rms [{unit}]", "rms / depth"]]
     for part in last.depths:
@@ -84,6 +87,7 @@ def stereo_evaluation_json(evaluation: StereoEvaluation) -> dict[str, Any]:
         "baseline": number_or_none(evaluation.baseline),
         "pairs": [list(pair) for pair in evaluation.pairs],
         "fitted_views": list(evaluation.fitted),
+        "distortion": dict(zip(("left", "right"), evaluation.models, strict=True)),
         "rig": None if evaluation.rig is None else _error_json(evaluation.rig),
         **({} if evaluation.verdict is None else {"verdict": verdict_json(evaluation.verdict)}),
     }
@@ -128,6 +132,31 @@ def rig_report(rig: Rig) -> str:
     if rig.verdict is not None:
         blocks.append(verdict_lines(rig.verdict))
     return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def rig_json(rig: Rig) -> dict[str, Any]:
+    """The summary of a rig as JSON values; None for numbers that do not exist."""
+    values = zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True)
+    return {
+        "left": calibration_json(rig.left),
+        "right": calibration_json(rig.right),
+        "unit": rig.unit,
+        "R": rig.R.tolist(),
+        "t": rig.t.tolist(),
+        "baseline": rig.baseline,
+        "parameters": {
+            name: {"value": value, "std": number_or_none(rig.std[name])} for name, value in values
+        },
+        "baseline_std": number_or_none(rig.std["baseline"]),
+        "rmse_px": number_or_none(rig.rmse_px),
+        "max_px": number_or_none(rig.max_px),
+        "pairs": [list(pair) for pair in rig.pairs],
+        "left_out": [[*pair, reason] for pair, reason in rig.left_out.items()],
+        "converged": bool(rig.converged),
+        "stop_reason": str.__str__(rig.stop_reason),
+        "warnings": list(rig.warnings),
+        **({} if rig.verdict is None else {"verdict": verdict_json(rig.verdict)}),
+    }
 
 
 def views_alone(alone: tuple[tuple[str, ...], tuple[str, ...]]) -> list[str]:

@@ -26,6 +26,7 @@ from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import SchurCovariance, schur_covariance
 from neurocal_cli.stereo.adjust import AdjustedRig
+from neurocal_cli.stereo.choice_covariance import open_covariance
 from neurocal_cli.stereo.pair_covariance import not_smaller
 from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import Columns, Observations, rig_jacobian
@@ -112,6 +113,9 @@ class _RigAssembly:
         )
         if least is not None:
             self.covariance = _widened(self.covariance, not_smaller(self.covariance.shared, least))
+        added = open_covariance(problem, calibrations, adjusted, free, variance)
+        if added is not None:
+            self.covariance = _widened(self.covariance, self.covariance.shared + added)
 
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
         state, frames = self.adjusted.state, self.problem.frames

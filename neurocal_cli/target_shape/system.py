@@ -16,6 +16,8 @@ from neurocal_cli.target_shape.prior import Prior
 
 __all__ = ["Solved", "System"]
 
+_RIDGE = 1e-10  # added to a unit diagonal where rounding has made a matrix indefinite
+
 
 class System:
     """The quadratic with its parts: what does not depend on the precisions is computed once.
@@ -193,6 +195,9 @@ class Solved:
 def _inverse(M: Array) -> tuple[Array, float]:
     scale = 1.0 / np.sqrt(np.diagonal(M))
     scaled = M * scale[:, None] * scale
-    root = np.linalg.inv(np.linalg.cholesky(scaled))
+    try:
+        root = np.linalg.inv(np.linalg.cholesky(scaled))
+    except np.linalg.LinAlgError:  # coefficients that only tell together, as xi and alpha do
+        root = np.linalg.inv(np.linalg.cholesky(scaled + _RIDGE * np.eye(len(M))))
     logdet = -2 * float(np.log(np.diagonal(root)).sum() + np.log(scale).sum())
     return (root.T @ root) * scale[:, None] * scale, logdet

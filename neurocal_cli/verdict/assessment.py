@@ -15,11 +15,12 @@ Everything follows from the calibration and its points, so a file can be judged 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.cross_validation import (
     FOLDS,
     Minimum,
@@ -29,19 +30,19 @@ from neurocal_cli.bundle_adjustment.cross_validation import (
 )
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
-from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.bundle_adjustment.view_covariance import counting_views, scores_of_poses
+from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
-from neurocal_cli.target_shape.uncertainty import covariance_basis
+from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covariance
 from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
@@ -136,19 +137,18 @@ class _AtMinimum:
         self.state, self.normal = adjusted.state, adjusted.normal
         self.cost = float(self.normal[:, -1, -1].sum())
         self.unknowns = int(self.free.sum()) + (6 * len(views) if self.free_poses else 0)
-        asked = self.free, self.free_poses
-        basis = covariance_basis(
-            calibration.target, self.views, self.state, *asked, self.points.world, self.normal
-        )
-        self.normal = basis.normal
-        self.spare = max(basis.n_equations - self.unknowns, 1)
         self.errors = point_residuals(self.views, self.state)
         self.repeated = repeated_poses(self.views, self.state, self.errors)
-        cov = covariance(self.normal, *asked, basis.n_equations, basis.shared)
-        self.condition = 1.0 / cov.smallest if cov.smallest > 0 else np.inf
-        self.covariance = counting_views(
-            cov, self.normal, *asked, basis.n_equations, self.repeated, basis.moves_without
-        ).entries
+        known = camera_covariance(
+            CameraSeen(
+                self.views, self.state, self.normal, self.free, self.free_poses, self.repeated,
+                self.points.world, calibration.target, tuple(calibration.lens_choice),
+            )
+        )  # fmt: skip
+        self.normal = known.basis.normal
+        self.spare = max(known.basis.n_equations - self.unknowns, 1)
+        self.condition = 1.0 / known.plain.smallest if known.plain.smallest > 0 else np.inf
+        self.covariance, self.wide = known.found.entries, known.wide
 
     def _arranged(self) -> Views:
         if self.points.covariance is None:
@@ -262,13 +262,29 @@ class _AtMinimum:
             return None
         view = self.points.view_index
         depth = (self.given.R[view, 2] * self.points.world).sum(axis=1) + self.given.t[view, 2]
+        angle = None
+        if self.camera.distortion.wide:  # depths behind 90 degrees are none
+            angle = farthest_angle(self.views, self.state)
+            depth = np.linalg.norm(
+                (self.given.R[view] @ self.points.world[..., None])[..., 0] + self.given.t[view], axis=1
+            )
         depths = np.array([depth.min(), median(depth), depth.max(), _DISTANT * depth.max()])
-        free, shared = self.free, self.covariance
-        if self.camera.distortion.model == "rich":
+        state, camera, normal, free = self.state, self.camera, self.normal, self.free
+        shared = self.covariance
+        if self.wide is not None:
+            richer = self.wide.open
+            state, normal, free, shared = (
+                richer.state(state),
+                self.wide.normal,
+                richer.free,
+                self.wide.entries,
+            )
+            camera = replace(camera, distortion=Distortion(richer.model, richer.k))
+        if camera.distortion.model == "rich":
             free, shared = _stored(self.calibration, self.views.pixel_scale)
         return projection_uncertainty(
-            self.views, self.state, self.camera, self.normal, free, self.free_poses,
-            self.cost / self.spare, image_grid(self.points.image_size), depths, shared,
+            self.views, state, camera, normal, free, self.free_poses, self.cost / self.spare,
+            image_grid(self.points.image_size), depths, shared, angle,
         )  # fmt: skip
 
 

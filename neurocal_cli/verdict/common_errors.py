@@ -32,7 +32,7 @@ _SIGMAS = 2.0
 _LEFT = 1.25
 
 
-def common_errors(evidence: Evidence, unit: str) -> Iterator[Finding]:
+def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding]:
     """Reasons against a camera that is not the same in all views, or a board that is not flat.
 
     Parameters
@@ -40,6 +40,8 @@ def common_errors(evidence: Evidence, unit: str) -> Iterator[Finding]:
     evidence : Evidence
     unit : str
         Of the world.
+    wide : bool
+        Whether the lens is a wide one, whose rays may not meet in one point.
     """
     change, board, groups = _explanation(evidence), evidence.board, evidence.groups
     differ = groups if change is None else change
@@ -51,7 +53,7 @@ def common_errors(evidence: Evidence, unit: str) -> Iterator[Finding]:
         yield _of_several_cameras(groups)
     # Views of a bent board differ, and not by chance; rows given twice know less than they seem to.
     if change is not None and not evidence.repeated and (board is None or change.explained > board.explained):
-        yield _changed(change)
+        yield _changed(change, wide)
 
 
 def _explanation(evidence: Evidence) -> ViewChange | None:
@@ -100,7 +102,7 @@ def _alternative(first: Array, second: Array) -> str:
     return "from two zooms"
 
 
-def _changed(change: ViewChange) -> Finding:
+def _changed(change: ViewChange, wide: bool) -> Finding:
     size = abs(change.amount)
     percent, grows = f"{100 * size:.2g} %", "grows" if change.amount > 0 else "shrinks"
     what = "the focal length" if change.what == "focal length" else "the size of the image"
@@ -108,6 +110,8 @@ def _changed(change: ViewChange) -> Finding:
         reason = f"{what} {grows} by {percent} along the sequence of the views, so zoom or focus moves"
     elif change.pattern == "distance":
         reason = f"{what} {grows} by {percent} from the farthest to the nearest view, so the focus moves"
+        if wide:
+            reason += ", or the rays of this wide lens do not meet in one point"
     elif change.pattern.startswith("tilt"):
         ends = "to the left to those to the right" if change.pattern.endswith("u") else "upwards to downwards"
         reason = (

@@ -27,6 +27,8 @@ from neurocal_cli.least_squares.leave_out import inverse_or_nan
 __all__ = ["ProjectionUncertainty", "image_grid", "projection_uncertainty"]
 
 _ACROSS = 21  # points across the image
+# A wide lens may show this times the angle of the farthest point, and this angle in any case [rad].
+_BEYOND, _LEAST = 1.1, 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +75,7 @@ def projection_uncertainty(
     pixels: Array,
     depths: Array,
     shared: Array,
+    farthest: float | None = None,
 ) -> ProjectionUncertainty:
     """Propagate the covariance of a calibration.
 
@@ -90,10 +93,13 @@ def projection_uncertainty(
     depths : (D,) array
     shared : (f, f) array
         Covariance of the free entries and coefficients (`view_covariance`).
+    farthest : float, optional
+        Angle from the axis of the farthest point of a wide lens [rad]. Pixels much farther out lie beyond its
+        image circle.
     """
     columns = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     gain, motion = _motions(views, state, normal, columns, free_poses)
-    by_camera, by_point, rays = _derivatives(camera, pixels, views.pixel_scale)
+    by_camera, by_point, rays = _derivatives(camera, pixels, views.pixel_scale, farthest)
     by_camera = by_camera[:, :, np.flatnonzero(free)]
     std = np.empty((len(depths), len(pixels)))
     for k, depth in enumerate(depths):
@@ -124,8 +130,12 @@ def _motions(
     return gain, motion
 
 
-def _derivatives(camera: Camera, pixels: Array, scale: float) -> tuple[Array, Array, Array]:
+def _derivatives(
+    camera: Camera, pixels: Array, scale: float, farthest: float | None
+) -> tuple[Array, Array, Array]:
     """Of the pixels (G, 2) by the normalised camera (5 + K) and by points at depth 1; rays (G, 3)."""
     rays = camera.seen_points(pixels)
+    if farthest is not None:
+        rays = np.where(rays[:, 2:] < np.cos(min(max(_BEYOND * farthest, _LEAST), np.pi)), np.nan, rays)
     by_camera, by_point = camera.project_jacobian(rays)
     return by_camera * np.array([scale] * 5 + [1.0] * (by_camera.shape[2] - 5)), by_point, rays

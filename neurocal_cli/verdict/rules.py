@@ -75,7 +75,8 @@ def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
     # What the errors have in common is their cause, even where it costs the camera little.
-    for grade, reason, advice in common_errors(evidence, calibration.unit):
+    wide = calibration.camera.distortion.wide
+    for grade, reason, advice in common_errors(evidence, calibration.unit, wide):
         yield max(grade, int(bool(errors))), reason, advice
     yield from errors
     yield from given_parameters(evidence.asked_for, calibration.intrinsics, calibration.std)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.plots import picture, style
+from neurocal_cli.plots.figure import picture, style
 from neurocal_cli.zoom_lens.evaluation import LensEvaluation
 from neurocal_cli.zoom_lens.static_calibration import local_covariance
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens

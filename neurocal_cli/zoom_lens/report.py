@@ -58,6 +58,27 @@ def lens_report(lens: ZoomLens) -> str:
     return "\n\n".join(blocks)
 
 
+def lens_json(lens: ZoomLens) -> dict[str, Any]:
+    """The summary of a lens as JSON values; None for numbers that do not exist."""
+    verdict = judge_lens(lens)
+    return {
+        "controls": list(lens.controls),
+        "n_settings": len(lens.settings),
+        "n_points": int(lens.counts.sum()),
+        "parameters": list(lens.names),
+        "distortion": lens.model,
+        "still": bool(lens.still),
+        "known_cameras": bool(lens.known),
+        "rmse_px": number_or_none(float(lens.rmse_px)),
+        "noise_floor_px": None if lens.known else number_or_none(float(np.sqrt(2 * lens.variance))),
+        "left_out_px": number_or_none(float(lens.left_out_px)),
+        "members": len(lens.members),
+        "converged": bool(lens.converged),
+        "warnings": list(lens.warnings),
+        **({} if verdict is None else {"verdict": verdict_json(verdict)}),
+    }
+
+
 def _scatter_text(lens: ZoomLens, scatter: list[float]) -> str:
     """The scatter about each network; that of alpha is relative."""
     local = lens.tables.local

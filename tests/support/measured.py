@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -90,10 +91,21 @@ def errors(
     name: str, seeds: range, points: Points = "midpoints", gamma: float | None = None, hidden: bool = False
 ) -> Errors:
     """Errors of a condition's pictures."""
+    return errors_of(lambda seed: take(name, seed), seeds, points, gamma, hidden)
+
+
+def errors_of(
+    taken: Callable[[int], tuple[Scene, Rendered]],
+    seeds: range,
+    points: Points = "midpoints",
+    gamma: float | None = None,
+    hidden: bool = False,
+) -> Errors:
+    """Errors of pictures, one for each seed."""
     parts: list[tuple[Array, Array, Array, Array]] = []
     visible, kept, polarity = 0, 0, []
     for seed in seeds:
-        scene, picture = take(name, seed)
+        scene, picture = taken(seed)
         for plane, bound in zip(picture.truth.planes, scene_bound(scene), strict=True):
             grid, mirrored = found(plane, seed, hidden=hidden)
             measured = measure(picture.image, grid, points, gamma)

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.folds import largest_second_difference, split_at_folds
 from neurocal_cli.detection.finding.grow import check_lattice
-from neurocal_cli.detection.finding.lattice import Lattice, in_whole_square
+from neurocal_cli.detection.finding.lattice import Index, Lattice, in_whole_square
 from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.detection.finding.links import Links
 from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 
-__all__ = ["lattice_from_links"]
+__all__ = ["lattice_from_links", "linked_group"]
 
 # (c, r) from a vertex to its neighbour at the port along c, and at the next ones.
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
@@ -77,6 +77,17 @@ def lattice_from_links(
         # Vertices left out here can be found again when the grid grows.
         part = _with(part.subset(in_whole_square(good)).connected_parts(), saddles.points[middle])
     return None
+
+
+def linked_group(links: Links, middle: int) -> tuple[Index, Index]:
+    """Places (N, 2) and saddles (N,) in whole squares that links lead to from a saddle."""
+    places = _follow(links, middle, [False] * len(links.to))
+    place, member = np.array(list(places)), np.array(list(places.values()))
+    place -= place.min(axis=0)
+    seen = np.zeros(place.max(axis=0) + 1, dtype=bool)
+    seen[tuple(place.T)] = True
+    kept = in_whole_square(seen)[tuple(place.T)]
+    return place[kept], member[kept]
 
 
 def _with(parts: list[Lattice], point: Array) -> Lattice | None:

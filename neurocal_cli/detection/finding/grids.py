@@ -1,7 +1,8 @@
 """All chessboards of an image, of any size: `find_grids` runs the steps of this package.
 
 On a reduced image, saddle points of the brightness are linked along edges, and blocks of 3 x 3 linked
-vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices.
+vertices grow into grids. Finer levels of the pyramid complete the grids and refine their vertices. Where more
+saddles are linked than grids hold, `straighten` searches again, in a view without the bends of a wide lens.
 
 In: an image. Out: grids with vertices known to a few tenths of a pixel, for `measuring`.
 """
@@ -20,12 +21,13 @@ from neurocal_cli.detection.finding.folds import split_at_folds
 from neurocal_cli.detection.finding.from_links import lattice_from_links
 from neurocal_cli.detection.finding.grow import grow, remove_outliers
 from neurocal_cli.detection.finding.lattice import LEAST_SIGMA, Lattice
-from neurocal_cli.detection.finding.levels import Level, levels_of
+from neurocal_cli.detection.finding.levels import Level, levels_of, pyramid
 from neurocal_cli.detection.finding.links import Links, find_links
 from neurocal_cli.detection.finding.merge import merge_lattices
 from neurocal_cli.detection.finding.overlaps import any_overlap, drop_duplicates, trim_overlaps
 from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
 from neurocal_cli.detection.finding.seeds import find_seeds_2x3, find_seeds_3x3
+from neurocal_cli.detection.finding.straighten import any_left, find_bent, refined_locally
 from neurocal_cli.detection.finding.stretch import stretch
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.grid import Grid
@@ -40,6 +42,7 @@ _SEARCHED = 1.4e6
 _MOST_SEARCHED = 30_000_000
 # Insensitive; they bound the time: tests/benchmarks/test_detection_speed.py, "clutter only".
 _TRIES, _TRIES_2X3 = 8, 4  # seeds of a level that may fail; bounds the time where there is no board
+_UNFINISHED = 0.4  # least share of the wanted vertices in a lattice that a wide lens may have cut short
 _BEHIND = 3.0  # ratio of the squares' sizes from which on a second board is not searched
 
 Size = tuple[int, int]
@@ -63,23 +66,69 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
         meet at a fold are separate grids. A grid has at least 3 x 3 vertices, because smaller ones
         occur in clutter and no third vertex tests their lines.
     """
-    lattices: list[Lattice] = []
-    saddles: Saddles
     wanted = frozenset((*sizes, *((rows, cols) for cols, rows in sizes)))
     levels = levels_of(image)
+    lattices = _find(levels, wanted)
+    return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
+
+
+def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) -> list[Lattice]:
+    """Lattices on the finest level of a pyramid; `straight` where no lens is left to bend them."""
+    lattices: list[Lattice] = []
+    bent: list[Lattice] = []
+    saddles: Saddles
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
         lattices = [_to_finer_level(level, x) for x in lattices]
-        if level in small or (not lattices and level.image.size <= _MOST_SEARCHED):
+        bent = [refined_locally(level, replace(x, pixels=2 * x.pixels), 2) for x in bent]
+        none = not lattices and not bent
+        if level in small or (none and level.image.size <= _MOST_SEARCHED):
             if level is small[0]:
                 lattices = [y for x in lattices for y in _boards(remove_outliers(level, grow(level, x)))]
             saddles = find_saddles(level, _mask(level, lattices) if lattices else None)
-            lattices += _find_new(level, saddles, lattices, wanted)
+            links = find_links(level, saddles) if len(saddles) >= 9 else None
+            masked = sum(int(x.seen.sum()) for x in lattices)
+            if links is not None:
+                lattices += _find_new(level, saddles, links, lattices, wanted)
             if level not in small[1:]:
                 lattices = _split_planes(level, lattices)
-    if not lattices and levels and levels[0] in small:
+            if level is small[0] and not (straight or _nearest_whole(lattices, wanted)):
+                lattices, bent = _find_bent(level, saddles, links, masked, lattices, wanted)
+    if not lattices and not bent and levels and levels[0] in small:
         lattices = _split_planes(levels[0], _find_slivers(levels[0], saddles))
-    return [Grid(x.pixels, x.dark) for x in sorted(lattices, key=lambda x: -_area(x.pixels))]
+    return lattices + bent
+
+
+def _find_bent(
+    level: Level,
+    saddles: Saddles,
+    links: Links | None,
+    masked: int,
+    known: list[Lattice],
+    wanted: frozenset[Size],
+) -> tuple[list[Lattice], list[Lattice]]:
+    """Known lattices without pieces of bent ones, and the bent ones.
+
+    Saddles are those besides lattices of so many masked vertices.
+    """
+    lost = masked > sum(int(x.seen.sum()) for x in known)
+    least = _UNFINISHED * min((cols * rows for cols, rows in wanted), default=np.inf)
+    unfinished = [x for x in known if x.seen.sum() >= least]
+    if not (lost or unfinished or (links is not None and any_left(saddles, links, known))):
+        return known, []
+    if masked:
+        saddles = find_saddles(level)
+        links = find_links(level, saddles) if len(saddles) >= 9 else None
+    if links is None:
+        return known, []
+
+    def search(view: NDArray[np.float32]) -> list[Lattice]:
+        return _find(pyramid(view), wanted, straight=True)
+
+    found = find_bent(level, saddles, links, known, unfinished, search)
+    left = drop_duplicates(found + known) if found else known
+    bent = [x for x in left if any(x is y for y in found)]
+    return [x for x in left if not any(x is y for y in bent)], bent
 
 
 def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:
@@ -124,12 +173,13 @@ def _sides(points: Array) -> Array:
 
 
 def _find_new(
-    level: Level, saddles: Saddles, known: list[Lattice], wanted: frozenset[Size] = frozenset()
+    level: Level,
+    saddles: Saddles,
+    links: Links,
+    known: list[Lattice],
+    wanted: frozenset[Size] = frozenset(),
 ) -> list[Lattice]:
     """Grids of a level's saddles besides the known ones. The first grid of an image gets more effort."""
-    if len(saddles) < 9:
-        return []
-    links = find_links(level, saddles)
     seeds = find_seeds_3x3(saddles, links)
     found = _grow_from_seeds(
         level, saddles, links, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES, known, wanted
@@ -187,7 +237,10 @@ def _find_slivers(level: Level, saddles: Saddles) -> list[Lattice]:
     if part is None:
         return []
     found = []
-    for lattice in _find_new(part.level, find_saddles(part.level), []):
+    saddles = find_saddles(part.level)
+    if len(saddles) < 9:
+        return []
+    for lattice in _find_new(part.level, saddles, find_links(part.level, saddles), []):
         pixels = np.full_like(lattice.pixels, np.nan)
         pixels[lattice.seen] = part.back(lattice.pixels[lattice.seen])
         grid = grow(level, _refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["Level", "interpolate", "levels_of"]
+__all__ = ["Level", "interpolate", "levels_of", "pyramid"]
 
 Image = NDArray[np.float32]
 
@@ -81,8 +81,13 @@ def levels_of(image: NDArray[np.generic]) -> list[Level]:
     levels : list of Level
         The original first; empty when the image is too small to hold a board.
     """
+    return pyramid(_grey(image))
+
+
+def pyramid(image: Image) -> list[Level]:
+    """Halve an image in the grey levels of 8 bits repeatedly; see `levels_of`."""
     levels = []
-    current, scale = _grey(image), 1
+    current, scale = image, 1
     while min(current.shape) >= (16 if scale == 1 else _SMALLEST):
         levels.append(Level(current, scale))
         current, scale = np.asarray(cv2.pyrDown(current), dtype=np.float32), 2 * scale

@@ -12,7 +12,7 @@ from neurocal_cli.detection.finding.links import Index, Links
 from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.geometry import Array
 
-__all__ = ["find_seeds_2x3", "find_seeds_3x3"]
+__all__ = ["find_seeds_2x3", "find_seeds_3x3", "whole_blocks"]
 
 # Insensitive; tests/test_finding.py.
 _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
@@ -27,8 +27,7 @@ def find_seeds_3x3(saddles: Saddles, links: Links) -> Index:
     members : (S, 3, 3) int array
         Saddles of each block; ``[.., r, c]`` with c along port 0 of the middle one, r along port 1.
     """
-    closed = _closed(links)
-    centre = np.flatnonzero(closed.all(axis=1))
+    centre = whole_blocks(links)
     block = np.empty((len(centre), 3, 3), dtype=np.intp)
     block[:, 1, 1] = centre
     for p, (c, r) in enumerate(((1, 0), (0, 1), (-1, 0), (0, -1))):
@@ -41,6 +40,11 @@ def find_seeds_3x3(saddles: Saddles, links: Links) -> Index:
     irregularity = _irregularity(grid)
     order = np.argsort(irregularity, kind="stable")
     return block[order[irregularity[order] < _IRREGULAR]]
+
+
+def whole_blocks(links: Links) -> Index:
+    """Saddles (S,) with four closed squares around them."""
+    return np.flatnonzero(_closed(links).all(axis=1))
 
 
 def find_seeds_2x3(saddles: Saddles, links: Links) -> tuple[Index, Index]:

@@ -29,10 +29,12 @@ from neurocal_cli.detection.fitting.edge_profile import (
     tail_terms,
 )
 from neurocal_cli.detection.fitting.shading import Shading
+from neurocal_cli.detection.fitting.smooth_map import Frame
+from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
 from neurocal_cli.geometry import Array
 
-__all__ = ["BoardBlur", "PixelNoise", "level_prior", "profile_shape"]
+__all__ = ["BoardBlur", "FieldBlur", "PixelNoise", "level_prior", "profile_shape"]
 
 Single = NDArray[np.float32]
 
@@ -41,6 +43,7 @@ _FLAT = 0.95  # light, from -1 to 1, beyond which a pixel has the dark or the li
 _LEAST_SHARE = 0.3  # of the largest noise; clipped pixels seem to have less
 _ROUND = 0.5  # relative deviation of the squared blur at which an edge counts half ...
 _ROUND_EDGES = 1.0  # ... and the weight, in edges, of the prior that blur is the same in all directions
+_FIELD_STEPS, _FIELD_SPREAD = 5, 0.25  # reweighted fits; log sigma at whose deviation an edge counts half
 _BLUR_SPREAD = 0.03  # least relative deviation of an edge's blur from the board's
 _ENOUGH = 10000  # pixels that are enough to estimate the profile's shape
 # Prior standard deviations of tails and response: they matter where blur and contrast have the same effect,
@@ -139,6 +142,7 @@ def profile_shape(
     rest = slice(1, RESPONSE_TERMS + 7)
     normal, right = products[rest, rest], products[rest, 0]
     normal[np.diag_indices_from(normal)] *= 1 + _RIDGE
+    normal[np.diag_indices_from(normal)] += _TINY  # no edge may be good
     # Blur, contrast, tails and the odd terms of the response are strongly correlated.
     believed = np.concatenate([np.full(2, _TAILS), np.full(RESPONSE_TERMS, _RESPONSE)]) ** -2
     known = np.concatenate([shape.tails.mean(axis=0), shape.nonlinearity])
@@ -187,7 +191,59 @@ class BoardBlur:
         return np.sqrt(np.maximum(square, LEAST_BLUR**2))
 
 
-def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: float, noise: float) -> LevelPrior:
+@dataclass(frozen=True, eq=False)
+class FieldBlur:
+    """Blur that grows towards the rim of a wide lens: log sigma by place and direction.
+
+    Attributes
+    ----------
+    frame : Frame
+        Scales the pixels.
+    terms : (8,) array
+        Coefficients of 1, x, y, x^2, x y, y^2, and of cos 2 a and sin 2 a of the normal's direction a.
+    relative : float
+        Variance of the logarithm around that, without the variance of the fits.
+    """
+
+    frame: Frame
+    terms: Array
+    relative: float
+
+    @classmethod
+    def of(cls, fit: BatchFit, lines: Lines, good: NDArray[np.bool_], frame: Frame) -> FieldBlur:
+        """From the fits of edges, as far as they are good."""
+        if not good.any():
+            good = np.ones_like(good)
+        usual = upper_median(fit.values[good, BLUR])
+        log = np.log(fit.values[good, BLUR] / usual)
+        some = _places_and_directions(frame, lines.middle[good], lines.normal[good])
+        terms = np.zeros(some.shape[1])
+        for _ in range(_FIELD_STEPS):
+            weight = 1 / (1 + ((log - some @ terms) / _FIELD_SPREAD) ** 2)
+            # Constant unless many edges disagree.
+            normal = (some.T * weight) @ some + np.eye(len(terms)) * _ROUND_EDGES
+            terms = np.linalg.solve(normal, some.T @ (weight * log))
+        scatter = upper_median((log - some @ terms) ** 2) / CHI2_MEDIAN
+        noise = 2 * upper_median(fit.covariance[good, BLUR, BLUR] / fit.values[good, BLUR] ** 2)
+        terms[0] += np.log(usual)
+        return cls(frame, terms, max(scatter - noise, 0.0))
+
+    def along(self, normal: Array, place: Array) -> Array:
+        """(E,) blur [px] of edges with normals (E, 2) at places (E, 2) [px]."""
+        log = _places_and_directions(self.frame, place, normal) @ self.terms
+        return np.asarray(np.maximum(np.exp(log), LEAST_BLUR))
+
+
+def _places_and_directions(frame: Frame, place: Array, normal: Array) -> Array:
+    x, y = ((place - frame.centre) / frame.unit).T
+    n_u, n_v = normal.T
+    one = np.ones_like(x)
+    return np.stack([one, x, y, x * x, x * y, y * y, n_u * n_u - n_v * n_v, 2 * n_u * n_v], axis=-1)
+
+
+def level_prior(
+    shading: Shading, place: Array, sigma: Array, blur_spread: Array | float, noise: float
+) -> LevelPrior:
     """Prior of the levels and the blur of single edges from those of the whole board.
 
     Parameters
@@ -196,7 +252,7 @@ def level_prior(shading: Shading, place: Array, sigma: Array, blur_spread: float
     place : (E, 2) array [px]
     sigma : (E,) array [px]
         Blur.
-    blur_spread : float [px^2]
+    blur_spread : float or (E,) array [px^2]
         Variance of the blur of single edges around that.
     noise : float [DN^2]
         Variance of a pixel.

@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.batched_newton import CONTRAST, MEAN, BatchFit, ProfileShape
-from neurocal_cli.detection.fitting.common_parameters import BoardBlur, PixelNoise, level_prior, profile_shape
+from neurocal_cli.detection.fitting.common_parameters import (
+    BoardBlur,
+    FieldBlur,
+    PixelNoise,
+    level_prior,
+    profile_shape,
+)
 from neurocal_cli.detection.fitting.edge_fit import (
     OFFSET,
     EdgeData,
@@ -24,13 +30,14 @@ from neurocal_cli.detection.fitting.edge_fit import (
 from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
-from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map
+from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of
 from neurocal_cli.detection.fitting.map_selection import select_map
 from neurocal_cli.detection.fitting.pixel_box import half_widths
-from neurocal_cli.detection.fitting.shading import Levels, Shading, fit_shading, square_levels
-from neurocal_cli.detection.fitting.smooth_map import RICHEST_LENS, Frame, SmoothMap, homography_start
+from neurocal_cli.detection.fitting.shading import Levels, LocalShading, Shading, fit_shading, square_levels
+from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
+from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 from neurocal_cli.geometry import Array
@@ -42,6 +49,12 @@ Image = NDArray[np.generic]
 # Insensitive: later stages correct the errors of earlier ones.
 _START_SIGMA = 0.3  # px, of the coordinates of the found vertices
 _GOOD_START = 1.3  # chi2 per coordinate of these vertices at which no richer map is tried
+# Displacement by the lens, relative to the distance from its centre, from which on a wide lens is tried: at
+# once, after the first fit, and there if the residuals are ...
+_STRONGLY_BENT, _BENT, _WEAKLY_BENT = 0.25, 0.15, 0.05
+_UNEVEN = 100.0  # ... below so many variances of the noise
+_NOT_NOISE, _CLEARLY = 2.0, 0.5  # variance over that of the noise which a wide lens may lower, to this share
+_PARAMETER = 2.0  # chi2 that a parameter must be worth, in the choice between two kinds of lenses
 _ANCHOR = 2.0  # px, of these vertices in later maps, which they only keep regular
 _ENOUGH = 60  # edges that need no such anchors
 _MOMENT_SIGMA = 0.05  # px, of offsets from moments
@@ -171,12 +184,45 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     points = grid_image.anchors.value.reshape(2, n).T
     start = homography_start(frame, grid_image.anchors.grid[:n], points)
     found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
+    if found.model_index > found.map.richest_lens or _bend(grid_image, found) > _STRONGLY_BENT:
+        found = _wide_if_better(grid_image, found, grid_image.anchors, _GOOD_START)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
-    shading = fit_shading(frame, dark, light)
+    shading = _shading_of(found.map, dark, light)
     noise = max(upper_median(np.concatenate([dark.noise, light.noise])), grid_image.floor)
     mapped, sigma = _by_moments(grid_image, found, shading)
     first = _first_fit(grid_image, mapped, sigma, shading, noise)
     return _last_fit(grid_image, first)
+
+
+def _bend(grid_image: GridImage, mapped: MapFit) -> float:
+    """Greatest displacement of a vertex by the lens, relative to its distance from the lens's centre."""
+    return mapped.map.bend(grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2])
+
+
+def _wide_if_better(
+    grid_image: GridImage, found: MapFit, observations: Observations, enough: float = 0.0
+) -> MapFit:
+    """The map of a wide lens, where that fits better than a lens that displaces slopes."""
+    grid = grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2]
+    size = grid_image.image.shape[1], grid_image.image.shape[0]
+    points = grid_image.anchors.value.reshape(2, -1).T
+    start = wide_start(found.map.frame, grid, points, size)
+    if start is None:
+        return found
+    wide = select_map(start, observations, found.shift, enough, most=start.richest_lens)
+    costs = [
+        loss_of(fit.residual / np.sqrt(observations.variance)) + _PARAMETER * len(fit.map.free)
+        for fit in (found, wide)
+    ]
+    return wide if costs[1] < costs[0] else found
+
+
+def _may_be_wide(bend: float, excess: float) -> bool:
+    """Whether a lens that bends so much can be what is left of the variance.
+
+    A weak bend follows slopes up to hundredths of a pixel, and what is more comes from an uneven board.
+    """
+    return excess > _NOT_NOISE and (bend > _BENT or (bend > _WEAKLY_BENT and excess < _UNEVEN))
 
 
 def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
@@ -212,8 +258,12 @@ def _first_fit(
         observations,
         mapped.shift,
         least=mapped.model_index,
-        most=max(mapped.model_index, RICHEST_LENS),
+        most=max(mapped.model_index, mapped.map.richest_lens),
     )
+    if not isinstance(chosen.map, WideMap) and _may_be_wide(_bend(grid_image, chosen), chosen.excess):
+        wide = _wide_if_better(grid_image, chosen, observations)
+        # An uneven board departs from both.
+        chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
     good &= chosen.weight[: len(good)] > 0
     return GridFit(lines, fit, data, chosen, shading, shape, PixelNoise(noise, noise, noise), good)
 
@@ -248,11 +298,13 @@ def _fine_fit(
     n, half_length = len(first.good), 0.5 * lines.length
     shape = profile_shape(first.data, first.fit, first.shape, first.good)
     noise = PixelNoise.of(first.fit, first.data.root, grid_image.floor)
-    blur = BoardBlur.of(first.fit, lines.normal, first.good)
-    sigma = blur.along(lines.normal)
+    sigma, spread = _blur(first, lines, lines)
     data = edge_pixels(grid_image.image, lines, sigma, shading, REACH * sigma, 1)
-    prior = level_prior(shading, lines.middle, sigma, blur.spread, noise.edge)
+    prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
     offset = first.map.residual[:n] + first.map.shift[0]
+    if isinstance(first.map.map, WideMap):
+        # A fit that went astray in the dark of the rim starts at the map again.
+        offset = np.where(first.good, offset, first.map.shift[0])
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
     data = with_weight(data, noise.weights(light_at(data, start)))
     fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
@@ -274,8 +326,8 @@ def fit_grid_vertices(
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
-    blur = BoardBlur.of(fitted.fit, fitted.lines.normal, fitted.good)
-    sigma = 0.5 * (blur.along(lines[0].normal) + blur.along(lines[1].normal))
+    (first, spread), (second, _) = (_blur(fitted, fitted.lines, line) for line in lines)
+    sigma = 0.5 * (first + second)
     contrast = fitted.shading.at(place)[1]
     slopes = fitted.shading.slopes(place)
     data = vertex_data(
@@ -285,7 +337,7 @@ def fit_grid_vertices(
     shape = ProfileShape(tails, fitted.shape.nonlinearity)
     if fitted.shape.half is not None:
         shape = replace(shape, half=np.stack([half_widths(line.normal) for line in lines], axis=1))
-    prior = level_prior(fitted.shading, place, sigma, blur.spread, fitted.noise.edge)
+    prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     half = (0.5 * lines[0].length, 0.5 * lines[1].length)
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
@@ -299,6 +351,16 @@ def fit_grid_vertices(
         variance *= fitted.map.excess
         departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
     return fit, lines, is_reliable(fit, departure, data.beyond)
+
+
+def _blur(fitted: GridFit, edges: Lines, lines: Lines) -> tuple[Array, Array | float]:
+    """Blur (E,) [px] of lines by the fits of all edges, and the variance of single ones around it [px^2]."""
+    if isinstance(fitted.map.map, WideMap):
+        field = FieldBlur.of(fitted.fit, edges, fitted.good, fitted.map.map.frame)
+        sigma = field.along(lines.normal, lines.middle)
+        return sigma, field.relative * sigma**2
+    board = BoardBlur.of(fitted.fit, edges.normal, fitted.good)
+    return board.along(lines.normal), board.spread
 
 
 def _ends(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -317,4 +379,9 @@ def _shading(first: GridFit) -> Shading:
     place = first.lines.middle[good]
     dark = Levels(place, (values[:, MEAN] - values[:, CONTRAST])[good], (both - cross)[good])
     light = Levels(place, (values[:, MEAN] + values[:, CONTRAST])[good], (both + cross)[good])
-    return fit_shading(first.shading.frame, dark, light)
+    return _shading_of(first.map.map, dark, light)
+
+
+def _shading_of(at: SmoothMap, dark: Levels, light: Levels) -> Shading:
+    smooth = fit_shading(at.frame, dark, light)
+    return LocalShading.of(smooth, dark, light) if isinstance(at, WideMap) else smooth

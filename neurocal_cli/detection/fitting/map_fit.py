@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.smooth_map import MAP_MODELS, SmoothMap
+from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
@@ -118,8 +118,8 @@ class MapFit:
 
     @property
     def model_index(self) -> int:
-        """Index of the map's model in `MAP_MODELS`."""
-        return MAP_MODELS.index((self.map.radial, self.map.degree))
+        """Index of the map's model in its `models`."""
+        return self.map.models.index((self.map.radial, self.map.degree))
 
 
 def fit_map(start: SmoothMap, observations: Observations, shift: Array, steps: int = STEPS) -> MapFit:

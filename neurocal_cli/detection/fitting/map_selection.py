@@ -1,6 +1,6 @@
 """Selecting the model of the smooth map: the simplest one that the observations do not contradict.
 
-In: a start and observations. Out: the fitted map of the selected model of `smooth_map.MAP_MODELS`.
+In: a start and observations. Out: the fitted map of the selected model of the start's `models`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from neurocal_cli.detection.fitting.map_fit import (
     solve_map,
     with_covariance,
 )
-from neurocal_cli.detection.fitting.smooth_map import MAP_MODELS, SmoothMap
+from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.geometry import Array
 
 __all__ = ["select_map"]
@@ -37,7 +37,7 @@ def select_map(
     shift: Array,
     enough: float = 0.0,
     least: int = 0,
-    most: int = len(MAP_MODELS) - 1,
+    most: int | None = None,
 ) -> MapFit:
     """Fit the simplest model that the observations do not contradict.
 
@@ -50,13 +50,13 @@ def select_map(
     enough : float
         Chi2 per observation at which no richer model is tried.
     least, most : int
-        Indices of the simplest and the richest model that are tried.
+        Indices of the simplest and the richest model that are tried; the richest of all by default.
     """
     best: MapSolution | None = None
     now, paid, futile = start, 0, [0, 0]  # futile: lens models, polynomials
     informative, precision = observations.informative, 1 / np.sqrt(observations.variance)
     n_telling, scale = int(informative.sum()), 0.0
-    for radial, degree in MAP_MODELS[least : most + 1]:
+    for radial, degree in start.models[least : None if most is None else most + 1]:
         if futile[degree > 0] >= _FUTILE:
             continue
         now = now.with_model(radial, degree)

@@ -15,7 +15,7 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_median
 from neurocal_cli.geometry import Array
 
-__all__ = ["Levels", "Shading", "fit_shading", "square_levels"]
+__all__ = ["Levels", "LocalShading", "Shading", "fit_shading", "square_levels"]
 
 _x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
 # Weights of a square's corners in places (64, 4) of its interior, away from the blurred edges.
@@ -26,6 +26,7 @@ _TUKEY = 5.0  # standard deviations beyond which a level counts as an outlier
 _TINY = 1e-9  # DN^2
 _RIDGE = 1e-12
 _LEAST_CONTRAST = 1e-3  # DN, against division by 0
+_NEAREST = 3  # levels that count most at a place
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 
 
@@ -80,6 +81,61 @@ class Shading:
         dv = np.stack([zero, zero, one, zero, x, 2 * y], axis=-1) / self.frame.unit
         dark, light = (np.stack([du @ c, dv @ c], axis=-1) for c in (self.dark, self.light))
         return 0.5 * (light + dark), 0.5 * (light - dark)
+
+
+@dataclass(frozen=True, eq=False)
+class LocalShading(Shading):
+    """Levels that also follow the squares nearby: light falls fast towards the rim of a wide lens's image.
+
+    Attributes
+    ----------
+    near : pair of (N, 2) arrays [px]
+        Where dark and light levels were measured.
+    above : pair of (N,) arrays [DN]
+        What they are above the polynomials there.
+    """
+
+    near: tuple[Array, Array] = field(default_factory=lambda: (np.zeros((0, 2)), np.zeros((0, 2))))
+    above: tuple[Array, Array] = field(default_factory=lambda: (np.zeros(0), np.zeros(0)))
+
+    @classmethod
+    def of(cls, smooth: Shading, dark: Levels, light: Levels) -> LocalShading:
+        """From polynomials, and the levels that they were fitted to."""
+        near = dark.place, light.place
+        above = tuple(
+            levels.level - _terms(smooth.frame, levels.place) @ coefficients
+            for levels, coefficients in ((dark, smooth.dark), (light, smooth.light))
+        )
+        spread = []
+        for levels, rest, before in zip((dark, light), above, smooth.spread, strict=True):
+            if len(rest) <= _NEAREST:
+                return cls(
+                    smooth.frame, smooth.dark, smooth.light, smooth.spread, near, (0 * above[0], 0 * above[1])
+                )
+            left = rest - _nearby(levels.place, rest, levels.place, itself=False)
+            chance = 2 * upper_median(levels.variance)
+            spread.append(min(max(upper_median(left**2) / CHI2_MEDIAN - chance, 0.0), before))
+        return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, (above[0], above[1]))
+
+    def at(self, place: Array) -> tuple[Array, Array]:
+        """Mean level and half contrast at places (N, 2)."""
+        terms = _terms(self.frame, place)
+        dark, light = (
+            terms @ coefficients + (_nearby(near, above, place) if len(above) else 0.0)
+            for coefficients, near, above in zip((self.dark, self.light), self.near, self.above, strict=True)
+        )
+        return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
+
+
+def _nearby(near: Array, value: Array, place: Array, itself: bool = True) -> Array:
+    """Means of values at places (N, 2) near others (M, 2), weighted by their distances; (M,) array."""
+    away = ((place[:, None] - near) ** 2).sum(axis=-1)
+    if not itself:
+        np.fill_diagonal(away, np.inf)
+    rank = min(_NEAREST, len(near)) - 1
+    width = np.partition(away, rank, axis=1)[:, rank]
+    weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
+    return np.asarray(weight @ value / np.maximum(weight.sum(axis=1), 1e-12))
 
 
 def square_levels(image: NDArray[np.generic], grid: Grid, at: SmoothMap) -> tuple[Levels, Levels]:

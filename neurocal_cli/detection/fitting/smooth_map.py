@@ -15,17 +15,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["MAP_MODELS", "RICHEST_LENS", "Frame", "Places", "SmoothMap", "homography_start"]
-
-# Models of the map, the simplest first: (set of radial parameters, degree of the polynomial).
-MAP_MODELS: tuple[tuple[int, int], ...] = ((0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6))
-RICHEST_LENS = 3  # index of the richest model without a polynomial
+__all__ = ["Frame", "Places", "SmoothMap", "homography_start", "polynomial_orders", "polynomials"]
 
 _HOMOGRAPHY, _LENS = 8, 6
 _REST = _HOMOGRAPHY + _LENS
@@ -101,6 +98,12 @@ class SmoothMap:
         Of the parameters; 0 for fixed ones.
     """
 
+    # The simplest first: (set of radial parameters, degree of the polynomial).
+    models: ClassVar[tuple[tuple[int, int], ...]] = (
+        (0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6)
+    )  # fmt: skip
+    richest_lens: ClassVar[int] = 3  # index of the richest model without a polynomial
+
     frame: Frame
     parameters: Array
     radial: int = 0
@@ -125,7 +128,7 @@ class SmoothMap:
     def with_model(self, radial: int, degree: int) -> SmoothMap:
         """The map with other free parameters; new ones are 0, and old ones are dropped."""
         old = self.parameters[_REST:].reshape(2, -1)
-        rest = np.zeros((2, len(_orders(degree, self.frame))))
+        rest = np.zeros((2, len(polynomial_orders(degree, self.frame))))
         common = min(old.shape[1], rest.shape[1])
         rest[:, :common] = old[:, :common]
         values = np.concatenate([self.parameters[:_REST], rest.reshape(-1)])
@@ -150,8 +153,16 @@ class SmoothMap:
             rho = (e * (self._metric @ e)).sum(axis=0)
             q += e * (rho * (values[10] + values[11] * rho))
         if self.degree:
-            q += values[_REST:].reshape(2, -1) @ _rest(self.degree, self.frame, ground[0], ground[1]).T
+            q += values[_REST:].reshape(2, -1) @ polynomials(self.degree, frame, ground[0], ground[1]).T
         return np.asarray(frame.centre + frame.unit * q.T).reshape(grid.shape)
+
+    def bend(self, grid: Array) -> float:
+        """Greatest displacement by the lens at grid points (N, 2), over the distance from its centre."""
+        ground = np.column_stack([(grid - self.frame.origin) / self.frame.half, np.ones(len(grid))])
+        homogeneous = ground @ self._homography.T
+        e = homogeneous[:, :2] / homogeneous[:, 2:] - self.parameters[8:10]
+        rho = (e * (e @ self._metric)).sum(axis=1)
+        return float(np.abs(rho * (self.parameters[10] + self.parameters[11] * rho)).max())
 
     def places(self, grid: Array, direction: Array) -> Places:
         """Grid points (N, 2) and unit vectors (2, N), prepared for maps of this model."""
@@ -161,7 +172,7 @@ class SmoothMap:
         axis = frame.unit * direction
         rest = None
         if self.degree:
-            terms = _rest(self.degree, frame, ground[0], ground[1]).T
+            terms = polynomials(self.degree, frame, ground[0], ground[1]).T
             rest = (axis[:, None] * terms).reshape(-1, len(grid))
         return Places(ground, axis, frame.centre @ direction, rest)
 
@@ -255,7 +266,7 @@ def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
     return SmoothMap(frame, values)
 
 
-def _orders(degree: int, frame: Frame) -> tuple[tuple[int, int], ...]:
+def polynomial_orders(degree: int, frame: Frame) -> tuple[tuple[int, int], ...]:
     """Orders (i, j) of the polynomials in x and in y.
 
     Edges determine the map along a line at the line's vertices only. An order must therefore be lower than
@@ -271,10 +282,10 @@ def _orders_up_to(degree: int, most_x: float, most_y: float) -> tuple[tuple[int,
     return tuple((i, j) for i, j in orders if i <= most_x and j <= most_y)
 
 
-def _rest(degree: int, frame: Frame, x: Array, y: Array) -> Array:
+def polynomials(degree: int, frame: Frame, x: Array, y: Array) -> Array:
     """Values of the polynomials T_i(x) T_j(y), 2 <= i + j <= degree; (..., m) array."""
     tx, ty = [np.ones_like(x), x], [np.ones_like(y), y]
     for _ in range(degree - 1):
         tx.append(2 * x * tx[-1] - tx[-2])
         ty.append(2 * y * ty[-1] - ty[-2])
-    return np.stack([tx[i] * ty[j] for i, j in _orders(degree, frame)], axis=-1)
+    return np.stack([tx[i] * ty[j] for i, j in polynomial_orders(degree, frame)], axis=-1)

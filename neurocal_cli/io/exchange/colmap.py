@@ -37,8 +37,18 @@ _MODELS: dict[str, tuple[str, int, tuple[int | None, ...]]] = {
     "OPENCV_FISHEYE": ("fisheye", 2, (0, 1, 2, 3)),
     "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, (0, None, None, None)),
     "RADIAL_FISHEYE": ("fisheye", 1, (0, 1, None, None)),
+    # Of versions from 4 on.
+    "SIMPLE_FISHEYE": ("fisheye", 1, (None, None, None, None)),
+    "FISHEYE": ("fisheye", 2, (None, None, None, None)),
+    "EUCM": ("eucm", 2, (0, 1)),
 }
-_NAMES = {"none": "PINHOLE", "k1k2p1p2": "OPENCV", "rational": "FULL_OPENCV", "fisheye": "OPENCV_FISHEYE"}
+_NAMES = {
+    "none": "PINHOLE",
+    "k1k2p1p2": "OPENCV",
+    "rational": "FULL_OPENCV",
+    "fisheye": "OPENCV_FISHEYE",
+    "eucm": "EUCM",
+}
 
 
 def is_folder(name: str) -> bool:

@@ -2,7 +2,8 @@
 
 One camera has ``camera_matrix`` and ``distortion_coefficients``; two have ``M1, D1, M2, D2, R, T`` as in
 OpenCV's stereo sample. Poses of views are ``extrinsic_parameters``, a row each of rotation vector and
-translation, as in its calibration sample, or ``rvecs`` and ``tvecs``, what ``calibrateCamera`` returns.
+translation, as in its calibration sample, or ``rvecs`` and ``tvecs``, what ``calibrateCamera`` returns. Of
+OpenCV's omnidirectional cameras ``xi`` stands beside k1, k2, p1, p2.
 """
 
 from __future__ import annotations
@@ -155,6 +156,8 @@ def entries(cameras: CameraSet) -> dict[str, Any]:
             tree[f"image_width{end}"], tree[f"image_height{end}"] = camera.image_size
         model, k = to_ros(camera.distortion.model, camera.distortion.coefficients)
         tree[f"distortion_model{side}"] = model
+        if model == "omnidir":
+            tree[f"xi{side}"], k = float(k[0]), k[1:]
         tree[f"M{side}" if side else "camera_matrix"] = camera.A
         tree[f"D{side}" if side else "distortion_coefficients"] = k[None]
     if cameras.has_lengths and cameras.unit is not None:
@@ -214,7 +217,7 @@ def npz_bytes(tree: Mapping[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-_ALL = ("none", "plumb_bob", "rational", "fisheye")
+_ALL = ("none", "plumb_bob", "rational", "fisheye", "omnidir")
 OPENCV = Format("OpenCV", _ALL, False, True, 2, False, False, _opencv)
 JSON = Format("JSON", _ALL, True, True, 2, False, False, _json)
 NPZ = Format("NumPy", _ALL, True, True, 2, False, False, _npz)

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.distortion.nearest_camera import NearestCamera, nearest_camera, with_model
 from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 
 __all__ = ["Fitted", "fitted_in"]
 
 _NO_SKEW = 1e-3  # a loss below this [px] is nobody's concern
+_NO_LOSS = 5e-3  # nor is this share of the image
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,8 +36,8 @@ class Fitted:
     remarks: tuple[str, ...] = ()
 
 
-def fitted_in(cameras: CameraSet, target: Format, force: bool) -> Fitted:
-    """Make cameras fit a format.
+def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None = None) -> Fitted:
+    """Make cameras fit a format, of one model if it is given.
 
     Skew that the format's programs ignore is taken out always: written, it would be ignored silently.
     The nearest camera without skew moves pixels by less than the ignored skew does.
@@ -45,6 +48,8 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool) -> Fitted:
     target : Format
     force : bool
         Whether the nearest camera of another distortion model will do.
+    model : str, optional
+        One of `MODELS`: the cameras become the nearest ones of this distortion model.
 
     Raises
     ------
@@ -61,16 +66,24 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool) -> Fitted:
         raise InputError(f"a file of {target.program} needs the size of the images; give --image-size W H")
     if target.metres:
         cameras = (cameras if target.poses else replace(cameras, poses={})).in_metres()
+    if model is not None and model not in target.models:
+        held = ", ".join(target.models)
+        raise InputError(f"{target.program} has no distortion model {model}; choose one of {held}")
     losses, remarks, fitted = [], [], []
-    for camera in cameras.cameras:
-        new, loss = _fitted(camera, target, force)
+    for camera, points in zip(cameras.cameras, _pixels_of(cameras), strict=True):
+        if model is None:
+            new, loss = _fitted(camera, target, force, points)
+        else:
+            new, loss = _of_model(camera, model, target, points)
         fitted.append(new)
         losses += [f"{camera.name}: {loss}"] if loss else []
     changed = any(new is not old for new, old in zip(fitted, cameras.cameras, strict=True))
     own = target.program == "neurocal"
-    if cameras.origin is not None and not own:
+    if cameras.origin is not None and (changed or not own):
         remarks.append(
             f"a file of {target.program} has no place for standard deviations, points and the verdict"
+            if not own
+            else "the new camera has no standard deviations, points and verdict"
         )
     if cameras.poses and not target.poses:
         remarks.append(f"a file of {target.program} has no place for the poses of {len(cameras.poses)} views")
@@ -78,20 +91,40 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool) -> Fitted:
     return Fitted(replace(cameras, cameras=tuple(fitted), origin=origin), tuple(losses), tuple(remarks))
 
 
-def _fitted(camera: Camera, target: Format, force: bool) -> tuple[Camera, str]:
+def _pixels_of(cameras: CameraSet) -> list[Array | None]:
+    """Where each camera saw the points that it was calibrated with."""
+    origin = cameras.origin
+    if origin is None:
+        return [None] * len(cameras.cameras)
+    parts = [origin] if isinstance(origin, Calibration) else [origin.left, origin.right]
+    return [part.points.pixels for part in parts]
+
+
+def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> tuple[Camera, str]:
+    straight = target.skew or not camera.intrinsics.skewed
+    if with_model(camera.distortion, model) is not None and straight:
+        return _as_model(camera, model), ""
+    near = nearest_camera(camera, model, target.skew, points)
+    return near.camera, f"the nearest {model}{'' if straight else ' without skew'} {_pixels(near)}"
+
+
+def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -> tuple[Camera, str]:
     model = next((m for m in target.models if with_model(camera.distortion, m) is not None), None)
     straight = target.skew or not camera.intrinsics.skewed
     if model is not None and straight:
         return _as_model(camera, model), ""
     if model is not None:
-        near = nearest_camera(camera, model, skew=False)
-        if near.max_px < _NO_SKEW:
+        near = nearest_camera(camera, model, False, points)
+        if near.over_image.max_px < _NO_SKEW:
             return _straightened(near.camera), ""
         return _straightened(near.camera), (
             f"programs of {target.program} ignore skew, so the nearest camera without it is written; "
             f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
         )
-    near = min((nearest_camera(camera, m, target.skew) for m in target.models), key=lambda n: n.max_px)
+    near = min(
+        (nearest_camera(camera, m, target.skew, points) for m in target.models),
+        key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px),
+    )
     what = (
         f"{target.program} has no distortion model {camera.distortion.model}; the nearest of its models, "
         f"{near.camera.distortion.model}, {_pixels(near)}"
@@ -116,4 +149,10 @@ def _straightened(camera: Camera) -> Camera:
 
 
 def _pixels(near: NearestCamera) -> str:
-    return f"moves pixels by {near.rms_px:.3g} px rms and {near.max_px:.3g} px at most over the image"
+    over, at = near.over_image, near.at_points
+    text = f"moves pixels by {over.rms_px:.3g} px rms and {over.max_px:.3g} px at most over the image"
+    if at is not None:
+        text += f", by {at.rms_px:.3g} px rms and {at.max_px:.3g} px at most where points were seen"
+    if near.lost > _NO_LOSS:
+        text += f", and it does not show {100 * near.lost:.0f} % of the image"
+    return text

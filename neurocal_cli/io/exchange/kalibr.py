@@ -1,7 +1,8 @@
 """Kalibr's camchain files: cameras in a chain, lengths in metres.
 
 ``T_cn_cnm1`` takes points from the camera before into this one. The centre of the top-left pixel is (0, 0),
-as Kalibr's corners are OpenCV's. radtan is k1, k2, p1, p2; equidistant is our fisheye.
+as Kalibr's corners are OpenCV's. radtan is k1, k2, p1, p2; pinhole-equidistant is our fisheye, omni-radtan
+our omnidir, ds our double_sphere. Their own numbers come first among the intrinsics.
 """
 
 from __future__ import annotations
@@ -19,7 +20,24 @@ from neurocal_cli.io.yaml_text import flow, text
 
 __all__ = ["FORMAT", "from_tree", "is_tree"]
 
-_MODELS = {"radtan": "k1k2p1p2", "equidistant": "fisheye", "equi": "fisheye", "none": "none"}
+# By camera model and distortion model.
+_MODELS = {
+    ("pinhole", "radtan"): "k1k2p1p2",
+    ("pinhole", "equidistant"): "fisheye",
+    ("pinhole", "equi"): "fisheye",
+    ("pinhole", "none"): "none",
+    ("omni", "radtan"): "omnidir",
+    ("omni", "none"): "omnidir",
+    ("ds", "none"): "double_sphere",
+    ("eucm", "none"): "eucm",
+}
+_OWN = {"pinhole": 0, "omni": 1, "ds": 2, "eucm": 2}  # numbers before fu, fv, pu, pv
+_WRITTEN = {
+    "fisheye": ("pinhole", "equidistant"),
+    "omnidir": ("omni", "radtan"),
+    "double_sphere": ("ds", "none"),
+    "eucm": ("eucm", "none"),
+}
 
 
 def is_tree(root: Field) -> bool:
@@ -48,42 +66,45 @@ def from_tree(root: Field) -> CameraSet:
 
 def _camera(field: Field, name: str) -> Camera:
     model = field["camera_model"].text()
-    if model != "pinhole":
+    if model not in _OWN:
         raise InputError(
-            f"{name}: the camera model {model[:40]!r} is not known; calibrate it as pinhole-equi or "
-            "pinhole-radtan, or with neurocal from the points"
+            f"{name}: the camera model {model[:40]!r} is not known; calibrate it as pinhole-equi, "
+            "pinhole-radtan, omni-radtan, ds-none or eucm-none, or with neurocal from the points"
         )
-    fu, fv, pu, pv = field["intrinsics"].array(4)
     lens = field["distortion_model"].text() if "distortion_model" in field else "none"
-    if lens not in _MODELS:
+    if (model, lens) not in _MODELS:
         raise InputError(
-            f"{name}: the distortion model {lens[:40]!r} is not known; calibrate it as radtan or "
-            "equidistant, or with neurocal from the points"
+            f"{name}: the distortion model {lens[:40]!r} is not known with the camera model {model}; "
+            "calibrate it as radtan or equidistant, or with neurocal from the points"
         )
-    ours = _MODELS[lens]
-    k = field["distortion_coeffs"].array(-1) if ours != "none" else np.zeros(0)
-    if ours != "none" and len(k) != 4:
-        field["distortion_coeffs"].fail("4 numbers")
+    own, (fu, fv, pu, pv) = np.split(field["intrinsics"].array(_OWN[model] + 4), [_OWN[model]])
+    k = np.zeros(0)
+    if lens != "none":
+        k = field["distortion_coeffs"].array(-1)
+        if len(k) != 4:
+            field["distortion_coeffs"].fail("4 numbers")
+    distortion = Distortion(_MODELS[model, lens], np.concatenate([own, k]))
     size = None
     if "resolution" in field:
         width, height = (entry.integer(1) for entry in field["resolution"].items())
         size = width, height
-    return Camera(Intrinsics(fu, fv, pu, pv), Distortion(ours, k), size, name)
+    return Camera(Intrinsics(fu, fv, pu, pv), distortion, size, name)
 
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     lines, before = [], Pose(np.eye(3), np.zeros(3))
     for k, camera in enumerate(cameras.cameras):
         a, _, b, u0, v0 = camera.entries
-        fisheye = camera.distortion.model == "fisheye"
-        coefficients = camera.distortion.coefficients if camera.distortion.coefficients.size else np.zeros(4)
+        model, lens = _WRITTEN.get(camera.distortion.model, ("pinhole", "radtan"))
+        own, k4 = np.split(camera.distortion.coefficients, [_OWN[model]])
+        coefficients = np.zeros(4) if lens == "radtan" and not k4.size else k4
         lines += [
             f"cam{k}:",
             f"  cam_overlaps: [{', '.join(str(n) for n in range(len(cameras.cameras)) if n != k)}]",
-            "  camera_model: pinhole",
+            f"  camera_model: {model}",
             f"  distortion_coeffs: {flow(coefficients)}",
-            f"  distortion_model: {'equidistant' if fisheye else 'radtan'}",
-            f"  intrinsics: {flow(np.array([a, b, u0, v0]))}",
+            f"  distortion_model: {lens}",
+            f"  intrinsics: {flow(np.array([*own, a, b, u0, v0]))}",
             f"  resolution: {list(camera.image_size or (0, 0))}",
             f"  rostopic: {text(f'/{camera.name}/image_raw')}",
         ]
@@ -96,4 +117,4 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     return {"": "\n".join([*lines, ""])}
 
 
-FORMAT = Format("Kalibr", ("none", "k1k2p1p2", "fisheye"), False, False, 99, True, True, _text)
+FORMAT = Format("Kalibr", ("none", "k1k2p1p2", *_WRITTEN), False, False, 99, True, True, _text)

@@ -12,6 +12,7 @@ from neurocal_cli.simulation.rendering.scene import (
     Background,
     Disc,
     Illumination,
+    ImageCircle,
     Occluder,
     Rectangle,
     Scene,
@@ -20,12 +21,14 @@ from neurocal_cli.simulation.rendering.scene import (
     Target,
 )
 from neurocal_cli.simulation.rendering.truth import PlaneTruth, Truth, ground_truth
+from neurocal_cli.simulation.rendering.wide import WideCamera
 
 __all__ = [
     "Background",
     "Bound",
     "Disc",
     "Illumination",
+    "ImageCircle",
     "Occluder",
     "PlaneTruth",
     "Rectangle",
@@ -35,6 +38,7 @@ __all__ = [
     "Sides",
     "Target",
     "Truth",
+    "WideCamera",
     "edge_bound",
     "ground_truth",
     "noise_free",

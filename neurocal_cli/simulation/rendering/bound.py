@@ -16,6 +16,7 @@ from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.light import enough_parts, image_light
 from neurocal_cli.simulation.rendering.scene import Scene
 from neurocal_cli.simulation.rendering.sensor import noise_variance, response, signal
+from neurocal_cli.simulation.rendering.wide import WideCamera
 
 __all__ = ["Bound", "edge_bound", "scene_bound", "vertex_bound"]
 
@@ -116,6 +117,8 @@ def _gradients(scene: Scene) -> tuple[Array, Array, Array]:
 
 
 def _shifted(scene: Scene, du: float, dv: float) -> Scene:
+    if isinstance(scene.camera, WideCamera):
+        return replace(scene, camera=scene.camera.moved(du, dv))
     i = scene.camera.intrinsics
     moved = Intrinsics(i.alpha_u, i.alpha_v, i.u0 + du, i.v0 + dv, i.theta)
     return replace(scene, camera=replace(scene.camera, intrinsics=moved))

@@ -16,6 +16,7 @@ from neurocal_cli.camera.projection import Rays
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer, occluder_cover
 from neurocal_cli.simulation.rendering.scene import Occluder, Scene
+from neurocal_cli.simulation.rendering.wide import WideCamera, WideRays
 
 __all__ = ["Composition"]
 
@@ -29,12 +30,12 @@ class Composition:
 
     Parameters
     ----------
-    camera : Camera
+    camera : Camera or WideCamera
     boards : tuple of BoardLayer
     occluders : tuple of Rectangle or Disc
     """
 
-    camera: Camera
+    camera: Camera | WideCamera
     boards: tuple[BoardLayer, ...]
     occluders: tuple[Occluder, ...]
 
@@ -45,7 +46,7 @@ class Composition:
         return cls(scene.camera, boards, scene.occluders)
 
     def light(
-        self, rays: Rays, behind: Array, cell: float, slack: float = 0.0
+        self, rays: Rays | WideRays, behind: Array, cell: float, slack: float = 0.0
     ) -> tuple[Array, NDArray[np.int8]]:
         """Mean reflectance of cells and the number of edges in each.
 
@@ -77,7 +78,7 @@ class Composition:
             open_share -= taken
         return light + open_share * behind, edges
 
-    def pixels(self, u: Array, v: Array, behind: Array) -> tuple[Array, NDArray[np.bool_], Rays]:
+    def pixels(self, u: Array, v: Array, behind: Array) -> tuple[Array, NDArray[np.bool_], Rays | WideRays]:
         """Reflectance at pixels' centres, and which pixels have edges in them.
 
         Parameters
@@ -125,7 +126,7 @@ class Composition:
 
     def _cut(
         self, u: Array, v: Array, start: tuple[Array, Array], behind: Array, side: float, parts: int
-    ) -> tuple[Array, NDArray[np.int8], Rays]:
+    ) -> tuple[Array, NDArray[np.int8], Rays | WideRays]:
         """Light of the parts x parts cells of squares with a given side; all flat."""
         offsets = ((np.arange(parts) + 0.5) / parts - 0.5) * side
         shape = (len(u), parts, parts)

@@ -13,6 +13,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.coverage import half_plane
 from neurocal_cli.simulation.rendering.scene import Disc, Occluder, Rectangle, Scene, Target
+from neurocal_cli.simulation.rendering.wide import WideRays
 
 __all__ = ["BoardLayer", "Cover", "occluder_cover"]
 
@@ -49,7 +50,8 @@ class BoardLayer:
     ----------
     target : Target
     inverse : (3, 3) array
-        From rays (x, y, 1) to w (a, b, 1), w = 1 / depth, a and b in squares.
+        From rays (x, y, z) to w (a, b, 1), w = 1 / depth, a and b in squares. Rays are slopes (z = 1) and
+        depths along the axis, or unit directions and depths along these.
     """
 
     target: Target
@@ -72,28 +74,31 @@ class BoardLayer:
             )
         return cls(target, np.asarray(np.linalg.inv(matrix), dtype=float))
 
-    def grid(self, rays: Rays) -> tuple[Array, Array, Array]:
+    def grid(self, rays: Rays | WideRays) -> tuple[Array, Array, Array]:
         """Grid coordinates a, b [squares] and w = 1 / depth where rays meet the target's plane."""
         N, x, y = self.inverse, rays.x, rays.y
-        w = N[2, 0] * x + N[2, 1] * y + N[2, 2]
+        z = rays.z if isinstance(rays, WideRays) else 1.0
+        w = N[2, 0] * x + N[2, 1] * y + N[2, 2] * z
         with np.errstate(divide="ignore", invalid="ignore"):
-            a = (N[0, 0] * x + N[0, 1] * y + N[0, 2]) / w
-            b = (N[1, 0] * x + N[1, 1] * y + N[1, 2]) / w
+            a = (N[0, 0] * x + N[0, 1] * y + N[0, 2] * z) / w
+            b = (N[1, 0] * x + N[1, 1] * y + N[1, 2] * z) / w
         return a, b, w
 
-    def slopes(self, rays: Rays, a: Array, b: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+    def slopes(
+        self, rays: Rays | WideRays, a: Array, b: Array, w: Array
+    ) -> tuple[Array, Array, Array, Array]:
         """Derivatives au, av, bu, bv of the grid coordinates by the pixel [squares / px]."""
         N = self.inverse
         ax, ay = (N[0, 0] - a * N[2, 0]) / w, (N[0, 1] - a * N[2, 1]) / w
         bx, by = (N[1, 0] - b * N[2, 0]) / w, (N[1, 1] - b * N[2, 1]) / w
-        return (
-            ax * rays.xu + ay * rays.yu,
-            ax * rays.xv + ay * rays.yv,
-            bx * rays.xu + by * rays.yu,
-            bx * rays.xv + by * rays.yv,
-        )
+        au, av = ax * rays.xu + ay * rays.yu, ax * rays.xv + ay * rays.yv
+        bu, bv = bx * rays.xu + by * rays.yu, bx * rays.xv + by * rays.yv
+        if isinstance(rays, WideRays):
+            az, bz = (N[0, 2] - a * N[2, 2]) / w, (N[1, 2] - b * N[2, 2]) / w
+            au, av, bu, bv = au + az * rays.zu, av + az * rays.zv, bu + bz * rays.zu, bv + bz * rays.zv
+        return au, av, bu, bv
 
-    def cover(self, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
+    def cover(self, rays: Rays | WideRays, cell: float, slack: float = 0.0) -> Cover:
         """What the target covers of cells around rays given as flat arrays.
 
         Parameters
@@ -114,7 +119,7 @@ class BoardLayer:
         at = np.flatnonzero(near)
         if not at.size:
             return Cover(alpha, light, depth, edges)
-        part = Rays(*(getattr(rays, name)[at] for name in ("u", "v", "x", "y", "xu", "xv", "yu", "yv")))
+        part = type(rays)(*(getattr(rays, name)[at] for name in rays._fields))
         a, b, w = a[at], b[at], w[at]
         au, av, bu, bv = self.slopes(part, a, b, w)
         paper, pattern = self.target.paper_box, self.target.pattern_box
@@ -167,7 +172,7 @@ def _inward(a: Array, ends: tuple[float, float]) -> Array:
     return np.minimum(a - ends[0], ends[1] - a)
 
 
-def occluder_cover(occluder: Occluder, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
+def occluder_cover(occluder: Occluder, rays: Rays | WideRays, cell: float, slack: float = 0.0) -> Cover:
     """What an occluder covers of cells around rays; see `BoardLayer.cover`."""
     du, dv = rays.u - occluder.centre[0], rays.v - occluder.centre[1]
     if isinstance(occluder, Disc):

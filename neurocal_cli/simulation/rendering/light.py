@@ -9,7 +9,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.blur import Blur
 from neurocal_cli.simulation.rendering.clutter import background_image
 from neurocal_cli.simulation.rendering.composition import Composition
-from neurocal_cli.simulation.rendering.scene import Illumination, Scene
+from neurocal_cli.simulation.rendering.scene import Illumination, ImageCircle, Scene
 
 __all__ = ["enough_parts", "illuminated", "image_light"]
 
@@ -46,7 +46,8 @@ def image_light(scene: Scene, parts: int | None = None) -> Array:
         _fill(scene, composition, blur, rows, level, edged, residual)
     image = blur.convolve(*_shaded(scene, level, edged, pad))
     image += residual[2 * pad : height + 2 * pad, 2 * pad : width + 2 * pad]
-    return image * _vignetting(scene)
+    image = image * _vignetting(scene)
+    return image if scene.circle is None else _in_circle(scene.circle, image)
 
 
 def illuminated(light: Illumination, size: tuple[int, int], u: Array, v: Array) -> Array:
@@ -135,3 +136,13 @@ def _vignetting(scene: Scene) -> Array | float:
     u, v = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
     corner = max(0.25 * ((width - 1) ** 2 + (height - 1) ** 2), 1.0)
     return np.asarray(1 - strength * (u**2 + v[:, None] ** 2) / corner)
+
+
+def _in_circle(circle: ImageCircle, image: Array) -> Array:
+    height, width = image.shape
+    u, v = np.arange(width) - circle.centre[0], np.arange(height)[:, None] - circle.centre[1]
+    radius = np.hypot(u, v)
+    away = (radius - circle.radius) / circle.soft
+    share = 1 / (1 + np.exp(np.clip(4 * away, -50, 50)))
+    fading = 1 - circle.vignetting * np.minimum(radius / circle.radius, 1) ** 4
+    return np.asarray(image * share * fading + circle.ring * np.exp(-0.5 * away**2))

@@ -16,11 +16,13 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.simulation.rendering.wide import WideCamera
 
 __all__ = [
     "Background",
     "Disc",
     "Illumination",
+    "ImageCircle",
     "Occluder",
     "Rectangle",
     "Scene",
@@ -173,6 +175,33 @@ class Illumination:
 
 
 @dataclass(frozen=True)
+class ImageCircle:
+    """The round image of a fisheye that does not fill the picture; it is dark outside.
+
+    Parameters
+    ----------
+    centre : (u, v) [px]
+    radius : float [px]
+    soft : float [px]
+        Width over which the light fades at the rim.
+    vignetting : float
+        Share of the light that is lost at the rim.
+    ring : float
+        Light of a bright ring at the rim, as some lenses have, 1 being full scale.
+    """
+
+    centre: tuple[float, float]
+    radius: float
+    soft: float = 3.0
+    vignetting: float = 0.0
+    ring: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.radius <= 0 or self.soft <= 0 or not 0 <= self.vignetting <= 1:
+            raise InputError("an image circle needs a radius, a soft rim, and vignetting from 0 to 1")
+
+
+@dataclass(frozen=True)
 class Sensor:
     """From light to numbers.
 
@@ -216,7 +245,7 @@ class Scene:
 
     Parameters
     ----------
-    camera : Camera
+    camera : Camera or WideCamera
         With the size of its images.
     pose : Pose
         World to camera.
@@ -231,9 +260,10 @@ class Scene:
     sensor : Sensor
     unit : str
         Of the world.
+    circle : ImageCircle, optional
     """
 
-    camera: Camera
+    camera: Camera | WideCamera
     pose: Pose
     targets: tuple[Target, ...] = ()
     background: Background = field(default_factory=Background)
@@ -242,6 +272,7 @@ class Scene:
     psf: float = 0.8
     sensor: Sensor = field(default_factory=Sensor)
     unit: str = "mm"
+    circle: ImageCircle | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.psf <= 50:

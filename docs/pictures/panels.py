@@ -1,0 +1,21 @@
+"""The page of panels that ``--plot`` draws, of the sample camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from neurocal_cli import calibrate, read_points
+from neurocal_cli.plots.pages import draw_calibration
+
+HERE = Path(__file__).resolve().parent
+SAMPLES = HERE.parents[1] / "sample_data"
+
+
+def main() -> None:
+    """Draw ``panels.png``."""
+    found = calibrate(read_points(str(SAMPLES / "flat.csv")), skew=False)
+    (HERE / "panels.png").write_bytes(draw_calibration(found))
+
+
+if __name__ == "__main__":
+    main()

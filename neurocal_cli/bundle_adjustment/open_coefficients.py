@@ -1,0 +1,191 @@
+"""What a camera is uncertain by because its distortion model was chosen.
+
+A model that was chosen for what it predicts lacks coefficients that real lenses have: p1 and p2 move the
+image centre, k3 moves k1 and k2. They are left open here, each group of them absent or with a Gaussian prior
+of the size that lenses have (George and McCulloch 1993). To second order around the minimum, all the models
+that the chosen one is part of follow from one normal matrix. With w_m the posterior probability of model m,
+P_m and o_m its posterior covariance and mean of the open coefficients o, and T = dc/do how the parameters c
+of the camera follow them,
+
+    E = sum_m w_m (P_m + o_m o_m^T),    cov(c, o) = [T; 1] E [T; 1]^T + [cov(c), 0; 0, 0],
+
+which is the covariance that model averaging has (Hoeting et al. 1999), around the parameters of the chosen
+model, because those are reported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from itertools import compress, product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.leave_out import inverse_or_nan, solve_or_nan
+from neurocal_cli.least_squares.normal_equations import solve_scaled
+
+__all__ = [
+    "OpenCoefficients",
+    "OpenPrior",
+    "open_coefficients",
+    "radius",
+    "spread_of_open",
+    "wide_covariance",
+]
+
+# Groups that come and go together, the power of the radius, and the std of their terms' share of the radius
+# at the farthest point. Four real lenses have 0.03-0.14, 0.001-0.035, 0.0001-0.001 and 0.0015-0.007.
+# Repeated by tests/test_choice_uncertainty.py (slow: 200 draws of each of four lenses, std true to 0.9-1.2).
+_POLYNOMIAL = ((("k1",), 2, 0.1), (("k2",), 4, 0.03), (("p1", "p2"), 1, 0.001), (("k3",), 6, 0.005))
+_FISHEYE = ((("k1",), 2, 0.1), (("k2",), 4, 0.03), (("k3",), 6, 0.01), (("k4",), 8, 0.003))
+_ODDS = 3.0  # that a group is there
+_RICHEST = ("plumb_bob", "k1k2p1p2", "k1k2", "k1")
+
+
+@dataclass(frozen=True, eq=False)
+class OpenPrior:
+    """What is known of open unknowns before any point is seen.
+
+    Attributes
+    ----------
+    is_open : (f,) bool array
+        Which of the free unknowns are open.
+    size : (o,) array
+        Std of the open ones, where they are there.
+    groups : tuple of int arrays
+        Places among the open ones that come and go together.
+    """
+
+    is_open: NDArray[np.bool_]
+    size: Array
+    groups: tuple[NDArray[np.intp], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class OpenCoefficients:
+    """A camera with the coefficients that its model was chosen without.
+
+    Attributes
+    ----------
+    model : str
+        The richer model.
+    k : (K,) array
+        Its coefficients; the open ones are 0.
+    free : (5 + K,) bool array
+        What is free of A's entries and the coefficients, open ones included.
+    prior : OpenPrior
+    """
+
+    model: str
+    k: Array
+    free: NDArray[np.bool_]
+    prior: OpenPrior
+
+    def state(self, state: CameraState) -> CameraState:
+        """The same camera as one of the richer model."""
+        return replace(state, model=self.model, k=self.k)
+
+
+def radius(views: Views, state: CameraState) -> float:
+    """Radius of the farthest point in normalised image coordinates, before distortion."""
+    seen = (state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]
+    return float((np.hypot(seen[:, 0], seen[:, 1]) / seen[:, 2]).max())
+
+
+def open_coefficients(
+    model: str, k: Array, free: NDArray[np.bool_], choice: Collection[str], reach: float
+) -> OpenCoefficients | None:
+    """Coefficients that a model was chosen without; None where there are none.
+
+    Parameters
+    ----------
+    model, k
+        The chosen distortion.
+    free : (5 + K,) bool array
+        What was estimated of A's entries and the coefficients.
+    choice : collection of str
+        The models that were chosen from; empty where the model was named.
+    reach : float
+        `radius` of the farthest point.
+    """
+    own = coefficient_names(model)
+    richer = model if model == "fisheye" else next((m for m in _RICHEST if m in choice), "none")
+    names = coefficient_names(richer)
+    if not choice or not np.isfinite(reach) or not reach > 0 or not set(own) <= set(names):
+        return None
+    value = dict(zip(own, k.tolist(), strict=True))
+    estimated = dict(zip(own, free[5:].tolist(), strict=True))
+    is_open = np.array([False] * 5 + [not estimated.get(name, False) for name in names])
+    if not is_open.any():
+        return None
+    wanted = free.copy()[:5].tolist() + [True] * len(names)
+    far = float(np.arctan(reach)) if richer == "fisheye" else reach
+    at = {name: place for place, name in enumerate(np.array(names)[is_open[5:]].tolist())}
+    size, groups = np.zeros(len(at)), []
+    for members, power, share in _FISHEYE if richer == "fisheye" else _POLYNOMIAL:
+        places = [at[name] for name in members if name in at]
+        size[places] = share / far**power
+        if places:
+            groups.append(np.array(places))
+    everything = np.array(wanted)
+    kept = np.array([value.get(name, 0.0) for name in names])
+    return OpenCoefficients(richer, kept, everything, OpenPrior(is_open[everything], size, tuple(groups)))
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> tuple[Array, Array]:
+    """What the points tell of the open unknowns.
+
+    Parameters
+    ----------
+    S : (f, f) array
+        Normal matrix of what is free, poses eliminated.
+    g : (f,) array
+        Right side, J^T r.
+    variance : float
+        Of the residuals, larger where they are correlated.
+    prior : OpenPrior
+
+    Returns
+    -------
+    E : (o, o) array
+        Mean of o o^T; nan where the points leave open what was estimated.
+    follow : (f, o) array
+        [T; 1]: how all that is free follows.
+    """
+    size, is_open = prior.size, prior.is_open
+    c, o = np.flatnonzero(~is_open), np.flatnonzero(is_open)
+    T = -solve_scaled(S[np.ix_(c, c)], S[np.ix_(c, o)])
+    # In units of the prior: what is left of the open ones once the others have followed.
+    left = (S[np.ix_(o, o)] + S[np.ix_(o, c)] @ T) * size[:, None] * size / variance
+    right = (g[o] + T.T @ g[c]) * size / variance
+    second, total = np.zeros_like(left), 0.0
+    models = []
+    for there in product((False, True), repeat=len(prior.groups)):
+        some = np.concatenate([np.zeros(0, np.intp), *compress(prior.groups, there)])
+        Q = left[np.ix_(some, some)] + np.eye(len(some))
+        mean = solve_or_nan(Q, right[some])
+        logarithm = 0.5 * float(right[some] @ mean) - 0.5 * float(np.linalg.slogdet(Q)[1])
+        models.append(
+            (logarithm + sum(there) * np.log(_ODDS), some, inverse_or_nan(Q) + np.outer(mean, mean))
+        )
+    most = max(logarithm for logarithm, *_ in models)
+    for logarithm, some, moment in models:
+        weight = np.exp(logarithm - most)
+        second[np.ix_(some, some)] += weight * moment
+        total += weight
+    follow = np.zeros((len(is_open), len(o)))
+    follow[c], follow[o] = T, np.eye(len(o))
+    return second * size[:, None] * size / total, follow
+
+
+def wide_covariance(entries: Array, E: Array, follow: Array, is_open: NDArray[np.bool_]) -> Array:
+    """(f, f) covariance of all that is free, from that of what was estimated for known open ones."""
+    wide = follow @ E @ follow.T
+    wide[np.ix_(~is_open, ~is_open)] += entries
+    return np.asarray(wide)

@@ -1,0 +1,55 @@
+"""The option ``--html``: a page on what the command has just found."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from neurocal_cli.commands.streams import TYPED
+
+if TYPE_CHECKING:
+    from neurocal_cli.calibration import Calibration
+    from neurocal_cli.stereo.rig import Rig
+
+__all__ = ["html_option", "write_page"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def html_option(f: F) -> F:
+    """Add ``--html``, the page that ``neurocal report`` makes."""
+    return click.option(
+        "--html",
+        metavar="REPORT.html",
+        type=click.Path(writable=False, readable=False),
+        show_default="none",
+        help="Also write the page that `neurocal report` makes, with this command and the SHA-256 of its "
+        "inputs.",
+    )(f)
+
+
+def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None) -> None:
+    """Write the page of a result that was made from these files; nothing without a name."""
+    if html is None:
+        return
+    import hashlib
+
+    from neurocal_cli.html_report.origin import Origin, versions
+    from neurocal_cli.html_report.reports import calibration_page, rig_page
+    from neurocal_cli.io.files import read_bytes
+    from neurocal_cli.io.writing import write_whole
+    from neurocal_cli.stereo.rig import Rig
+
+    files = {}
+    for name in inputs:
+        if name is not None and name != "-":  # what came through a pipe is gone
+            data, source = read_bytes(name)
+            files[source] = hashlib.sha256(data).hexdigest()
+    typed = click.get_current_context().meta.get(TYPED, ())
+    origin = Origin(files, shlex.join(("neurocal", *typed)), versions())
+    write_whole(
+        html, rig_page(result, origin) if isinstance(result, Rig) else calibration_page(result, origin)
+    )

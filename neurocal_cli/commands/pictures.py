@@ -1,0 +1,59 @@
+"""The option ``--plot`` of commands whose picture is a page of panels."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, TypeVar
+
+import click
+
+from neurocal_cli.commands.options import check_plot
+
+__all__ = ["Plots", "check_plots", "panels_option", "write_plots"]
+
+F = TypeVar("F", bound=Callable[..., Any])
+Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
+
+
+def panels_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
+    """Add ``--plot``, which draws all panels on a page or one of them; the value is of the type `Plots`."""
+
+    def parse(ctx: click.Context, param: click.Parameter, words: Iterable[str]) -> Plots:
+        return tuple(_parsed(word) for word in words)
+
+    def _parsed(word: str) -> tuple[str | None, str]:
+        panel, equals, file = word.partition("=")
+        return (panel, file) if equals and panel in panels else (None, word)
+
+    return click.option(
+        "--plot",
+        "plots",
+        metavar="[PANEL=]FILE.png",
+        multiple=True,
+        callback=parse,
+        show_default="none",
+        help=f"Plot {what} to this .png, .pdf or .svg file: all panels on one page, or one of them: "
+        f"{', '.join(panels)}. It can be repeated.",
+    )
+
+
+def check_plots(plots: Plots, output: str | None = None) -> None:
+    """Refuse pictures that cannot be drawn; see `options.check_plot`."""
+    for _, file in plots:
+        check_plot(file, output)
+
+
+def write_plots(plots: Plots, draw: Callable[[str, str | None], bytes]) -> None:
+    """Draw and write all pictures.
+
+    Parameters
+    ----------
+    plots : Plots
+    draw : callable
+        Gives a picture of a kind ("png") and of a panel.
+    """
+    from neurocal_cli.io.writing import write_whole
+
+    for panel, file in plots:
+        write_whole(file, draw(os.path.splitext(file)[1][1:].lower(), panel))

@@ -1,0 +1,221 @@
+"""Searching a board in a view without the bends that a wide lens gives its lines.
+
+The squares of a board near a wide lens bend, and change from one to the next, more than growth allows
+elsewhere. Their links are seen nevertheless, and tell the lens and the plane. In a view of that plane from
+straight above, lines are straight and squares are equal, so that growth finds the others.
+
+In: a level with its saddles and links, and the lattices already known. Out: the lattice of a linked group of
+saddles as that view shows it, in the level's pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.detection.finding.from_links import linked_group
+from neurocal_cli.detection.finding.lattice import Index, Lattice
+from neurocal_cli.detection.finding.levels import Level
+from neurocal_cli.detection.finding.links import Links
+from neurocal_cli.detection.finding.saddles import Saddles
+from neurocal_cli.detection.finding.seeds import whole_blocks
+from neurocal_cli.detection.finding.subpixel import refine_saddles
+from neurocal_cli.detection.medians import median
+from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
+from neurocal_cli.geometry import Array
+
+__all__ = ["PlaneView", "any_left", "find_bent", "refined_locally"]
+
+_OWN, _BESIDE = 0.4, 2.0  # squares; nearer saddles are the lattice's own, farther ones not its next line
+_LIKE, _LINE = 0.5, 3  # least contrast relative to the lattice's, and least number of saddles of such a line
+_GROUPS = 3  # of linked saddles that are tried
+_OFF = 0.12  # squares; greatest rms distance of vertices from the fit of the lens ...
+_OUTLIER = 0.3  # ... and greatest distance of a vertex that is not left out of it
+_ROUNDS = 3  # of leaving such vertices out
+_WIDE = 0.5  # rad; least angle from the axis at which a lens may be why a lattice is not finished
+_MORE = 1.1  # least ratio of a group to the known vertices in it, to be searched again
+_AROUND, _LEAST_AROUND = 0.75, 4.0  # of the group's extent, and squares, that the view shows around it
+_SQUARE = 24.0  # px; a square of the view ...
+_MOST_PIXELS = 1.4e6  # ... in a view of at most this size
+_LARGEST = 1.5  # px; farthest that a vertex moves when it is refined in the image
+_SIGMA = 0.15  # of a square's width; smoothing of derivatives, in steps of 0.25 px
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneView:
+    """A plane seen from straight above, through the lens that shows it in the image.
+
+    Attributes
+    ----------
+    fit : WideFit
+    square : float [px]
+        In the view.
+    first : (2,) array [squares]
+        Grid coordinates of the view's first pixel.
+    size : (width, height) [px]
+    """
+
+    fit: WideFit
+    square: float
+    first: Array
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, fit: WideFit, places: Array) -> PlaneView:
+        """A view of places (N, 2) of the plane and their surroundings."""
+        low, high = places.min(axis=0), places.max(axis=0)
+        around = np.maximum(_AROUND * (high - low), _LEAST_AROUND)
+        extent = high - low + 2 * around
+        square = min(_SQUARE, float(np.sqrt(_MOST_PIXELS / extent.prod())))
+        width, height = np.ceil(square * extent).astype(int).tolist()
+        return cls(fit, square, low - around, (width, height))
+
+    def back(self, points: Array) -> Array:
+        """Points (..., 2) of the view in the image [px]."""
+        return self.fit.at(self.first + points / self.square)
+
+    def seen(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
+        """The view, from the image."""
+        width, height = self.size
+        v, u = np.mgrid[0:height, 0:width].astype(float)
+        places = self.back(np.stack([u, v], axis=-1)).astype(np.float32)
+        view = cv2.remap(image, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # type: ignore[call-overload]
+        return np.asarray(view, dtype=np.float32)
+
+
+def any_left(saddles: Saddles, links: Links, known: list[Lattice]) -> bool:
+    """Whether linked saddles belong to no lattice: a block of their own, or a line beside a lattice."""
+    linked = (links.to >= 0).any(axis=1)
+    blocks = np.zeros(len(saddles), dtype=bool)
+    blocks[whole_blocks(links)] = True
+    beside = np.zeros(len(saddles), dtype=bool)
+    for lattice in known:
+        own = lattice.pixels[lattice.seen]
+        away = np.sqrt(((saddles.points[:, None] - own) ** 2).sum(axis=-1).min(axis=1)) / lattice.width
+        like = saddles.contrast > _LIKE * median(lattice.contrast)
+        beside |= linked & like & (away > _OWN) & (away < _BESIDE)
+        blocks &= away > _OWN
+    return bool(blocks.any() or np.count_nonzero(beside) >= _LINE)
+
+
+def find_bent(
+    level: Level,
+    saddles: Saddles,
+    links: Links,
+    known: list[Lattice],
+    unfinished: list[Lattice],
+    search: Callable[[NDArray[np.float32]], list[Lattice]],
+) -> list[Lattice]:
+    """Search again where more saddles are linked than lattices hold, and around unfinished lattices.
+
+    Parameters
+    ----------
+    level : Level
+    saddles : Saddles
+        Of the whole level, those of known lattices too.
+    links : Links
+    known : list of Lattice
+    unfinished : list of Lattice
+        Those known ones that are smaller than the board.
+    search : function of an image
+        Finds its lattices.
+
+    Returns
+    -------
+    lattices : list of Lattice
+        Each larger than the known ones at the same place.
+    """
+    found: list[Lattice] = []
+    groups = [(places, saddles.points[members], _MORE, 0.0) for places, members in _groups(saddles, links)]
+    groups += [(np.argwhere(x.seen)[:, ::-1], x.pixels[x.seen], 1.0, _WIDE) for x in unfinished]
+    for places, pixels, more, wide in groups:
+        if len(pixels) < more * max((_shared(x, pixels) for x in (*known, *found)), default=0):
+            continue
+        fit = _fitted(places.astype(float), pixels, level)
+        if fit is None or fit.lens.angles(pixels).max() < wide:
+            continue
+        view = PlaneView.of(fit, places.astype(float))
+        for lattice in search(view.seen(level.image)):
+            inside = _into_image(lattice, view, level)
+            if inside is not None and inside.seen.sum() > max(
+                (_shared(x, inside.pixels[inside.seen]) for x in (*known, *found)), default=0
+            ):
+                found.append(inside)
+    return found
+
+
+def _groups(saddles: Saddles, links: Links) -> Iterator[tuple[Index, Index]]:
+    """Places (N, 2) and saddles (N,) of linked groups of at least 3 x 3, from different middles."""
+    middles = whole_blocks(links)
+    covered = np.zeros(len(saddles), dtype=bool)
+    for _ in range(_GROUPS):
+        free = middles[~covered[middles]]
+        if not len(free):
+            return
+        # The strongest vertex is the least likely to be clutter.
+        middle = int(free[np.argmax(saddles.contrast[free])])
+        places, members = linked_group(links, middle)
+        covered[members] = covered[middle] = True
+        if len(members) >= 9:
+            yield places, members
+
+
+def _shared(lattice: Lattice, pixels: Array) -> int:
+    """Number of a lattice's vertices among pixels (N, 2)."""
+    own = lattice.pixels[lattice.seen]
+    away = np.hypot(*np.moveaxis(own[:, None] - pixels, -1, 0)).min(axis=1)
+    return int((away < 0.25 * lattice.width).sum())
+
+
+def _fitted(places: Array, pixels: Array, level: Level) -> WideFit | None:
+    """The lens by most vertices of a group; None if they lie on no plane seen through one."""
+    height, width = level.image.shape
+    kept = np.ones(len(places), dtype=bool)
+    for _ in range(_ROUNDS):
+        fit = fit_wide_lens(places[kept], pixels[kept], (width, height))
+        if not np.isfinite(fit.rms):
+            return None
+        off = np.hypot(*(fit.at(places) - pixels).T) / _widths(fit, places)
+        good = off < max(_OUTLIER, 3 * median(off))
+        if good.sum() < 9 or (good == kept).all():
+            break
+        kept = good
+    return fit if np.sqrt((off[kept] ** 2).mean()) < _OFF and kept.mean() > 0.7 else None
+
+
+def _widths(fit: WideFit, places: Array) -> Array:
+    """(N,) geometric mean sides of the squares around places [px]."""
+    corner = fit.at(places[:, None] + 0.5 * np.array([[0, 0], [1, 0], [0, 1]]))
+    c, r = 2 * (corner[:, 1] - corner[:, 0]), 2 * (corner[:, 2] - corner[:, 0])
+    return np.sqrt(np.maximum(np.abs(c[:, 0] * r[:, 1] - c[:, 1] * r[:, 0]), 1e-6))
+
+
+def _into_image(lattice: Lattice, view: PlaneView, level: Level) -> Lattice | None:
+    """A lattice of the view in the level, without vertices outside it."""
+    pixels = view.back(lattice.pixels)
+    room = np.array(level.image.shape[::-1]) - 2
+    with np.errstate(invalid="ignore"):
+        inside = np.asarray(((pixels >= 1) & (pixels <= room)).all(axis=-1))
+    if not inside.any():
+        return None
+    kept = replace(lattice, pixels=pixels).subset(inside)
+    return refined_locally(level, kept, _LARGEST)
+
+
+def refined_locally(level: Level, lattice: Lattice, most: float) -> Lattice:
+    """The lattice with its vertices at saddle points within `most` px, smoothed for squares of any size."""
+    row, col, predicted = lattice.predicted
+    sigma = np.clip(np.round(_SIGMA * predicted.width / 0.25) * 0.25, 0.75, 2.0)
+    pixels = lattice.pixels.copy()
+    for value in np.unique(sigma):
+        some = sigma == value
+        start = pixels[row[some], col[some]]
+        refined = refine_saddles(level.image, start, float(value))
+        with np.errstate(invalid="ignore"):
+            close = np.hypot(*(refined - start).T) < most
+        pixels[row[some], col[some]] = np.where(close[:, None], refined, start)
+    return replace(lattice, pixels=pixels)

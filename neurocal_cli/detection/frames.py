@@ -1,0 +1,75 @@
+"""Which frames of a video are worth measuring: the sharp ones that differ from each other.
+
+Each short stretch of the video gives its sharpest frame. Of those that are about as sharp as most, the
+sharpest one is taken first, and then again and again the one that differs most from all taken so far, until
+the next one would hardly differ: a board that is held still gives one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.geometry import Array
+
+__all__ = ["choose_frames"]
+
+_STRETCH = 8  # frames, a quarter of a second: of a hand that shakes, some moment is still
+_WIDTH = 640  # px; sharpness is seen there as well, and costs less
+_THUMB = (48, 36)  # px
+_SHARP = 0.4  # of the median sharpness of the stretches
+_DIFFERENT = 6.0  # DN, rms; noise of a still camera leaves 1 after averaging
+
+
+@dataclass(frozen=True, eq=False)
+class _Best:
+    """The sharpest frame of a stretch."""
+
+    number: int
+    sharpness: float
+    thumb: Array
+
+
+def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int) -> list[int]:
+    """Choose frames by their numbers, in the order of the video.
+
+    Parameters
+    ----------
+    frames : iterable of (height, width) uint8 arrays
+    most : int
+        Frames to choose at most.
+    """
+    stretches: list[_Best] = []
+    for number, grey in enumerate(frames):
+        seen = _seen(number, grey)
+        if number % _STRETCH == 0:
+            stretches.append(seen)
+        elif seen.sharpness > stretches[-1].sharpness:
+            stretches[-1] = seen
+    if not stretches:
+        return []
+    sharpness = np.array([one.sharpness for one in stretches])
+    sharp = [one for one in stretches if one.sharpness >= _SHARP * np.median(sharpness)]
+    thumbs = np.stack([one.thumb.ravel() for one in sharp])
+    chosen = [int(np.argmax([one.sharpness for one in sharp]))]
+    distance = _distance(thumbs, thumbs[chosen[0]])
+    while len(chosen) < most and distance.max() > _DIFFERENT:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, _distance(thumbs, thumbs[chosen[-1]]))
+    return sorted(sharp[k].number for k in chosen)
+
+
+def _seen(number: int, grey: NDArray[np.uint8]) -> _Best:
+    height, width = grey.shape
+    factor = min(1.0, _WIDTH / width)
+    small = cv2.resize(grey, (round(factor * width), round(factor * height)), interpolation=cv2.INTER_AREA)
+    thumb = cv2.resize(small, _THUMB, interpolation=cv2.INTER_AREA).astype(float)
+    return _Best(number, float(cv2.Laplacian(small, cv2.CV_32F).var()), thumb)
+
+
+def _distance(thumbs: Array, one: Array) -> Array:
+    return np.asarray(np.sqrt(((thumbs - one) ** 2).mean(axis=1)))

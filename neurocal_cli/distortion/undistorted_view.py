@@ -1,0 +1,153 @@
+"""What undistorted pictures show: on a plane, a cylinder or a sphere, and how much of the field of view.
+
+The optical axis keeps its pixel, in proportion where the picture has another size; it is in the middle of a
+panorama whose field of view is given. A plane shows less than 180 degrees, and its scale grows outwards with
+1 / cos^2 of the angle.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.distortion.panorama import PANORAMAS, Panorama
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = ["SHAPES", "Field", "Undistorted", "field_of_view", "plane_like", "undistorted_view"]
+
+SHAPES = ("plane", *PANORAMAS)
+Undistorted = Camera | Panorama
+
+_ALONG = 1001  # pixels along a row and a column
+_WIDEST_PLANE = 170.0  # degrees
+_NARROW = 1e-3  # rad
+
+
+class Field(NamedTuple):
+    """How far a picture sees along the row and the column of its optical axis [rad].
+
+    Attributes
+    ----------
+    left, right, top, bottom : float
+        Angles from the axis; left and top are negative.
+    """
+
+    left: float
+    right: float
+    top: float
+    bottom: float
+
+    @property
+    def degrees(self) -> tuple[float, float]:
+        """From left to right, and from top to bottom."""
+        across, down = np.degrees([self.right - self.left, self.bottom - self.top]).tolist()
+        return across, down
+
+    def common(self, other: Field) -> Field:
+        """What both see."""
+        return Field(
+            max(self.left, other.left), min(self.right, other.right),
+            max(self.top, other.top), min(self.bottom, other.bottom),
+        )  # fmt: skip
+
+
+def field_of_view(camera: Undistorted, size: tuple[int, int]) -> Field:
+    """The field of view of images of some size.
+
+    Raises
+    ------
+    InputError
+        A camera that sees nothing there.
+    """
+    u0, v0 = _axis(camera, size)
+    share, ends = np.linspace(0, 1, _ALONG), []
+    for row in (True, False):
+        along = share * size[0 if row else 1] - 0.5
+        line = np.column_stack([along, 0 * along + v0] if row else [0 * along + u0, along])
+        X, Y, Z = camera.unproject(line).T
+        angle = np.arctan2(X if row else Y, Z)
+        angle = angle[np.isfinite(angle)]
+        if not len(angle):
+            raise InputError("the camera sees nothing in the middle of its image; correct the camera")
+        ends += [float(angle.min()), float(angle.max())]
+    return Field(*ends)
+
+
+def _axis(camera: Undistorted, size: tuple[int, int]) -> Array:
+    """Pixel of the optical axis, or the nearest one in the image."""
+    pixel = camera.project(np.array([0.0, 0.0, 1.0]))[0]
+    return np.asarray(np.clip(pixel, 0, np.array(size) - 1.0))
+
+
+def plane_like(camera: Camera) -> Intrinsics:
+    """The camera matrix of a plane with the scale of the middle of the image: for most lenses, their own."""
+    if not camera.distortion.wide:
+        return camera.intrinsics
+    A = camera.A.copy()
+    A[:2, :2] = camera.project_jacobian(np.array([[0.0, 0.0, 1.0]]))[1][0, :, :2]
+    A[1, 0] = 0.0  # but for rounding
+    return Intrinsics.from_matrix(A)
+
+
+def undistorted_view(
+    camera: Camera,
+    size: tuple[int, int],
+    shape: str = "plane",
+    fov: float | None = None,
+    new_size: tuple[int, int] | None = None,
+) -> Undistorted:
+    """Choose what undistorted pictures show.
+
+    Parameters
+    ----------
+    camera : Camera
+    size : (width, height) [px]
+        Of its images.
+    shape : {"plane", "cylinder", "equirectangular"}
+    fov : float, optional [degrees]
+        Field of view from left to right. By default a plane keeps the scale of the middle of the image; the
+        others show all that the image does from left to right.
+    new_size : (width, height), optional [px]
+        Of the pictures; by default the same.
+
+    Raises
+    ------
+    InputError
+        Another shape; a field of view that the shape cannot show.
+    """
+    if shape not in SHAPES:
+        raise InputError(f"the shape must be one of {', '.join(SHAPES)}, not {shape[:40]!r}")
+    most = _WIDEST_PLANE if shape == "plane" else 360.0
+    if fov is not None and not 0 < fov <= most:
+        raise InputError(
+            f"a {shape} shows at most {most:g} degrees, not {fov:g}"
+            + ("; use a cylinder" if shape == "plane" and 0 < fov <= 360 else "")
+        )
+    new_size = new_size or size
+    factors = np.array(new_size) / size
+    u0, v0 = (_axis(camera, size) + 0.5) * factors - 0.5
+    left, right = float(u0 + 0.5), float(new_size[0] - 0.5 - u0)  # of the axis
+    if shape == "plane":
+        if fov is None:
+            plain = Camera(plane_like(camera), Distortion(), size, camera.name)
+            return plain.rescaled((float(factors[0]), float(factors[1]))) if new_size != size else plain
+        f = _scale_of_plane(left, right, np.radians(fov))
+        return Camera(Intrinsics(f, f, float(u0), float(v0)), Distortion(), new_size, camera.name)
+    if fov is None:
+        field = field_of_view(camera, size)
+        f = min(left / max(-field.left, _NARROW), right / max(field.right, _NARROW))
+    else:
+        f = new_size[0] / np.radians(fov)
+        u0, v0 = 0.5 * (np.array(new_size) - 1.0)
+    return Panorama(shape, float(f), float(u0), float(v0), new_size, camera.name)
+
+
+def _scale_of_plane(left: float, right: float, fov: float) -> float:
+    """Find f with atan(left / f) + atan(right / f) = fov: the tangent of the sum, a quadratic equation."""
+    half = 0.5 * (left + right) / np.tan(fov)
+    return float(half + np.sqrt(half * half + left * right))

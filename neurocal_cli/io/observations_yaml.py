@@ -1,0 +1,201 @@
+"""The points that a calibration was found from, as a block of its file.
+
+A row for each point; or, in a long file, each place of the target once, and a row for each view whose numbers
+are texts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from operator import add
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.io.text_columns import (
+    LONGEST,
+    column_lines,
+    join_ranges,
+    number_texts,
+    read_columns,
+    read_numbers,
+    read_ranges,
+)
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import flow, quoted
+from neurocal_cli.points import Correspondences
+
+__all__ = ["observation_lines", "read_observations"]
+
+_PLACE = ("X", "Y", "Z")
+_PIXEL = ("u", "v")
+_COVARIANCE = ("suu", "suv", "svv")
+_ACROSS = ("nu", "nv")
+
+
+def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
+    """Lines of the block ``observations``."""
+    measured, blocks = list(_PIXEL), [points.pixels]
+    if points.covariance is not None:
+        measured += _COVARIANCE
+        blocks.append(points.covariance)
+    if points.across is not None:
+        measured += _ACROSS
+        blocks.append(points.across)
+    columns = ["view", *(["point"] if points.point is not None else []), *_PLACE, *measured]
+    yield "observations:"
+    yield f"  columns: [{', '.join(columns)}]"
+    if len(points) == 0:
+        yield "  rows: []"
+    elif long:
+        yield from (f"  {line}" for line in _long_lines(points, np.hstack(blocks)))
+    else:
+        yield "  rows:"
+        yield from _rows(points, np.hstack([points.world, *blocks]))
+
+
+def _rows(points: Correspondences, numbers: Array) -> Iterator[str]:
+    # They are further in than their key: OpenCV's FileStorage wants that.
+    heads = [f"    - [{quoted(name)}, " for name in points.view_names]
+    heads = [heads[k] for k in points.view_index.tolist()]
+    if points.point is not None:
+        labels = np.asarray(points.point).tolist()
+        ids = {label: f"{quoted(str(label))}, " for label in set(labels)}
+        heads = [head + ids[label] for head, label in zip(heads, labels, strict=True)]
+    return map(add, heads, flow(numbers)[2:-1].split(", ["))
+
+
+def _long_lines(points: Correspondences, measured: Array) -> Iterator[str]:
+    place, first = _places(points)
+    labels = {} if points.point is None else {"point": np.asarray(points.point)[first].astype(str).tolist()}
+    coordinates = {name: points.world[first, k] for k, name in enumerate(_PLACE)}
+    yield "places:  # each place of the target once; its columns"
+    yield from (f"  {line}" for line in column_lines({**labels, **coordinates}))
+    yield "views:  # name, its points among the places, and a text for each of the columns that follow Z"
+    starts = np.flatnonzero(np.diff(points.view_index, prepend=-1))
+    for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(points)], strict=True):
+        name = quoted(points.view_names[points.view_index[start]])
+        for k in range(start, end, LONGEST):
+            rows = slice(k, min(k + LONGEST, end))
+            texts = [text for column in measured[rows].T for text in number_texts(column)]
+            yield f"    - [{name}, {', '.join([repr(join_ranges(place[rows])), *texts])}]"
+
+
+def _places(points: Correspondences) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The place of each row among the different ones, and the first row at each place."""
+    bits = np.ascontiguousarray(points.world).view(np.dtype((np.void, 24))).ravel().tolist()
+    keys = bits if points.point is None else list(zip(bits, np.asarray(points.point).tolist(), strict=True))
+    number: dict[Any, int] = {}
+    place = np.array([number.setdefault(key, len(number)) for key in keys], dtype=np.int64)
+    return place, np.unique(place, return_index=True)[1]
+
+
+def read_observations(
+    observations: Field,
+    unit: str,
+    image_size: tuple[int, int] | None,
+    image_center: tuple[float, float] | None,
+    none: bool,
+) -> Correspondences:
+    """Read the block ``observations``, in either form.
+
+    Parameters
+    ----------
+    observations : Field
+    unit : str
+    image_size : (width, height) or None [px]
+    image_center : (u0, v0) or None [px]
+    none : bool
+        Whether there may be none at all.
+
+    Raises
+    ------
+    FormatError
+        A table that is not as it was written.
+    """
+    if "places" in observations:
+        columns, stands = _long_columns(observations), f"{observations.path}.views"
+    else:
+        columns, stands = _row_columns(observations), f"{observations.path}.rows"
+    if none and not columns:  # a camera that a lens gave
+        return Correspondences.none(image_size, unit)
+    if not columns:
+        observations["rows"].fail("at least one row")
+
+    def numbers(names: tuple[str, ...]) -> Array:
+        fields = (Field(columns[name], observations.source, f"{stands}, column {name},") for name in names)
+        return np.column_stack([field.array(-1) for field in fields])
+
+    labels = {
+        name: _labels(columns[name], observations, name) for name in ("view", "point") if name in columns
+    }
+    try:
+        return Correspondences(
+            numbers(_PLACE),
+            numbers(_PIXEL),
+            view=labels.get("view"),
+            point=labels.get("point"),
+            covariance=numbers(_COVARIANCE) if set(_COVARIANCE) <= set(columns) else None,
+            across=numbers(_ACROSS) if set(_ACROSS) <= set(columns) else None,
+            image_size=image_size,
+            image_center=image_center,
+            unit=unit,
+            source=observations.source,
+        )
+    except InputError as error:
+        raise FormatError(str(error)) from error
+
+
+def _names(observations: Field) -> list[str]:
+    names = [name.text() for name in observations["columns"].items()]
+    missing = [name for name in (*_PLACE, *_PIXEL) if name not in names]
+    if missing or len(set(names)) < len(names):
+        observations["columns"].fail("a list of different names with X, Y, Z, u, v among them")
+    return names
+
+
+def _row_columns(observations: Field) -> dict[str, list[Any]]:
+    """Turn the table into columns by name."""
+    names = _names(observations)
+    rows = observations["rows"]
+    if not isinstance(rows.value, list):
+        rows.fail("a list of rows")
+    for k, row in enumerate(rows.value):
+        if type(row) is not list or len(row) != len(names):
+            Field(row, rows.source, f"{rows.path}[{k}]").fail(f"a list of {len(names)} values")
+    return dict(zip(names, map(list, zip(*rows.value, strict=True)), strict=True)) if rows.value else {}
+
+
+def _long_columns(observations: Field) -> dict[str, list[Any]]:
+    names = _names(observations)
+    places = read_columns(observations["places"], frozenset(("point",)))
+    measured = [name for name in names if name not in places and name != "view"]
+    if set(places) - {"point"} != set(_PLACE) or "view" not in names:
+        observations["places"].fail("the columns X, Y, Z and point, if the points have names")
+    columns: dict[str, list[Any]] = {name: [] for name in names}
+    for entry in observations["views"].items():
+        view, where, *texts = entry.items() if len(entry.value) == len(measured) + 2 else [entry] * 2
+        if len(texts) != len(measured):
+            entry.fail(f"a list of {len(measured) + 2} texts")
+        rows = read_ranges(where, len(places["X"]))
+        columns["view"] += [view.text()] * len(rows)
+        for name, values in places.items():
+            columns[name] += [values[row] for row in rows]
+        for name, text in zip(measured, texts, strict=True):
+            numbers = read_numbers([text])
+            if len(numbers) != len(rows):
+                text.fail(f"{len(rows)} numbers")
+            columns[name] += numbers
+    return columns if columns["view"] else {}
+
+
+def _labels(labels: list[Any], observations: Field, name: str) -> list[str]:
+    if set(map(type, labels)) <= {str}:
+        return labels
+    return [
+        Field(label, observations.source, f"{observations.path}.rows[{k}], {name},").text()
+        for k, label in enumerate(labels)
+    ]

@@ -1,0 +1,157 @@
+"""Long columns as texts of numbers with commas between them: ``X: ['0.0,20.0,40.0']``.
+
+PyYAML's own parser takes 50 us for a number, but 0.3 us for a character of a text. A text has 160 numbers at
+most, because OpenCV's FileStorage takes no text of more than 4095 characters.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import flows, quoted
+
+__all__ = [
+    "LONGEST",
+    "column_lines",
+    "join_ranges",
+    "number_texts",
+    "read_columns",
+    "read_numbers",
+    "read_ranges",
+    "read_table",
+    "table_lines",
+]
+
+LONGEST = 160  # numbers in a text, each of 24 characters at most
+
+_NUMBERS = re.compile(r"(?:[-+0-9.eE, ]|null)+").fullmatch
+_RANGES = re.compile(r"[0-9]{1,12}(?:-[0-9]{1,12})?(?:,[0-9]{1,12}(?:-[0-9]{1,12})?)*").fullmatch
+
+
+def number_texts(values: NDArray[Any]) -> list[str]:
+    """Write numbers as texts in quotes; ``null`` for what is not finite."""
+    words = _words(values)
+    return [f"'{','.join(words[k : k + LONGEST])}'" for k in range(0, len(words), LONGEST)]
+
+
+def _words(values: NDArray[Any]) -> list[str]:
+    flat = np.ravel(values)
+    return list(map(str, flat.tolist())) if flat.dtype.kind in "iu" else flows(flat)
+
+
+def column_lines(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Iterator[str]:
+    """Lines of a table, one for each column: arrays as texts of numbers, labels one by one."""
+    for name, values in columns.items():
+        parts = number_texts(values) if isinstance(values, np.ndarray) else map(quoted, values)
+        yield f"{name}: [{', '.join(parts)}]"
+
+
+def table_lines(
+    columns: Mapping[str, NDArray[Any] | Sequence[str]], long: bool, indent: int = 4
+) -> Iterator[str]:
+    """Lines of ``columns`` and ``rows``, or of a long table of ``columns`` alone."""
+    if long:
+        yield "columns:"
+        yield from (f"  {line}" for line in column_lines(columns))
+        return
+    cells = [
+        _words(values) if isinstance(values, np.ndarray) else map(quoted, values)
+        for values in columns.values()
+    ]
+    yield f"columns: [{', '.join(columns)}]"
+    yield "rows:"
+    yield from (f"{' ' * indent}- [{', '.join(row)}]" for row in zip(*cells, strict=True))
+
+
+def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
+    """Read either form of a table: its columns, each a list of what is in it.
+
+    Raises
+    ------
+    FormatError
+        Rows or columns of different lengths.
+    """
+    if isinstance(field["columns"].value, dict):
+        table = read_columns(field["columns"], labels)
+    else:
+        names = [name.text() for name in field["columns"].items()]
+        rows = [row.value for row in field["rows"].items()]
+        if len(set(names)) < len(names) or any(
+            type(row) is not list or len(row) != len(names) for row in rows
+        ):
+            field.fail(f"a table with {len(names)} columns")
+        table = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)) if rows else {}
+    return {name: Field(values, field.source, f"{field.path}.{name}") for name, values in table.items()}
+
+
+def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
+    """Read a table back: numbers (None for null), and text in the columns called `labels`.
+
+    Raises
+    ------
+    FormatError
+        What is no column, or columns of different lengths.
+    """
+    columns: dict[str, list[Any]] = {}
+    for name in field.keys():  # noqa: SIM118 - a Field, not a dict
+        column = field[name]
+        columns[name] = (
+            [entry.text() for entry in column.items()]
+            if name in labels
+            else read_numbers(list(column.items()))
+        )
+    if len(set(map(len, columns.values()))) > 1:
+        field.fail("columns of one length")
+    return columns
+
+
+def read_numbers(texts: Sequence[Field]) -> list[Any]:
+    """Read the numbers of some texts, None for null; they may still be infinite.
+
+    Raises
+    ------
+    FormatError
+        Anything but numbers.
+    """
+    for entry in texts:
+        if not _NUMBERS(entry.text()):
+            entry.fail("numbers with commas between them")
+    try:
+        return list(json.loads(f"[{','.join(entry.value for entry in texts)}]"))
+    except ValueError:
+        texts[0].fail("numbers with commas between them")
+
+
+def join_ranges(numbers: NDArray[np.int64]) -> str:
+    """Write whole numbers as ranges, ``0-92,95,97-99``."""
+    cuts = np.flatnonzero(np.diff(numbers) != 1)
+    first = numbers[np.concatenate([[0], cuts + 1])].tolist()
+    last = numbers[np.concatenate([cuts, [len(numbers) - 1]])].tolist()
+    return ",".join(f"{a}-{b}" if a < b else f"{a}" for a, b in zip(first, last, strict=True))
+
+
+def read_ranges(field: Field, below: int) -> list[int]:
+    """Read ranges back.
+
+    Raises
+    ------
+    FormatError
+        Text that is none, or numbers that are not below the limit.
+    """
+    text = field.text()
+    if not _RANGES(text):
+        field.fail("whole numbers and ranges such as 0-92")
+    numbers: list[int] = []
+    for part in text.split(","):
+        first, _, last = part.partition("-")
+        if int(last or first) >= below:
+            field.fail(f"numbers below {below}")
+        numbers.extend(range(int(first), int(last or first) + 1))
+    return numbers

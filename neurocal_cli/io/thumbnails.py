@@ -1,0 +1,79 @@
+"""Small pictures of photographs, for a page that holds many of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.io.image_paths import find_images, view_names
+from neurocal_cli.io.images import encode_image, read_image, shrink
+
+__all__ = ["photographs_of", "thumbnails"]
+
+_WIDEST = 960  # px; a page shows no more of one
+_NARROWEST = 120
+
+
+def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
+    """Find the image of each view: the file that has its name, without folder and ending.
+
+    Parameters
+    ----------
+    views : tuple of str
+    word : str
+        A folder or a pattern, see `image_paths.find_images`.
+
+    Raises
+    ------
+    InputError
+        No view has an image there.
+    FormatError
+        A folder that cannot be read or is empty.
+    """
+    paths = find_images([word])
+    found = dict(zip(view_names(paths), paths, strict=True))
+    images = {view: found[view] for view in views if view in found}
+    if not images:
+        raise InputError(
+            f"{word}: no image has the name of a view, such as {views[0] if views else 'none'!s}; give the "
+            "folder of the images that were calibrated from"
+        )
+    return images
+
+
+def thumbnails(images: Mapping[str, str], size: tuple[int, int] | None, most_bytes: int) -> dict[str, bytes]:
+    """Images as small JPEG files, of which all together take no more than so many bytes.
+
+    Parameters
+    ----------
+    images : dict of paths by name
+    size : (width, height) or None [px]
+        That all images must have.
+    most_bytes : int
+
+    Raises
+    ------
+    FormatError
+        An image that cannot be read, or of another size.
+    """
+    small: dict[str, NDArray[np.uint8]] = {}
+    for name, path in images.items():
+        image = read_image(path)
+        if size is not None and image.size != size:
+            raise FormatError(
+                f"has {image.size[0]} x {image.size[1]} px, but the camera {size[0]} x {size[1]}; give the "
+                "images that were calibrated from",
+                image.source,
+            )
+        small[name] = shrink(image.grey, _WIDEST)
+    width = _WIDEST
+    while True:
+        files = {name: encode_image(shrink(grey, width), ".jpg", 70) for name, grey in small.items()}
+        total = sum(map(len, files.values()))
+        if total <= most_bytes or width == _NARROWEST:
+            return files
+        # A picture of half the width takes a little more than a quarter of the bytes.
+        width = max(_NARROWEST, int(width * min(0.9, (most_bytes / total) ** 0.6)))

@@ -1,0 +1,157 @@
+"""The poses of views, as a block of a calibration file: an entry for each, or columns in a long file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.calibration import ViewResult
+from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
+from neurocal_cli.errors import FormatError
+from neurocal_cli.geometry import Array, euler_to_rotation, rotation_to_euler
+from neurocal_cli.io.text_columns import column_lines, read_columns
+from neurocal_cli.io.tree_fields import Field
+from neurocal_cli.io.yaml_text import flows, text
+
+__all__ = ["alike", "read_views", "view_lines"]
+
+_NAME = "name"
+
+# Angles give R back but for the last bits; more means an edit of one.
+_SAME = 1e-6
+
+
+def alike(views: Mapping[str, ViewResult]) -> bool:
+    """Whether the same is known of all views, so that they fit into columns."""
+    return len({frozenset(view.std) for view in views.values()}) <= 1
+
+
+def view_lines(views: Mapping[str, ViewResult], K: Array, long: bool) -> Iterator[str]:
+    """Lines of the block ``views``."""
+    if not views:
+        yield "views: []"
+        return
+    R, t = np.stack([v.pose.R for v in views.values()]), np.stack([v.pose.t for v in views.values()])
+    pose = np.hstack([rotation_to_euler(R), t])
+    error = np.array([view.rmse_px for view in views.values()], dtype=float)
+    yield "views:"
+    if long:
+        yield from (f"  {line}" for line in column_lines(_columns(views, pose, error, R)))
+        return
+    P = K @ np.concatenate([R, t[:, :, None]], axis=2)
+    estimates = _estimates(pose, [view.std for view in views.values()])
+    for (name, view), entries, matrix, rmse, rotation in zip(
+        views.items(), estimates, flows(P), flows(error), flows(R), strict=True
+    ):
+        yield f"  - name: {text(name)}"
+        yield f"    rotation: {{{', '.join(entries[:3])}}}"
+        yield f"    translation: {{{', '.join(entries[3:])}}}"
+        yield f"    projection_matrix: {matrix}"
+        yield f"    rmse_px: {rmse}"
+        yield f"    n_points: {view.n_points}"
+        yield f"    R: {rotation}"  # the angles give it back but for the last bit
+        if view.fixed:
+            yield "    fixed: true"
+
+
+def _columns(
+    views: Mapping[str, ViewResult], pose: Array, error: Array, R: Array
+) -> dict[str, NDArray[np.generic] | Sequence[str]]:
+    known = [name for name in POSE_NAMES if all(name in view.std for view in views.values())]
+    columns: dict[str, NDArray[np.generic] | Sequence[str]] = {_NAME: list(views)}
+    columns |= {name: pose[:, k] for k, name in enumerate(POSE_NAMES)}
+    columns |= {f"std_{name}": np.array([view.std[name] for view in views.values()]) for name in known}
+    columns["rmse_px"] = error
+    columns["n_points"] = np.array([view.n_points for view in views.values()], dtype=int)
+    columns["fixed"] = np.array([view.fixed for view in views.values()], dtype=int)
+    return columns | {f"R{row}{col}": R[:, row - 1, col - 1] for row in (1, 2, 3) for col in (1, 2, 3)}
+
+
+def _estimates(values: Array, stds: Sequence[Mapping[str, float]]) -> Iterator[list[str]]:
+    """Entries ``R_x: {value: ..., std: ...}`` of each view's pose; values (V, 6)."""
+    width = len(POSE_NAMES)
+    value = flows(values.ravel())
+    std = flows(np.array([[std.get(name, np.nan) for name in POSE_NAMES] for std in stds]).ravel())
+    for k, known in enumerate(stds):
+        row = zip(
+            POSE_NAMES, value[k * width : (k + 1) * width], std[k * width : (k + 1) * width], strict=True
+        )
+        yield [
+            f"{name}: {{value: {v}, std: {s}}}" if name in known else f"{name}: {{value: {v}}}"
+            for name, v, s in row
+        ]
+
+
+def read_views(field: Field) -> dict[str, ViewResult]:
+    """Read the block ``views``, in either form.
+
+    Raises
+    ------
+    FormatError
+        A key that is missing or wrong.
+    """
+    if isinstance(field.value, dict):
+        return _from_columns(field)
+    views: dict[str, ViewResult] = {}
+    for entry in field.items():
+        name = entry["name"].text()
+        if name in views:
+            entry["name"].fail("a name that no other view has")
+        views[name] = _view(entry)
+    return views
+
+
+def _from_columns(field: Field) -> dict[str, ViewResult]:
+    table = read_columns(field, frozenset((_NAME,)))
+    columns = {name: Field(values, field.source, f"{field.path}.{name}") for name, values in table.items()}
+    known = [name for name in POSE_NAMES if f"std_{name}" in columns]
+    wanted = [_NAME, *POSE_NAMES, "rmse_px", "n_points", "fixed"]
+    wanted += [f"R{row}{col}" for row in (1, 2, 3) for col in (1, 2, 3)]
+    for name in wanted:
+        field[name]  # which says what is missing
+    if len(set(table[_NAME])) < len(table[_NAME]):
+        field[_NAME].fail("names that differ")
+    pose = np.column_stack([columns[name].array(-1) for name in POSE_NAMES])
+    R = np.column_stack([columns[name].array(-1) for name in wanted[-9:]]).reshape(-1, 3, 3)
+    std = np.column_stack([columns[f"std_{name}"].array(-1, unknown=True) for name in known] or [pose[:, :0]])
+    if np.abs(R - np.stack([euler_to_rotation(*angles) for angles in pose[:, :3]])).max() > _SAME:
+        raise FormatError(
+            f"{field.path}: R11 to R33 and R_x, R_y, R_z disagree; correct those edited", field.source
+        )
+    return {
+        name: ViewResult(
+            pose=Pose(R[k], pose[k, 3:]),
+            std=dict(zip(known, std[k].tolist(), strict=True)),
+            n_points=Field(table["n_points"][k], field.source, f"{field.path}.n_points").integer(),
+            rmse_px=Field(table["rmse_px"][k], field.source, f"{field.path}.rmse_px").number_or_nan(),
+            fixed=bool(table["fixed"][k]),
+        )
+        for k, name in enumerate(table[_NAME])
+    }
+
+
+def _view(entry: Field) -> ViewResult:
+    values: list[float] = []
+    std: dict[str, float] = {}
+    for group, names in (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:])):
+        field = entry[group]
+        for name in names:
+            estimate = field[name]
+            values.append(estimate["value"].number())
+            if "std" in estimate.value:
+                std[name] = estimate["std"].number_or_nan()
+    R = euler_to_rotation(*values[:3])
+    if "R" in entry:
+        exact = entry["R"].array(3, 3)
+        if np.abs(exact - R).max() > _SAME:
+            raise FormatError(f"{entry.path}: R and rotation disagree; correct the one edited", entry.source)
+        R = exact
+    return ViewResult(
+        pose=Pose(R, np.array(values[3:])),
+        std=std,
+        n_points=entry["n_points"].integer() if "n_points" in entry else 0,
+        rmse_px=entry["rmse_px"].number_or_nan(),
+        fixed="fixed" in entry and entry["fixed"].boolean(),
+    )

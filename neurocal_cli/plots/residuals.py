@@ -1,0 +1,129 @@
+"""Panels of a camera's reprojection errors: where they are, how they scatter, by view, and while learning."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.plots.figure import ACCENT, INK, plain, say, style
+from neurocal_cli.plots.subject import Subject
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+__all__ = ["draw_learning", "draw_residuals", "draw_scatter", "draw_views", "set_image"]
+
+_MOST_ARROWS = 500  # more cannot be told apart
+_MANY_DOTS = 2000  # from here on they overlap, and an .svg of them grows large
+_MOST_BARS = 40  # views that still have room for their names
+_LONGEST_ARROW = 0.04  # of the image's width, for the length of a typical arrow
+_ZERO = 1e-16  # px, what a logarithmic axis shows for an error of 0
+
+
+def set_image(axes: Axes, subject: Subject) -> Array:
+    """The frame of the image, or of the points when its size is not known: left, right, top and bottom."""
+    left, right, top, bottom = frame = _frame(subject)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel="u [px]", ylabel="v [px]")
+    axes.spines[["top", "right"]].set_visible(True)
+    return frame
+
+
+def _frame(subject: Subject) -> Array:
+    if subject.image_size is not None:
+        width, height = subject.image_size
+        return np.array([-0.5, width - 0.5, -0.5, height - 0.5])
+    low, high = subject.points.pixels.min(axis=0), subject.points.pixels.max(axis=0)
+    margin = 0.05 * max(float((high - low).max()), 1.0)
+    return np.array([low[0] - margin, high[0] + margin, low[1] - margin, high[1] + margin])
+
+
+def _round_scale(scale: float) -> float:
+    """Round down to one of 1, 2, 5, 10, ..., so that the reader can divide by it."""
+    if not np.isfinite(scale) or scale <= 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(scale))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step <= scale / power * (1 + 1e-9)))
+
+
+def draw_residuals(axes: Axes, subject: Subject) -> None:
+    """Residuals of all views where they occur in the image, enlarged."""
+    evaluation = subject.evaluation
+    left, right, _, _ = _frame(subject)
+    seen = np.flatnonzero(np.isfinite(evaluation.residuals[:, 0]))
+    # A random choice: every n-th point of a grid of n columns would show one column.
+    shown = np.random.default_rng(0).permutation(seen)[:_MOST_ARROWS]
+    pixels, residuals = subject.points.pixels[shown], evaluation.residuals[shown]
+    spacing = np.sqrt(np.prod(np.ptp(pixels, axis=0)) / len(pixels)) if len(pixels) else 0.0
+    length = min(_LONGEST_ARROW * (right - left), max(1.5 * spacing, 0.015 * (right - left)))
+    scale = _round_scale(length / max(evaluation.rmse_px, 1e-300))
+    axes.quiver(
+        *pixels.T, *residuals.T, color=INK, angles="xy", scale_units="xy", scale=1 / scale, width=0.0025
+    )
+    axes.plot(subject.camera.intrinsics.u0, subject.camera.intrinsics.v0, "+", color=ACCENT, markersize=11)
+    some = "" if len(shown) == len(seen) else f", {len(shown)} of {len(seen)} points"
+    style(axes, f"Residuals, predicted minus observed,\nenlarged {scale:,.10g} times{some}")
+    set_image(axes, subject)
+    axes.set_xlabel("u [px]  (+ is the image centre)")
+
+
+def draw_scatter(axes: Axes, subject: Subject) -> None:
+    """Residuals about zero, with the circle of their rms."""
+    evaluation = subject.evaluation
+    seen = evaluation.residuals[np.isfinite(evaluation.residuals[:, 0])]
+    many = len(seen) > _MANY_DOTS
+    axes.scatter(
+        seen[:, 0], seen[:, 1], s=9, color=INK, alpha=0.15 if many else 0.5, linewidths=0, rasterized=many
+    )
+    angle = np.linspace(0, 2 * np.pi, 181)
+    circle = evaluation.rmse_px * np.array([np.cos(angle), np.sin(angle)])
+    axes.plot(*circle, color=ACCENT, linewidth=1.2, label=f"rms {evaluation.rmse_px:.4g} px")
+    axes.plot(evaluation.bias_u, evaluation.bias_v, "+", color=ACCENT, markersize=9, label="mean")
+    limit = 1.1 * max(evaluation.max_px, 1e-12) if np.isfinite(evaluation.max_px) else 1.0
+    style(axes, "Residuals of all points")
+    axes.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="du [px]", ylabel="dv [px]")
+    axes.legend(loc="upper right", frameon=False)
+
+
+def draw_views(axes: Axes, subject: Subject) -> None:
+    """Error of each view, in the order of the data."""
+    evaluation = subject.evaluation
+    errors = np.array([view.rmse_px for view in evaluation.views.values()])
+    if len(errors) <= _MOST_BARS:
+        axes.bar(np.arange(len(errors)), errors, color=INK, width=0.8 if len(errors) > 3 else 0.3)
+    else:
+        edges = np.arange(len(errors) + 1) - 0.5
+        axes.stairs(np.nan_to_num(errors), edges, fill=True, color=INK)
+    axes.axhline(evaluation.rmse_px, color=ACCENT, linewidth=1.2, label="all points")
+    style(axes, "Error of each view")
+    axes.set(xlabel="view", ylabel="rms [px]", xlim=(-0.6, len(errors) - 0.4))
+    if len(errors) <= _MOST_BARS:
+        names = [plain(name[-20:]) for name in evaluation.views]
+        axes.set_xticks(np.arange(len(errors)), names, rotation=90 if len(errors) > 6 else 0)
+    highest = np.nanmax(errors, initial=0.0)
+    axes.set_ylim(0, 1.25 * highest if highest > 0 else 1.0)  # room for the legend
+    axes.legend(loc="upper right", frameon=False)
+
+
+def draw_learning(axes: Axes, subject: Subject) -> None:
+    """Loss of the network along its training, and the error after the last steps."""
+    style(axes, "Learning curve of the best start")
+    calibration = subject.calibration
+    network = None if calibration is None else calibration.network
+    if calibration is None or network is None or not network.curve:
+        say(axes, "no training was recorded")
+        return
+    curve = np.maximum(np.array(network.curve), _ZERO)
+    marker = "o" if len(curve) <= 60 else ""
+    axes.semilogy(
+        np.arange(len(curve)), curve, marker=marker, markersize=3.5, color=INK, label="error of the network"
+    )
+    axes.axhline(
+        max(network.rmse_after, _ZERO),
+        color=ACCENT,
+        linewidth=1.2,
+        label=f"error after bundle adjustment, {network.rmse_after:.4g} px",
+    )
+    axes.set(xlabel="iteration" if calibration.trainer == "lm" else "checkpoint", ylabel="rms [px]")
+    axes.legend(loc="upper right", frameon=False)

@@ -1,0 +1,60 @@
+"""What the panels of a camera show: a calibration, or a camera with the points that it is judged by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+from neurocal_cli.calibration import Calibration, camera_of
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.evaluation import CameraEvaluation, evaluate_camera
+from neurocal_cli.points import Correspondences
+from neurocal_cli.verdict.assessment import gather_evidence
+from neurocal_cli.verdict.evidence import Evidence
+
+__all__ = ["Subject"]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A camera, the points of a picture and their errors.
+
+    Attributes
+    ----------
+    camera : Camera
+    points : Correspondences
+    evaluation : CameraEvaluation
+        Of these points.
+    calibration : Calibration or None
+        What the camera was calibrated from, where it is known.
+    """
+
+    camera: Camera
+    points: Correspondences
+    evaluation: CameraEvaluation
+    calibration: Calibration | None
+
+    @classmethod
+    def of(
+        cls,
+        camera: Calibration | Camera,
+        points: Correspondences | None = None,
+        evaluation: CameraEvaluation | None = None,
+    ) -> Subject:
+        """A camera with points that it was judged by; of a calibration its own by default."""
+        calibration = camera if isinstance(camera, Calibration) else None
+        if points is None:
+            points = Correspondences.none() if calibration is None else calibration.points
+        return cls(camera_of(camera), points, evaluation or evaluate_camera(camera, points), calibration)
+
+    @property
+    def image_size(self) -> tuple[int, int] | None:
+        """(width, height) [px], if known."""
+        return self.points.image_size or self.camera.image_size
+
+    @cached_property
+    def evidence(self) -> Evidence | None:
+        """What the points of the calibration tell of it; None without a calibration."""
+        if self.calibration is None or not len(self.calibration.points):
+            return None
+        return gather_evidence(self.calibration)

@@ -1,0 +1,145 @@
+"""Cameras that see more than a half-space, for pictures: a ray is a direction, not a slope.
+
+The angle t between a ray and the axis decides the radius in the image,
+
+    radius = focal * g(t),   g(t) = t + k1 t^3 + k2 t^5 + k3 t^7 + k4 t^9   (Kannala and Brandt 2006)
+
+or one of the classic laws: 2 sin(t / 2) keeps areas, 2 tan(t / 2) keeps shapes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = ["Law", "WideCamera", "WideRays"]
+
+Law = Literal["equidistant", "equisolid", "stereographic"]
+
+_STEPS = 12  # of Newton's method for the angle, from the table
+_TABLE = 512
+
+
+class WideRays(NamedTuple):
+    """Unit directions (x, y, z) of pixels, with derivatives by u and v; see `camera.projection.Rays`."""
+
+    u: Array
+    v: Array
+    x: Array
+    y: Array
+    z: Array
+    xu: Array
+    xv: Array
+    yu: Array
+    yv: Array
+    zu: Array
+    zv: Array
+
+
+@dataclass(frozen=True)
+class WideCamera:
+    """A camera with a fisheye lens.
+
+    Parameters
+    ----------
+    focal : float [px]
+    centre : (u, v) [px]
+    image_size : (width, height) [px]
+    k : tuple of up to four floats
+        Of the equidistant law only.
+    law : {"equidistant", "equisolid", "stereographic"}
+    widest : float [rad]
+        Angle from the axis beyond which the lens sees nothing.
+    """
+
+    focal: float
+    centre: tuple[float, float]
+    image_size: tuple[int, int]
+    k: tuple[float, ...] = ()
+    law: Law = "equidistant"
+    widest: float = np.pi
+
+    def __post_init__(self) -> None:
+        if not 0 < self.widest <= np.pi:
+            raise InputError("a lens sees to an angle between 0 and pi from its axis")
+        angles = np.linspace(0, self._widest, _TABLE)
+        if not (np.diff(self._law(angles)[0]) > 0).all():
+            raise InputError("the radius must grow with the angle; choose other coefficients")
+
+    @property
+    def radius(self) -> float:
+        """Of the image circle [px]."""
+        return self.focal * float(self._law(np.array(self._widest))[0])
+
+    def moved(self, du: float, dv: float) -> WideCamera:
+        """The camera with its centre moved [px]."""
+        return replace(self, centre=(self.centre[0] + du, self.centre[1] + dv))
+
+    def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Pixels (..., 2) of points (..., 3) in the camera's frame, and which of them are seen."""
+        across = np.hypot(points[..., 0], points[..., 1])
+        angle = np.arctan2(across, points[..., 2])
+        radius = self.focal * self._law(angle)[0]
+        share = np.where(across > 0, radius / np.where(across > 0, across, 1.0), 0.0)
+        return np.array(self.centre) + share[..., None] * points[..., :2], self.sees(points)
+
+    def sees(self, points: Array) -> NDArray[np.bool_]:
+        """Whether points (..., 3) are within the lens's field of view."""
+        across = np.hypot(points[..., 0], points[..., 1])
+        return np.asarray(np.arctan2(across, points[..., 2]) <= self._widest)
+
+    def rays(self, u: Array, v: Array, near: tuple[Array, Array] | None = None) -> WideRays:
+        """Directions of pixels with derivatives; nan outside the image circle. `near` is not needed."""
+        away_u, away_v = (np.asarray(x, dtype=float) - c for x, c in zip((u, v), self.centre, strict=True))
+        radius = np.maximum(np.hypot(away_u, away_v), 1e-9)
+        angle = self._angle(radius / self.focal)
+        slope = 1 / (self.focal * self._law(angle)[1])  # of the angle by the radius
+        cos_a, sin_a = away_u / radius, away_v / radius
+        sine, cosine = np.sin(angle), np.cos(angle)
+        along, around = cosine * slope, sine / radius
+        return WideRays(
+            u, v, sine * cos_a, sine * sin_a, cosine,
+            along * cos_a**2 + around * sin_a**2,
+            (along - around) * cos_a * sin_a,
+            (along - around) * cos_a * sin_a,
+            along * sin_a**2 + around * cos_a**2,
+            -sine * slope * cos_a,
+            -sine * slope * sin_a,
+        )  # fmt: skip
+
+    @property
+    def _widest(self) -> float:
+        return min(self.widest, np.pi - 1e-3) if self.law == "stereographic" else self.widest
+
+    def _law(self, angle: Array) -> tuple[Array, Array]:
+        """G and its derivative."""
+        if self.law == "equisolid":
+            return 2 * np.sin(0.5 * angle), np.maximum(np.cos(0.5 * angle), 1e-9)
+        if self.law == "stereographic":
+            tangent = np.tan(0.5 * np.minimum(angle, np.pi - 1e-3))
+            return 2 * tangent, 1 + tangent**2
+        square = angle**2
+        g, slope, power = np.ones_like(angle), np.ones_like(angle), np.ones_like(angle)
+        for n, k in enumerate(self.k, start=1):
+            power = power * square
+            g, slope = g + k * power, slope + (2 * n + 1) * k * power
+        return angle * g, slope
+
+    def _angle(self, radius: Array) -> Array:
+        """Angle of a radius in focal lengths, nan outside the image circle."""
+        table = np.linspace(0, self._widest, _TABLE)
+        radii = self._law(table)[0]
+        angle = np.interp(radius, radii, table)
+        for _ in range(_STEPS):
+            value, slope = self._law(angle)
+            step = (radius - value) / slope
+            angle = np.clip(angle + step, 0, self._widest)
+            if np.abs(step).max(initial=0.0) < 1e-13:
+                break
+        return np.where(radius <= radii[-1], angle, np.nan)

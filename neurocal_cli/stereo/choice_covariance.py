@@ -1,0 +1,103 @@
+"""What a rig and its cameras are uncertain by because their distortion models were chosen.
+
+As for a camera alone (`bundle_adjustment.open_coefficients`): coefficients that a model was chosen without
+are open unknowns of the common bundle adjustment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.open_coefficients import (
+    OpenCoefficients,
+    OpenPrior,
+    open_coefficients,
+    spread_of_open,
+)
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.schur_complement import eliminate
+from neurocal_cli.stereo.adjust import AdjustedRig
+from neurocal_cli.stereo.problem import RigProblem
+from neurocal_cli.stereo.reprojection import Columns, rig_normal_blocks
+
+__all__ = ["open_covariance"]
+
+
+def open_covariance(
+    problem: RigProblem,
+    calibrations: tuple[Calibration, Calibration],
+    adjusted: AdjustedRig,
+    free: NDArray[np.bool_],
+    variance: float,
+) -> Array | None:
+    """Covariance of the free shared unknowns that the choice of the models adds; None where it adds none.
+
+    Parameters
+    ----------
+    problem, calibrations, adjusted, free
+        As they were adjusted.
+    variance : float
+        Of the weighed residuals.
+    """
+    own = Columns.of(adjusted.state)
+    opened = [
+        _opened(calibration, adjusted, side, free[place])
+        for side, (calibration, place) in enumerate(zip(calibrations, (own.left, own.right), strict=True))
+    ]
+    if opened == [None, None]:
+        return None
+    cameras = [
+        camera if found is None else found.state(camera)
+        for camera, found in zip(adjusted.state.cameras, opened, strict=True)
+    ]
+    state = replace(adjusted.state, cameras=(cameras[0], cameras[1]))
+    columns = Columns.of(state)
+    parts = [
+        (free[place], np.zeros(int(free[place].sum()), dtype=bool))
+        if found is None
+        else (found.free, found.prior.is_open)
+        for found, place in zip(opened, (own.left, own.right), strict=True)
+    ]
+    parts.append((free[own.rig], np.zeros(int(free[own.rig].sum()), dtype=bool)))
+    all_free, is_open = (np.concatenate(part) for part in zip(*parts, strict=True))
+    normal, _ = rig_normal_blocks(problem.frames, problem.observations, state, columns)
+    kept = np.append(np.flatnonzero(all_free), columns.width - 1)
+    left, _ = eliminate(normal, kept, columns.pose)
+    whole = left.sum(axis=0)
+    E, follow = spread_of_open(whole[:-1, :-1], whole[:-1, -1], variance, _joined(is_open, opened))
+    follow = follow[~is_open]
+    added = follow @ E @ follow.T
+    return added if np.isfinite(added).all() else None
+
+
+def _opened(
+    calibration: Calibration, adjusted: AdjustedRig, side: int, free: NDArray[np.bool_]
+) -> OpenCoefficients | None:
+    """Of one camera; None too where the common bundle adjustment left it as it was."""
+    if not free.any():
+        return None
+    camera = adjusted.state.cameras[side]
+    return open_coefficients(
+        camera.model, camera.k, free, tuple(calibration.lens_choice), _radius(calibration)
+    )
+
+
+def _radius(calibration: Calibration) -> float:
+    """Radius of the farthest point in normalised image coordinates, before distortion."""
+    points = calibration.points
+    poses = [calibration.views[name].pose for name in points.view_names]
+    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
+    X, Y, Z = ((R[points.view_index] @ points.world[..., None])[..., 0] + t[points.view_index]).T
+    return float((np.hypot(X, Y) / Z).max())
+
+
+def _joined(is_open: NDArray[np.bool_], opened: list[OpenCoefficients | None]) -> OpenPrior:
+    """Both cameras' open coefficients, each with groups of its own."""
+    priors = [found.prior for found in opened if found is not None]
+    starts = np.cumsum([0, *(len(prior.size) for prior in priors)])
+    groups = [start + group for start, prior in zip(starts, priors, strict=False) for group in prior.groups]
+    return OpenPrior(is_open, np.concatenate([prior.size for prior in priors]), tuple(groups))

@@ -1,0 +1,175 @@
+"""Covariance of a calibrated camera and its poses: one place for all that reports or uses one.
+
+From the normal matrices, with the target's uncertainty where it was found (`uncertainty`), as far as views
+are independent (`view_covariance`), and with what the choice of the distortion model leaves open
+(`open_coefficients`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
+from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.open_coefficients import (
+    OpenCoefficients,
+    open_coefficients,
+    radius,
+    spread_of_open,
+    wide_covariance,
+)
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
+from neurocal_cli.bundle_adjustment.view_covariance import counting_views
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import solve_scaled
+from neurocal_cli.target import Target
+from neurocal_cli.target_shape.uncertainty import CovarianceBasis, covariance_basis
+
+__all__ = ["CameraCovariance", "CameraSeen", "WideCovariance", "camera_covariance"]
+
+
+@dataclass(frozen=True, eq=False)
+class CameraSeen:
+    """A camera at its minimum with the points that it saw.
+
+    Attributes
+    ----------
+    views : Views
+    state : CameraState
+    normal : (V, 12 + K, 12 + K) array
+        From `reprojection.normal_blocks`.
+    free : (5 + K,) bool array
+        Of A's entries and the distortion coefficients.
+    free_poses : bool
+    repeated : RepeatedPoses
+    world : (N, 3) array [world unit]
+        Where the points are, in their own order.
+    target : Target, optional
+        Where it was found.
+    choice : collection of str
+        Models that the distortion was chosen from; empty where it was named.
+    shared : (f, f) array, optional
+        Covariance of what is free, where it comes from elsewhere.
+    by_prior : float
+        How many of the coefficients a prior determines, not the points.
+    """
+
+    views: Views
+    state: CameraState
+    normal: Array
+    free: NDArray[np.bool_]
+    free_poses: bool
+    repeated: RepeatedPoses
+    world: Array
+    target: Target | None = None
+    choice: Collection[str] = ()
+    shared: Array | None = None
+    by_prior: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class WideCovariance:
+    """Of a camera with the coefficients that its distortion model was chosen without.
+
+    What is projected moves less than the covariance of the estimated ones alone has it: open coefficients and
+    the parameters that follow them make up for each other.
+
+    Attributes
+    ----------
+    open : OpenCoefficients
+    normal : (V, 12 + K, 12 + K) array
+        Of the camera with them.
+    entries : (f, f) array
+        Of all that is free, open ones included.
+    """
+
+    open: OpenCoefficients
+    normal: Array
+    entries: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCovariance:
+    """Covariance of a camera that was calibrated from points.
+
+    Attributes
+    ----------
+    basis : CovarianceBasis
+    plain : Covariance
+        Of the normal matrices.
+    found : Covariance
+        As far as views are independent, and with what the choice of the model leaves open.
+    wide : WideCovariance or None
+        Where the choice leaves anything open.
+    """
+
+    basis: CovarianceBasis
+    plain: Covariance
+    found: Covariance
+    wide: WideCovariance | None = None
+
+
+def camera_covariance(seen: CameraSeen) -> CameraCovariance:
+    """Covariance of a camera at its minimum.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Points that do not determine a camera whose target was found.
+    """
+    asked = seen.free, seen.free_poses
+    basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared)
+    plain = covariance(basis.normal, *asked, basis.n_equations + seen.by_prior, basis.shared)
+    if seen.shared is not None:
+        return CameraCovariance(basis, plain, plain)
+    found = counting_views(plain, basis.normal, *asked, basis.n_equations, seen.repeated, basis.moves_without)
+    known = CameraCovariance(basis, plain, found)
+    if not seen.choice or not np.isfinite(found.entries).all():
+        return known
+    reach = radius(seen.views, seen.state)
+    richer = open_coefficients(seen.state.model, seen.state.k, seen.free, seen.choice, reach)
+    return known if richer is None else _opened(seen, known, richer)
+
+
+def _opened(seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients) -> CameraCovariance:
+    state = richer.state(seen.state)
+    normal, _ = normal_blocks(seen.views.batches, state)
+    normal = _basis(seen, state, richer.free, normal).normal
+    q = reduced(normal, richer.free, seen.free_poses)
+    variance = _variance(seen, known.basis)
+    if not variance > 0:
+        return known
+    is_open = richer.prior.is_open
+    E, follow = spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
+    entries = wide_covariance(known.found.entries, E, follow, is_open)
+    if not np.isfinite(entries).all():
+        return known
+    poses = known.found.poses
+    if seen.free_poses:
+        columns = camera_columns(len(richer.free) - 5)[np.flatnonzero(richer.free)]
+        gain = solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, columns, POSE], 1, 2)) @ follow
+        poses = poses + gain @ E @ np.swapaxes(gain, 1, 2)
+    found = replace(known.found, entries=entries[np.ix_(~is_open, ~is_open)], poses=poses)
+    return replace(known, found=found, wide=WideCovariance(richer, normal, entries))
+
+
+def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
+    """Of the residuals, as if those were independent that are alike in neighbours or repeated poses."""
+    views = seen.views
+    unknowns = int(seen.free.sum()) + (6 * views.n_views if seen.free_poses else 0)
+    alike = correlation(views, point_residuals(views, seen.state))
+    worth = effective_number(views.n_equations, alike) / views.n_equations * seen.repeated.worth
+    return float(basis.normal[:, -1, -1].sum()) / max(basis.n_equations - unknowns, 1) / worth
+
+
+def _basis(
+    seen: CameraSeen, state: CameraState, free: NDArray[np.bool_], normal: Array, shared: Array | None = None
+) -> CovarianceBasis:
+    return covariance_basis(seen.target, seen.views, state, free, seen.free_poses, seen.world, normal, shared)

@@ -1,0 +1,138 @@
+"""Wide lenses of 60 to 220 degrees are calibrated from random weights, rays beyond 90 degrees included."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.wide_cameras import wide_camera, wide_points
+from support.wide_scenes import WideScene, wide_set
+
+from neurocal_cli import Calibration, calibrate
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.evaluation import evaluate_camera
+from neurocal_cli.stereo.triangulation import METHODS, triangulate
+
+# A rich lens has its own tests.
+every_wide_model = pytest.mark.parametrize("model", [name for name in WIDE if name != "rich"])
+# Times the error that is reached from the truth: an image that has to grow up to its corners costs a little.
+AT_THE_MINIMUM = 1.003
+
+
+def found(scene: WideScene, distortion: str = "", **given: object) -> Calibration:
+    distortion = distortion or scene.camera.distortion.model
+    return calibrate(scene.points, distortion=distortion, skew=False, target="given", **given)  # type: ignore[arg-type]
+
+
+@every_wide_model
+@pytest.mark.parametrize("field", [100.0, 185.0, 215.0])
+def test_the_minimum_is_found_without_a_guess(model: str, field: float) -> None:
+    scene = wide_set(int(field), model, field, n_views=8, sigma=0.1)
+    one = found(scene)
+    assert one.converged
+    assert not len(one.rejected)
+    assert one.rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
+
+
+def test_auto_takes_a_fisheye_for_one_and_says_so() -> None:
+    scene = wide_set(3, "fisheye", 190.0, n_views=10, sigma=0.1)
+    one = found(scene, "auto")
+    assert one.distortion_model == "fisheye"
+    assert one.rmse_px <= 1.01 * scene.least_rmse()
+    assert one.verdict is not None
+    assert one.verdict.word == "good"
+
+
+def test_given_intrinsics_and_poses_beyond_90_degrees() -> None:
+    scene = wide_set(7, "eucm", 205.0, n_views=8, sigma=0.1)
+    angles = np.concatenate([
+        np.arccos((p := scene.poses[name].to_camera(scene.points.world[scene.points.view_index == k]))[:, 2]
+                  / np.linalg.norm(p, axis=1))
+        for k, name in enumerate(scene.points.view_names)
+    ])  # fmt: skip
+    assert angles.max() > np.pi / 2
+    third = calibrate(scene.points, 3, intrinsics=scene.camera, target="given")
+    fourth = found(scene, type=4, extrinsics=scene.poses)
+    for one in (third, fourth):
+        assert one.rmse_px < 1.05 * scene.sigma * np.sqrt(2)
+    assert evaluate_camera(third, scene.points).n_behind == 0
+
+
+def test_given_poses_with_points_behind_need_a_wide_lens() -> None:
+    scene = wide_set(7, "eucm", 205.0, n_views=8, sigma=0.1)
+    with pytest.raises(DegenerateGeometryError, match="--distortion fisheye"):
+        found(scene, "k1", type=4, extrinsics=scene.poses)
+
+
+@pytest.mark.parametrize(
+    ("model", "distortion", "field"),
+    [("eucm", "eucm", 190), pytest.param("fisheye", "auto", 200, marks=pytest.mark.slow)],
+)
+def test_wrong_points_are_found_and_no_view_is_lost(model: str, distortion: str, field: float) -> None:
+    scene = wide_set(15, model, field, n_views=10, sigma=0.1)
+    rng = np.random.default_rng(0)
+    wrong = rng.random(len(scene.points)) < 0.05
+    pixels = scene.points.pixels + wrong[:, None] * rng.normal(size=(len(wrong), 2)) * 40
+    one = found(replace(scene, points=replace(scene.points, pixels=pixels)), distortion)
+    assert not one.rejected.views
+    assert abs(one.n_rejected - wrong.sum()) <= 0.1 * wrong.sum() + 2
+    assert one.rmse_px <= 1.02 * scene.least_rmse(scene.points.select(~wrong))
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_points_beside_the_cameras_are_triangulated(method: str) -> None:
+    left, right = wide_camera("fisheye"), wide_camera("double_sphere")
+    rig = Pose.from_euler(0.02, -0.05, 0.01, np.array([-0.1, 0.002, 0.003]))
+    points = wide_points(200, farthest=94.0)
+    sides = left.project(points)[0], right.project(rig.to_camera(points))[0]
+    seen = np.isfinite(sides[0] + sides[1]).all(axis=1)
+    assert (points[seen, 2] < 0).any()
+    result = triangulate(left, right, rig, sides[0][seen], sides[1][seen], method=method)
+    np.testing.assert_allclose(result.points, points[seen], rtol=1e-6, atol=1e-8)
+    assert not result.behind.any()
+
+
+def test_the_covariance_of_triangulated_points_is_that_of_slopes_where_both_can_tell() -> None:
+    left, right = wide_camera("fisheye"), wide_camera("eucm")
+    rig = Pose.from_euler(0.02, -0.05, 0.01, np.array([-0.1, 0.002, 0.003]))
+    points = wide_points(200, farthest=70.0)
+    rng = np.random.default_rng(1)
+    sides = [s + 0.2 * rng.normal(size=s.shape) for s in (
+        left.project(points)[0], right.project(rig.to_camera(points))[0])]  # fmt: skip
+    slopes = triangulate(left, right, rig, *sides)
+    # One point beside the camera, and rays are used for all of them.
+    beside = np.array([[3.0, 0.5, -0.1]])
+    more = [np.vstack([s, c.project(p)[0]]) for s, c, p in zip(
+        sides, (left, right), (beside, rig.to_camera(beside)), strict=True)]  # fmt: skip
+    rays = triangulate(left, right, rig, *more)
+    assert slopes.covariance is not None
+    assert rays.covariance is not None
+    np.testing.assert_allclose(rays.points[:-1], slopes.points, rtol=1e-8)
+    np.testing.assert_allclose(rays.covariance[:-1], slopes.covariance, rtol=1e-5)
+
+
+def errors_over_std(model: str, seeds: range) -> Iterator[list[float]]:
+    for seed in seeds:
+        scene = wide_set(seed, model)
+        one = found(scene)
+        assert one.rmse_px <= AT_THE_MINIMUM * scene.least_rmse(), seed
+        truth = scene.camera.intrinsics
+        yield [
+            (getattr(one.intrinsics, name) - getattr(truth, name)) / one.std[name]
+            for name in ("alpha_u", "alpha_v", "u0", "v0")
+        ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("part", range(5))
+@every_wide_model
+def test_a_thousand_wide_cameras_all_reach_the_minimum(model: str, part: int) -> None:
+    z = np.array(list(errors_over_std(model, range(50 * part, 50 * part + 50))))
+    rms = np.sqrt((z**2).mean(axis=0))
+    # alpha by itself is no parameter that the points tell beside xi.
+    told = rms if model in ("fisheye", "eucm") else rms[2:]
+    assert (np.abs(told - 1) < 3 / np.sqrt(2 * len(z))).all(), rms
