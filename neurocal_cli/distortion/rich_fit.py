@@ -44,6 +44,7 @@ _START = np.array([1.0, 10.0, 1.0, 10.0])  # sizes, in rms residuals
 _LARGEST, _SMALLEST = 1e3, 1e-4  # sizes, likewise
 _HELD = 1e-2  # size of what is held out, likewise
 _TINY, _SAME = 1e-300, 1e-6
+_NO_GAIN = 0.02  # of the logarithm of the evidence
 _LEAST_GAMMA, _LONGEST = 1e-6, 1.0  # of a step, in logarithms of the sizes
 _ROUNDS, _PASSES = 4, 60
 _SETTLED, _NEARLY = 0.02, 0.1  # relative changes of the sizes, within a round and between rounds
@@ -183,10 +184,12 @@ def _sizes(
         determined = float(gamma.sum())
         last, variance = variance, (cost - 2 * g @ step + step @ S @ step) / max(spare - determined, 1)
         # MacKay's step, longer for parts of which the data determine little, where it would be too short.
-        change = np.log([after @ K @ after for K in parts] / gamma / sizes**2) * (1 - 0.5 * gamma / free)
-        change = np.clip(change, -_LONGEST, _LONGEST) if learn else np.zeros(len(parts))
+        wanted = np.log([after @ K @ after for K in parts] / gamma / sizes**2)
+        change = np.clip(wanted * (1 - 0.5 * gamma / free), -_LONGEST, _LONGEST) * learn
         new = np.clip(sizes * np.exp(change), _SMALLEST * scale, _LARGEST * scale)
-        settled = max(np.abs(np.log(new / sizes)).max(), abs(np.log(variance / last))) < _SETTLED
+        change = np.abs(np.log(new / sizes))
+        gain = float((gamma * np.abs(np.expm1(wanted)) * change).sum())  # of the evidence's logarithm
+        settled = (change.max() < _SETTLED or gain < _NO_GAIN) and abs(np.log(variance / last)) < _SETTLED
         sizes = new
         if settled:
             break
@@ -206,9 +209,9 @@ def _parts() -> list[Array]:
     field = np.concatenate([np.kron(one, third), np.kron(third, one), np.sqrt(3) * mixed])
     bending, squares = np.kron(np.eye(2), field.T @ field), np.eye(2 * GRID * GRID)
     parts = []
-    for first, block in ((0, profile.T @ profile), (0, np.eye(RADII)), (RADII, bending), (RADII, squares)):
+    for at, block in ((0, profile.T @ profile), (0, np.eye(RADII)), (RADII, bending), (RADII, squares)):
         whole = np.zeros((_N, _N))
-        whole[first : first + len(block), first : first + len(block)] = block
+        whole[at : at + len(block), at : at + len(block)] = block
         parts.append(whole)
     return parts
 

@@ -7,16 +7,22 @@ import numpy as np
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.camera.rich_lens import GRID, RADII
+from neurocal_cli.camera.rich_lens import GRID, NODES, RADII
 from neurocal_cli.geometry import Array
 
 SIZE = (1000, 800)
+# Of a rich lens, without a field: its axis is seen at the principal point.
+_PROFILE = [*np.random.default_rng(0).normal(0, 2e-3, RADII), *np.zeros(len(NODES) - RADII)]
 # The scale, which xi enters, and the coefficients; all show 95 degrees within 500 px.
 WIDE_LENSES: dict[str, tuple[float, list[float]]] = {
     "fisheye": (293.0, [0.02, -0.01, 0.004, -0.001]),
     "omnidir": (530.0, [1.2, -0.02, 0.01, 1e-3, -5e-4]),
     "double_sphere": (250.0, [-0.1, 0.58]),
     "eucm": (280.0, [0.62, 1.1]),
+    "rich": (
+        293.0,
+        [0.02, -0.01, 0.004, -0.001, 1.2, 1.2, 1.2, *_PROFILE],
+    ),
 }
 
 
