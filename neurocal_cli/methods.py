@@ -83,7 +83,7 @@ def calibrate(
         The network; or one of the methods that the paper compares it with (`baselines`). These use all
         points, outliers included, and have no random starts.
     trainer : {"lm", "backprop"}
-    distortion : {"auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "plumb-line"}
+    distortion : {"auto", "plumb-line"} or one of `camera.distortion.MODELS`
         The distortion model whose coefficients are estimated with everything else; auto: the simplest that
         the points support (`lens_choice`), with another method none, with tsai k1; plumb-line, the paper's
         way: k1, k2, p1 and p2 from the images of straight lines alone, then the pinhole camera. Type 3 takes
@@ -193,8 +193,8 @@ def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics
 
 def _distortion_of(method: str, distortion: str) -> str:
     """The distortion model of a method other than the network's."""
-    if distortion == "plumb-line":
-        raise UsageError(f"distortion plumb-line needs the method neuro, but the method is {method}")
+    if distortion in ("plumb-line", "rich"):
+        raise UsageError(f"distortion {distortion} needs the method neuro, but the method is {method}")
     if distortion == "auto":
         return "k1" if method == "tsai" else "none"
     return distortion

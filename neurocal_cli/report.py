@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, Verdict, ViewResult
+from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.evaluation import CameraEvaluation
@@ -251,7 +252,10 @@ def parameter_rows(calibration: Calibration) -> list[list[str]]:
     for name, value in zip(
         coefficient_names(calibration.distortion_model), calibration.distortion, strict=True
     ):
-        rows.append(_parameter_row(name, "", value, calibration.std[name], name in calibration.fixed))
+        if name not in rich_lens.NAMES:
+            rows.append(_parameter_row(name, "", value, calibration.std[name], name in calibration.fixed))
+    if calibration.distortion_model == "rich":
+        rows.append(_displacement_row(calibration))
     if len(calibration.views) == 1:
         (view,) = calibration.views.values()
         values = [*view.pose.euler, *view.pose.t]
@@ -259,6 +263,16 @@ def parameter_rows(calibration: Calibration) -> list[list[str]]:
             unit = "rad" if name.startswith("R") else calibration.unit
             rows.append(_parameter_row(name, printable(unit), float(value), view.std[name], view.fixed))
     return rows
+
+
+def _displacement_row(calibration: Calibration) -> list[str]:
+    """A rich lens's nodes in one line: how far they move the points that were seen, at most [px]."""
+    rays = calibration.camera.unproject(calibration.points.pixels)
+    k = calibration.distortion[-len(rich_lens.NAMES) :]
+    X, Y, Z = rays[np.isfinite(rays[:, 0])].T
+    d = rich_lens.displacement(k, X, Y, Z, by_coefficients=False)
+    moved = np.hypot(calibration.intrinsics.alpha_u * d.x, calibration.intrinsics.alpha_v * d.y)
+    return ["displacement [px]", f"up to {moved.max(initial=0.0):.2g}", f"{len(rich_lens.NODES)} nodes", ""]
 
 
 def _parameter_row(name: str, unit: str, value: float, std: float, given: bool) -> list[str]:

@@ -66,7 +66,7 @@ def test_undistort_inverts_distort(model: str, points: tuple[np.ndarray, ...]) -
 
 
 @pytest.mark.parametrize(
-    "model", [name for name in MODELS if name not in ("none", "omnidir", "double_sphere", "eucm")]
+    "model", [name for name in MODELS if name not in ("none", "omnidir", "double_sphere", "eucm", "rich")]
 )
 def test_opencv_bends_the_same_way(model: str, points: tuple[np.ndarray, ...]) -> None:
     cv2 = pytest.importorskip("cv2")

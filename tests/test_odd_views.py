@@ -39,7 +39,7 @@ def test_a_view_whose_sigma_is_too_small_is_named_and_kept() -> None:
     found = calibrate(with_sigma(np.where(ONE[:, 0], 0.02, 0.2)))
     assert found.n_rejected == 0
     assert found.verdict is not None
-    assert found.verdict.reasons == ("view03: the stated sigma is 11 times too small",)
+    assert found.verdict.reasons[0] == "view03: the stated sigma is 11 times too small"
 
 
 def test_points_whose_sigma_is_too_small_are_no_outliers() -> None:

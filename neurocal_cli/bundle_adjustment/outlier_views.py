@@ -49,7 +49,7 @@ def find_outlier_view(solution: Solution) -> str | None:
     V = views.n_views
     if V < _FEWEST or problem.type == 3 or not problem.free_poses:
         return None
-    quadratics = reduced(adjusted.normal, problem.free_camera, problem.free_poses)
+    quadratics = reduced(adjusted.normal, problem.free_of_prior, problem.free_poses)
     spare = views.n_equations - problem.n_parameters
     if _largest_move(quadratics, float(adjusted.cost.sum()) / max(spare, 1)) < _MOVES:
         return None
@@ -64,8 +64,10 @@ def find_outlier_view(solution: Solution) -> str | None:
     if not contradiction[view] > _OUTLIER:
         return None
     rest = np.delete(np.arange(V), view)
-    others = adjust(views.subset(rest).batches, _of(adjusted.state, rest), problem.free_camera, True, _STEPS)
-    left = reduced(others.normal, problem.free_camera, True)
+    others = adjust(
+        views.subset(rest).batches, _of(adjusted.state, rest), problem.free_of_prior, True, _STEPS
+    )
+    left = reduced(others.normal, problem.free_of_prior, True)
     among = float(median(_contradictions(left, own[rest], conditions[rest]))) / variance
     return views.names[view] if contradiction[view] > _OUTLIER * max(among, 1.0) else None
 

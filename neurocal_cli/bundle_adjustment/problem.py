@@ -19,6 +19,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.projection import image_points, undistorted_pixels
+from neurocal_cli.camera.rich_lens import FIRST_NODE
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array, rotation_to_axis
 from neurocal_cli.points import Correspondences
@@ -56,7 +57,8 @@ class Problem:
     free_distortion : bool
         Whether the other coefficients are estimated.
     restraint : callable, optional
-        What the distortion has to obey beside the points.
+        What the distortion has to obey beside the points: a condition of these points, or a rich lens's
+        prior, which goes for other points too.
     turned : (V, 3, 3) array, optional
         With a given wide lens taken off, the pinhole of each view looks at its target: rotations from the
         camera's frame to that pinhole's. Until `with_seen_pixels`.
@@ -85,14 +87,22 @@ class Problem:
         return np.concatenate([self.free, np.array(coefficients, dtype=bool)])
 
     @property
+    def free_of_prior(self) -> NDArray[np.bool_]:
+        """The same without a rich lens's nodes, which a prior holds where points do not."""
+        free = self.free_camera
+        if self.distortion.model == "rich":
+            free[5 + FIRST_NODE :] = False
+        return free
+
+    @property
     def free_poses(self) -> bool:
         """Whether the poses are estimated."""
         return self.poses is None
 
     @property
     def n_parameters(self) -> int:
-        """Number of unknowns."""
-        return int(self.free_camera.sum()) + (6 * self.views.n_views if self.free_poses else 0)
+        """Number of unknowns that the points alone have to determine."""
+        return int(self.free_of_prior.sum()) + (6 * self.views.n_views if self.free_poses else 0)
 
     @property
     def given_centre(self) -> Array | None:
@@ -126,7 +136,8 @@ class Problem:
             views, turned = arrange(points), None
         else:
             views, turned = _undistorted_views(points, self.distortion, self.entries)
-        return replace(self, points=points, views=views, turned=turned, restraint=None)
+        restraint = self.restraint if self.distortion.model == "rich" else None
+        return replace(self, points=points, views=views, turned=turned, restraint=restraint)
 
     def with_model(self, model: str) -> Problem:
         """The same points with another distortion model to be estimated."""

@@ -77,6 +77,8 @@ class Solution:
     shared : (n, n) array, optional
         Covariance of A's free entries and the free distortion coefficients, where it is not that of the
         normal matrix.
+    by_prior : float
+        How many of the estimated coefficients a prior determines, not the points.
     common_noise : float
         Share of the noise that is the same for all points; see `common_noise`.
     model_errors : dict of float by distortion model [px], optional
@@ -93,6 +95,7 @@ class Solution:
     adjusted: Adjusted
     record: TrainingRecord
     shared: Array | None = None
+    by_prior: float = 0.0
     common_noise: float = 0.0
     model_errors: Mapping[str, float] | None = None
     straight_lines: StraightLines | None = None

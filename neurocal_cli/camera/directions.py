@@ -11,9 +11,10 @@ through A. With rho = hypot(X, Y), d = |(X, Y, Z)| and theta = atan2(rho, Z):
                                                                   (Usenko, Demmel and Cremers 2018)
     eucm           (x', y') = (X, Y) / (alpha hypot(sqrt(beta) rho, Z) + (1 - alpha) Z)
                                                                   (Khomutenko, Garcia and Martinet 2016)
+    rich           (x', y') = the fisheye's, and a smooth displacement: `rich_lens`
 
-The last three are (X, Y) / w. The image grows with theta where w > 0 and dw/dZ > 0, because w is homogeneous
-of degree one. What a model shows beyond that is no image.
+omnidir's before its polynomial, double_sphere's and eucm's are (X, Y) / w. The image grows with theta where
+w > 0 and dw/dZ > 0, because w is homogeneous of degree one. What a model shows beyond that is no image.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.polynomial import Coefficients, distorted_with_jacobian
 from neurocal_cli.geometry import Array
 
@@ -33,6 +35,7 @@ WIDE = {
     "omnidir": ("xi", "k1", "k2", "p1", "p2"),
     "double_sphere": ("xi", "alpha"),
     "eucm": ("alpha", "beta"),
+    "rich": ("k1", "k2", "k3", "k4", *rich_lens.NAMES),
 }
 # Their first coefficient is xi, and the scale in the middle of the image is alpha_u / (1 + xi).
 WITH_XI = ("omnidir", "double_sphere")
@@ -63,7 +66,9 @@ class Direction(NamedTuple):
     seen: NDArray[np.bool_]
 
 
-def project_directions(model: str, k: Coefficients, X: Array, Y: Array, Z: Array) -> Direction:
+def project_directions(
+    model: str, k: Coefficients, X: Array, Y: Array, Z: Array, by_coefficients: bool = True
+) -> Direction:
     """Project directions with a wide lens, with derivatives.
 
     Parameters
@@ -74,12 +79,17 @@ def project_directions(model: str, k: Coefficients, X: Array, Y: Array, Z: Array
         Each a number or an array that broadcasts against X.
     X, Y, Z : arrays of one shape
         In any unit; the direction alone counts.
+    by_coefficients : bool
+        Whether the derivatives by the coefficients are wanted; a rich lens has hundreds, and leaves them out.
+        Its coefficients are numbers, the same for all points.
     """
     q = X * X + Y * Y
     if model == "fisheye":
         return _fisheye(k, X, Y, Z, q)
     if model == "omnidir":
         return _omnidir(k, X, Y, Z, q)
+    if model == "rich":
+        return _rich(k, X, Y, Z, q, by_coefficients)
     sphere = _double_sphere if model == "double_sphere" else _eucm
     return _by_divisor(X, Y, *sphere(k, q, Z))
 
@@ -159,4 +169,22 @@ def _omnidir(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array) -> Directi
     return Direction(
         x, y, (by[0][0], by[1][0], by[2][0]), (by[0][1], by[1][1], by[2][1]),
         [after(*m.by_coefficient[0]), *by_k], seen,
+    )  # fmt: skip
+
+
+def _rich(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array, by_coefficients: bool) -> Direction:
+    m = _fisheye(k[:4], X, Y, Z, q)
+    more = rich_lens.displacement(np.asarray(k[4:]), X, Y, Z, by_coefficients)
+    by_x, by_y = (
+        (a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in ((m.by_x, more.by_x), (m.by_y, more.by_y))
+    )
+    # The image grows where it is nowhere folded: the two derivatives across the ray turn the same way.
+    cross = (
+        X * (by_x[1] * by_y[2] - by_x[2] * by_y[1])
+        + Y * (by_x[2] * by_y[0] - by_x[0] * by_y[2])
+        + Z * (by_x[0] * by_y[1] - by_x[1] * by_y[0])
+    )
+    return Direction(
+        m.x + more.x, m.y + more.y, by_x, by_y, [*m.by_coefficient, *more.by_coefficient],
+        m.seen & np.asarray(cross > 0),
     )  # fmt: skip

@@ -46,6 +46,7 @@ _PINHOLES = {
     "omnidir": (0.1, 0.0, 0.0, 0.0, 0.0),
     "double_sphere": (0.0, 0.1),
     "eucm": (0.1, 1.0),
+    "rich": (1 / 3, 2 / 15, 17 / 315, 62 / 2835, 1.0, 1.0, 1.0, *np.zeros(len(WIDE["rich"]) - 7)),
 }
 
 
@@ -125,7 +126,7 @@ def distort(model: str, k: Coefficients, x: Array, y: Array) -> tuple[Array, Arr
     x', y' : arrays of that shape
     """
     if model in WIDE:
-        seen = project_directions(model, k, x, y, np.ones_like(x))
+        seen = project_directions(model, k, x, y, np.ones_like(x), by_coefficients=False)
         return seen.x, seen.y
     return distorted(k, x, y)
 

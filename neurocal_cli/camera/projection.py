@@ -101,7 +101,7 @@ def project_points(
     """
     if model in WIDE:
         a, s, b, u0, v0 = entries
-        x, y, _, _, _, seen = project_directions(model, k, X, Y, Z)
+        x, y, _, _, _, seen = project_directions(model, k, X, Y, Z, by_coefficients=False)
         return a * x + s * y + u0, b * y + v0, seen
     q = 1.0 / Z
     u, v = image_points(entries, model, k, X * q, Y * q)
@@ -167,7 +167,8 @@ def _project_wide(
     by_entries: Array, by_point: Array, by_coefficient: Array,
 ) -> tuple[Array, Array, NDArray[np.bool_]]:  # fmt: skip
     a, s, b, u0, v0 = entries
-    image = project_directions(model, k, *points)
+    X, Y, Z = points
+    image = project_directions(model, k, X, Y, Z)
     by_entries[..., 0, 0, :], by_entries[..., 1, 0, :], by_entries[..., 2, 1, :] = image.x, image.y, image.y
     by_entries[..., 3, 0, :] = by_entries[..., 4, 1, :] = 1.0
     _through_matrix(entries, list(zip(image.by_x, image.by_y, strict=True)), by_point)

@@ -18,7 +18,7 @@ _NEWTON_STEPS = 30
 _STEP = 1e-9  # rad; the next step, its square, is rounding
 _ACCURACY = 1e-11  # of the point projected again: more is no inverse
 _HALVINGS = 40
-_SMALLEST = 1e-100  # coefficient; what is less overflows, and has no root near any image
+_SMALLEST = 1e-30  # coefficient; what is less overflows, and has no root near any image
 _REAL = 1e-6  # imaginary part of a double root, over its real part, that rounding makes
 
 
@@ -27,8 +27,8 @@ def largest_angle(distortion: Distortion) -> float:
 
     Tangential terms, small within any image, are left out.
     """
-    if distortion.model == "fisheye":
-        slope = np.array([1.0, *(distortion.coefficients * [3, 5, 7, 9])])
+    if distortion.model in ("fisheye", "rich"):  # whose displacement is small
+        slope = np.array([1.0, *(distortion.coefficients[:4] * [3, 5, 7, 9])])
         return float(min(np.sqrt(first_root(slope)), np.pi))
     theta = np.linspace(0.0, np.pi, _TABLE)
     seen = _along_radius(distortion, theta)[1]
@@ -50,14 +50,15 @@ def first_root(coefficients: Array) -> float:
 
 
 def _along_radius(distortion: Distortion, theta: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Distorted radii of angles, without tangential terms, and whether the image grows there."""
+    """Distorted radii of angles, without tangential terms or a field, and whether the image grows there."""
     names = coefficient_names(distortion.model)
     k = [
-        0.0 if name in ("p1", "p2") else value
+        0.0 if name in ("p1", "p2") or name[0] == "f" else value
         for name, value in zip(names, distortion.coefficients, strict=True)
     ]
     with np.errstate(all="ignore"):
-        out = project_directions(distortion.model, k, np.sin(theta), np.zeros_like(theta), np.cos(theta))
+        ray = np.sin(theta), np.zeros_like(theta), np.cos(theta)
+        out = project_directions(distortion.model, k, *ray, by_coefficients=False)
     return out.x, out.seen
 
 
@@ -89,11 +90,11 @@ def unproject_directions(distortion: Distortion, x: Array, y: Array) -> tuple[Ar
         share = np.where(radius > 0, np.sin(theta) / radius, 0.0)
         X, Y, Z = x * share, y * share, np.cos(theta)
         for _ in range(_NEWTON_STEPS):
-            seen = project_directions(distortion.model, k, X, Y, Z)
+            seen = project_directions(distortion.model, k, X, Y, Z, by_coefficients=False)
             X, Y, Z, step = _moved((X, Y, Z), seen.by_x, seen.by_y, x - seen.x, y - seen.y)
             if not np.fmax.reduce(step, axis=None, initial=0.0) > _STEP:
                 break
-        seen = project_directions(distortion.model, k, X, Y, Z)
+        seen = project_directions(distortion.model, k, X, Y, Z, by_coefficients=False)
         good = np.hypot(seen.x - x, seen.y - y) < _ACCURACY * (1 + radius)
         good &= seen.seen & (np.cos(limit) < Z)
     return np.where(good, X, np.nan), np.where(good, Y, np.nan), np.where(good, Z, np.nan)

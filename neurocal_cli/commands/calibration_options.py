@@ -305,14 +305,16 @@ _OPTIONS = [
                 "omnidir",
                 "double_sphere",
                 "eucm",
+                "rich",
                 "plumb-line",
             ]
         ),
         default="auto",
         help="Distortion model, with coefficients as in OpenCV; none is a pinhole camera. fisheye, omnidir, "
         "double_sphere and eucm are for wide lenses, also beyond 180 degrees. auto compares the "
-        "models by cross-validation and chooses the simplest one whose error is as low as any. plumb-line "
-        "estimates k1, k2, p1 and p2 from the straight lines of the target alone.",
+        "models by cross-validation and chooses the simplest one whose error is as low as any. rich is a "
+        "fisheye with a smooth displacement of the image, for lenses that no other model describes. "
+        "plumb-line estimates k1, k2, p1 and p2 from the straight lines of the target alone.",
     ),
     click.option(
         "--no-skew",

@@ -63,7 +63,7 @@ def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
     if name not in ("plumb_bob", "rational_polynomial"):
         raise InputError(
             f"distortion model {name[:40]!r} is unknown; use plumb_bob, rational_polynomial, "
-            "equidistant, omnidir, double_sphere, eucm"
+            "equidistant, omnidir, double_sphere, eucm, rich"
         )
     if values[8:].any() or len(values) not in (4, 5, 8, 12, 14):
         raise InputError(f"distortion has 4, 5 or 8 coefficients k1,k2,p1,p2,k3,..,k6, found {len(values)}")

@@ -19,6 +19,7 @@ from neurocal_cli.distortion.candidate_models import fit_candidates, supported
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
+from neurocal_cli.distortion.rich_fit import with_displacement
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
@@ -48,6 +49,8 @@ def fit(problem: Problem, options: Options) -> Solution:
     """
     if options.distortion == "plumb-line":
         return _plumb_line_first(problem, options)
+    if problem.free_distortion and problem.distortion.model == "rich":
+        return with_displacement(fit(problem.with_model("fisheye"), options))
     check_points(problem)
     solution = _first_solution(problem, options)
     if options.distortion != "auto":
@@ -82,6 +85,8 @@ def fit_again(
         problem.adjust(replace(solution.adjusted, state=start)),
         replace(record, agreed=record.agreed[place]),
     )
+    if problem.restraint is not None:  # a rich lens's prior
+        return with_displacement(again)
     return _finished(again, options, only_from_here)
 
 

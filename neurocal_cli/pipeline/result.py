@@ -45,6 +45,7 @@ def calibration_of(
         CameraSeen(
             views, state, adjusted.normal, problem.free_camera, problem.free_poses, repeated,
             problem.points, solution.target, tuple(solution.model_errors or ()), solution.shared,
+            solution.by_prior,
         )
     )  # fmt: skip
     refuse_undetermined(problem, state, known.plain)
@@ -152,7 +153,7 @@ def _network_record(solution: Solution, rmse: float) -> NetworkRecord:
 
 def _corner_warning(problem: Problem) -> tuple[str, ...]:
     """Where no point is, a distortion is anyone's guess."""
-    if problem.restraint is None:
+    if problem.restraint is None or problem.distortion.model == "rich":
         return ()
     return (
         f"the distortion model {problem.distortion.model} that fits the points best is not monotonic (maps "

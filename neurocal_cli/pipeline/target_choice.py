@@ -54,7 +54,8 @@ def with_target(
     solution, rejected
         The ones given where the target stays as it is.
     """
-    if choice == "given" or solution.refusal or options.distortion == "plumb-line":
+    rich = solution.state.model == "rich"  # it bends as a target does
+    if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected
     found = _found(solution, choice, None)
     if found is None or (choice == "auto" and _other_reason(solution, found)):

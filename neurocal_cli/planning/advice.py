@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
@@ -129,7 +130,7 @@ def _state(calibration: Calibration) -> tuple[Array, Array, NDArray[np.bool_], f
     if camera.image_size is None:
         raise InputError("the size of the images is unknown; calibrate with --image-size W H")
     names = (*_ORDER, *coefficient_names(calibration.distortion_model))
-    free = np.array([name not in calibration.fixed for name in names])
+    free = np.array([name not in calibration.fixed and name not in NODES for name in names])
     if not camera.intrinsics.skewed:
         free[1] = False
     if not free.any():

@@ -14,6 +14,7 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.pairing import ViewPairs
@@ -93,12 +94,12 @@ class RigProblem:
 def free_parameters(calibration: Calibration) -> NDArray[np.bool_]:
     """(5 + K,) which of A's entries and the distortion coefficients are free.
 
-    Given parameters are not. With a distortion from straight lines none is, as camera and distortion
-    belong together.
+    Given parameters are not, nor a rich lens's nodes, which need their prior. With a distortion from
+    straight lines none is, as camera and distortion belong together.
     """
     names = (*_ENTRY_NAMES, *coefficient_names(calibration.distortion_model))
     held = calibration.straight_lines is not None
-    return np.array([not held and name not in calibration.fixed for name in names])
+    return np.array([not held and name not in (*calibration.fixed, *NODES) for name in names])
 
 
 def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:
@@ -107,7 +108,10 @@ def estimated_parameters(calibration: Calibration) -> NDArray[np.bool_]:
     coefficients = coefficient_names(calibration.distortion_model)
     names = (*_ENTRY_NAMES, *coefficients)
     return np.array(
-        [name not in calibration.fixed and not (from_lines and name in coefficients) for name in names]
+        [
+            name not in (*calibration.fixed, *NODES) and not (from_lines and name in coefficients)
+            for name in names
+        ]
     )
 
 

@@ -59,6 +59,8 @@ class CameraSeen:
         Models that the distortion was chosen from; empty where it was named.
     shared : (f, f) array, optional
         Covariance of what is free, where it comes from elsewhere.
+    by_prior : float
+        How many of the coefficients a prior determines, not the points.
     """
 
     views: Views
@@ -71,6 +73,7 @@ class CameraSeen:
     target: Target | None = None
     choice: Collection[str] = ()
     shared: Array | None = None
+    by_prior: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +128,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     """
     asked = seen.free, seen.free_poses
     basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared)
-    plain = covariance(basis.normal, *asked, basis.n_equations, basis.shared)
+    plain = covariance(basis.normal, *asked, basis.n_equations + seen.by_prior, basis.shared)
     if seen.shared is not None:
         return CameraCovariance(basis, plain, plain)
     found = counting_views(plain, basis.normal, *asked, basis.n_equations, seen.repeated, basis.moves_without)

@@ -21,7 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.cross_validation import Minimum, disagreement, held_out
+from neurocal_cli.bundle_adjustment.cross_validation import (
+    FOLDS,
+    Minimum,
+    disagreement,
+    held_out,
+    reduced,
+)
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle, predicted_pixels
@@ -32,6 +38,8 @@ from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covariance
@@ -191,7 +199,22 @@ class _AtMinimum:
 
     def _held_out(self) -> float:
         lost = held_out(self._minimum())
+        if self.camera.distortion.model == "rich":
+            lost = self._held_out_with_prior()
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
+
+    def _held_out_with_prior(self) -> Array:
+        """Squared errors of views that are left out, a rich lens's displacement being found without them.
+
+        With everything, points and prior are balanced; without a fold F of the views the minimum is at
+        -(H - S_F)^-1 g_F, where H^-1 is the covariance for noise of unit variance.
+        """
+        free, shared = _stored(self.calibration, self.views.pixel_scale)
+        q, fold = reduced(self.normal, free, self.free_poses), self.repeated.folds(FOLDS)
+        S, g = q.summed((fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float))
+        inverse = shared / (self.cost / self.spare)
+        steps = np.linalg.solve(inverse @ S - np.eye(len(shared)), (g @ inverse)[..., None])[..., 0]
+        return q.at(np.asarray(steps[fold], dtype=float))
 
     def _precision(self) -> tuple[float, float]:
         freedom = np.where(self.views.nearly_flat, 8, 11)
@@ -257,6 +280,8 @@ class _AtMinimum:
                 self.wide.entries,
             )
             camera = replace(camera, distortion=Distortion(richer.model, richer.k))
+        if camera.distortion.model == "rich":
+            free, shared = _stored(self.calibration, self.views.pixel_scale)
         return projection_uncertainty(
             self.views, state, camera, normal, free, self.free_poses, self.cost / self.spare,
             image_grid(self.points.image_size), depths, shared, angle,
@@ -264,9 +289,23 @@ class _AtMinimum:
 
 
 def _free(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) which of A's entries and of the distortion coefficients were estimated from these points."""
-    fixed = set(calibration.fixed)
+    """(5 + K,) which of A's entries and of the distortion coefficients the points alone determined.
+
+    A rich lens is judged with its displacement as it is.
+    """
+    fixed = {*calibration.fixed, *NODES}
     coefficients = coefficient_names(calibration.distortion_model)
     if calibration.straight_lines is not None:
         fixed |= set(coefficients)
     return np.array([name not in fixed for name in (*_ORDER, *coefficients)])
+
+
+def _stored(calibration: Calibration, pixel_scale: float) -> tuple[NDArray[np.bool_], Array]:
+    """What was estimated, and the covariance that the calibration holds, with its prior, normalised."""
+    names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
+    place = [names.index(name) for name in calibration.covariance_names]
+    to_entries = np.eye(len(names))
+    to_entries[:5, :5] = np.linalg.inv(calibration.intrinsics.entry_jacobian() * pixel_scale)
+    block = to_entries[:, place] @ calibration.covariance @ to_entries[:, place].T
+    free = np.array([name not in calibration.fixed for name in (*_ORDER, *names[5:])])
+    return free, np.asarray(block[np.ix_(free, free)])

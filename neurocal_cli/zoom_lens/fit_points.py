@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.camera.distortion import MODELS
+from neurocal_cli.camera.distortion import MODELS, WIDE
 from neurocal_cli.errors import UsageError
 from neurocal_cli.zoom_lens.committee import Budget
 from neurocal_cli.zoom_lens.cross_validation import left_out_errors
@@ -33,7 +33,8 @@ __all__ = ["CAMERAS", "DISTORTIONS", "OUTLIERS", "TRAININGS", "fit_lens"]
 TRAININGS = ("joint", "alternating")
 OUTLIERS = ("reject", "keep")
 CAMERAS = ("auto", "still", "moving")
-DISTORTIONS = ("auto", *MODELS)
+# A network for each coefficient follows the setting; of the wide models a fisheye's coefficients alone are linear.
+DISTORTIONS = ("auto", *(model for model in MODELS if model not in WIDE or model == "fisheye"))
 
 
 def fit_lens(

@@ -15,6 +15,7 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import Distortion, distort
 from neurocal_cli.camera.monotonic import is_monotonic, monotonic_radius
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -35,6 +36,7 @@ LENSES = {
     "omnidir": [0.9, -0.1, 0.03, 1e-3, -2e-3],
     "double_sphere": [-0.2, 0.58],
     "eucm": [0.6, 1.1],
+    "rich": [0.08, -0.03, 0.02, -0.005, 0.5, 0.4, 0.3, *np.random.default_rng(0).normal(0, 1e-3, len(NODES))],
 }
 
 

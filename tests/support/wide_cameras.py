@@ -7,15 +7,22 @@ import numpy as np
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.camera.rich_lens import GRID, NODES, RADII
 from neurocal_cli.geometry import Array
 
 SIZE = (1000, 800)
+# Of a rich lens, without a field: its axis is seen at the principal point.
+_PROFILE = [*np.random.default_rng(0).normal(0, 2e-3, RADII), *np.zeros(len(NODES) - RADII)]
 # The scale, which xi enters, and the coefficients; all show 95 degrees within 500 px.
 WIDE_LENSES: dict[str, tuple[float, list[float]]] = {
     "fisheye": (293.0, [0.02, -0.01, 0.004, -0.001]),
     "omnidir": (530.0, [1.2, -0.02, 0.01, 1e-3, -5e-4]),
     "double_sphere": (250.0, [-0.1, 0.58]),
     "eucm": (280.0, [0.62, 1.1]),
+    "rich": (
+        293.0,
+        [0.02, -0.01, 0.004, -0.001, 1.2, 1.2, 1.2, *_PROFILE],
+    ),
 }
 
 
@@ -40,11 +47,14 @@ def plainly_projected(model: str, k: list[float], A: Array, points: Array) -> Ar
 
 def _projected(model: str, k: list[float], A: Array, X: float, Y: float, Z: float) -> Array:
     d = np.sqrt(X**2 + Y**2 + Z**2)
-    if model == "fisheye":
+    if model in ("fisheye", "rich"):
         r = np.hypot(X, Y)
         theta = np.arctan2(r, Z)
         bent = theta + k[0] * theta**3 + k[1] * theta**5 + k[2] * theta**7 + k[3] * theta**9
         x, y = bent * X / r, bent * Y / r
+        if model == "rich":
+            dx, dy = _displaced(np.array(k[4:]), X / (d + Z), Y / (d + Z))
+            x, y = x + dx, y + dy
     elif model == "omnidir":  # as in OpenCV's omnidir::projectPoints
         x, y = X / d / (Z / d + k[0]), Y / d / (Z / d + k[0])
         r2 = x**2 + y**2
@@ -61,3 +71,19 @@ def _projected(model: str, k: list[float], A: Array, X: float, Y: float, Z: floa
         w = k[0] * np.sqrt(k[1] * (X**2 + Y**2) + Z**2) + (1 - k[0]) * Z
         x, y = X / w, Y / w
     return np.asarray((A @ [x, y, 1.0])[:2])
+
+
+def _displaced(k: Array, *s: float) -> Array:
+    """A rich lens's displacement at a place in stereographic coordinates."""
+    profile, nodes = k[3 : 3 + RADII], k[3 + RADII :].reshape(2, GRID, GRID)
+    r, h = np.hypot(*s), k[0] / (RADII - 1)
+    along = sum(g * (_spline(r / h - i) - _spline(r / h + i)) for i, g in enumerate(profile, 1))
+    places = np.array(s) / (2 * k[1:3] / (GRID - 3)) + (GRID - 1) / 2
+    x, y = (np.array([_spline(place - n) for n in range(GRID)]) for place in places)
+    return np.asarray(along * np.array(s) / r + nodes @ x @ y)
+
+
+def _spline(t: float) -> float:
+    """The cubic B-spline around 0."""
+    t = abs(t)
+    return (4 - 6 * t**2 + 3 * t**3) / 6 if t < 1 else max(2 - t, 0) ** 3 / 6

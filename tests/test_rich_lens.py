@@ -1,0 +1,158 @@
+"""Lenses that no polynomial describes: the rich lens finds them, and its standard deviations are true."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.camera.rich_lens import REACHES
+from neurocal_cli.errors import UsageError
+from neurocal_cli.geometry import Array, rotation_step
+from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration
+from neurocal_cli.methods import calibrate, fit_poses
+from neurocal_cli.points import Correspondences
+from neurocal_cli.report import calibration_report
+
+NOISE, SIZE = 0.15, (1000, 800)
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A fisheye of 150 degrees with a displacement [px] of another form than the model's."""
+
+    mustache: float = 0.0  # px, with a bump in the radius
+    askew: float = 0.0  # px, not symmetric
+
+    def project(self, points: Array) -> Array:
+        rho, Z = np.hypot(points[:, 0], points[:, 1]), points[:, 2]
+        theta = np.arctan2(rho, Z)
+        bump = np.exp(-0.5 * ((theta - 0.8) / 0.13) ** 2) - 0.6 * np.sin(4 * theta)
+        radius = 400.0 * theta * (1 - 0.03 * theta**2) + self.mustache * bump
+        pixels = np.array([505.0, 392.0]) + (radius / rho)[:, None] * points[:, :2]
+        u, v = ((pixels - [500, 400]) / 400).T
+        aside = np.column_stack([np.sin(2.2 * u + 0.7) * np.cos(1.5 * v), np.cos(1.9 * v - 0.5) * u])
+        return np.asarray(pixels + self.askew * aside)
+
+
+LENS = Lens(mustache=2.0, askew=1.0)
+
+
+def views(lens: Lens, seed: int, n: int, noise: float = NOISE) -> Correspondences:
+    """A board of 9 x 6 in many directions, as much of it as the image shows."""
+    rng = np.random.default_rng(seed)
+    board = np.stack(np.meshgrid(np.arange(9), np.arange(6), [0]), axis=-1).reshape(-1, 3) * 30.0
+    worlds, pixels, names = [], [], []
+    while len(worlds) < n:
+        theta, phi = 1.2 * np.sqrt(rng.uniform()), rng.uniform(0, 2 * np.pi)
+        turn = rotation_step(np.append(rng.uniform(-0.5, 0.5, 2), rng.uniform(-3, 3))[None])[0]
+        facing = rotation_step(theta * np.array([[-np.sin(phi), np.cos(phi), 0.0]]))[0]
+        at = (board - board.mean(axis=0)) @ turn.T + [0, 0, rng.uniform(180, 400)]
+        points = at @ facing.T
+        seen = lens.project(points)
+        shown = ((seen > 0) & (seen < np.array(SIZE) - 1)).all(axis=1) & (at[:, 2] > 20)
+        shown &= np.arctan2(np.hypot(points[:, 0], points[:, 1]), points[:, 2]) < 1.4
+        if shown.sum() < 30:
+            continue
+        names += [f"v{len(worlds):02d}"] * int(shown.sum())
+        worlds.append(board[shown])
+        pixels.append(seen[shown] + rng.normal(0, noise, (int(shown.sum()), 2)))
+    return Correspondences(np.concatenate(worlds), np.concatenate(pixels), tuple(names), image_size=SIZE)
+
+
+def calibrated(points: Correspondences, distortion: str) -> Calibration:
+    return calibrate(points, distortion=distortion, target="given", outliers="keep")
+
+
+@pytest.fixture(scope="module")
+def rich() -> Calibration:
+    return calibrated(views(LENS, 0, 16), "rich")
+
+
+def test_a_mustache_lens_is_found_where_a_fisheye_fails(rich: Calibration) -> None:
+    fisheye = calibrated(rich.points, "fisheye")
+    others = views(LENS, 1, 6)
+    errors = [fit_poses(others, found.camera, 0).rmse_px for found in (rich, fisheye)]
+    floor = np.sqrt(2) * NOISE
+    assert errors[0] < 1.1 * floor < errors[1]
+
+
+def test_its_file_table_and_verdict(rich: Calibration, tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(format_calibration(rich))
+    again = read_calibration(path)
+    np.testing.assert_array_equal(again.distortion, rich.distortion)
+    np.testing.assert_array_equal(again.covariance, rich.covariance)
+    lines = [line for line in calibration_report(rich).splitlines() if "nodes" in line]
+    assert len(lines) == 1
+    assert lines[0].startswith("displacement [px]")
+    assert rich.verdict is not None
+    assert rich.verdict.measures["held_out_px"] == pytest.approx(np.sqrt(2) * NOISE, rel=0.15)
+
+
+def test_a_fisheye_needs_no_displacement() -> None:
+    points = views(Lens(), 2, 8)
+    camera, plain = calibrated(points, "rich"), calibrated(points, "fisheye")
+    others = views(Lens(), 3, 4, 0.0)
+    errors = [fit_poses(others, found.camera, 0).rmse_px for found in (camera, plain)]
+    floor = np.sqrt(2) * NOISE
+    assert np.hypot(errors[0], floor) < 1.05 * np.hypot(errors[1], floor)
+    assert set(REACHES) <= camera.fixed
+
+
+def test_other_methods_do_not_know_it() -> None:
+    with pytest.raises(UsageError, match="rich needs the method neuro"):
+        calibrate(views(Lens(), 2, 3), method="tsai", distortion="rich")
+
+
+def standardised(found: Calibration, lens: Lens, seen: Array) -> tuple[float, float]:
+    """Rms of errors over their std where points were seen, and where none was.
+
+    Where a camera looks is told by its poses: what a turn of all directions does to them is left out.
+    """
+    theta, phi = (a.ravel() for a in np.meshgrid(np.linspace(0.05, 1.35, 12), np.arange(24) * np.pi / 12))
+    rays = np.column_stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)])
+    truth = lens.project(rays)
+    shown = ((truth > 0) & (truth < np.array(SIZE) - 1)).all(axis=1)
+    rays, truth = rays[shown], truth[shown]
+    nearest = np.sqrt(((truth[:, None] - seen) ** 2).sum(axis=2)).min(axis=1)
+    near, far = nearest < 20, nearest > 60
+    camera = found.camera
+
+    def errors(turn: Array) -> Array:
+        return np.asarray(camera.project(rays @ rotation_step(turn[None])[0].T)[0] - truth)
+
+    turn = least_squares(lambda w: errors(w)[near].ravel(), np.zeros(3)).x
+    by_camera, by_point = camera.project_jacobian(rays)
+    names = [*INTRINSIC_NAMES, *coefficient_names(found.distortion_model)]
+    to_entries = np.eye(len(names))
+    to_entries[:5, :5] = np.linalg.inv(found.intrinsics.entry_jacobian())
+    J = by_camera.reshape(-1, len(names)) @ to_entries[:, [names.index(n) for n in found.covariance_names]]
+    turns = (by_point @ np.stack([np.cross(axis, rays) for axis in np.eye(3)], axis=2)).reshape(-1, 3)
+    without = np.eye(len(J)) - turns @ np.linalg.pinv(turns * np.repeat(near, 2)[:, None])
+    variance = np.diag(without @ J @ found.covariance @ J.T @ without.T).reshape(-1, 2)
+    squared = (errors(turn) ** 2 / variance).mean(axis=1)
+    return float(squared[near].mean()), float(squared[far].mean())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("half", [False, True])
+def test_errors_are_as_large_as_their_standard_deviations(half: bool) -> None:
+    lens, found = Lens(mustache=1.5, askew=1.5), []
+    for seed in range(12):
+        points = views(lens, 100 + seed, 30)
+        if half:  # of the image has no points
+            points = points.select(points.pixels[:, 0] < 560)
+            enough = np.bincount(points.view_index)[points.view_index] >= 24
+            points = points.select(enough)
+        found.append(standardised(calibrated(points, "rich"), lens, points.pixels))
+    seen, unseen = np.sqrt(np.nanmean(found, axis=0))
+    assert 0.8 < seen < 1.2
+    if half:
+        assert 0.5 < unseen < 1.5
