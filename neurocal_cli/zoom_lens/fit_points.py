@@ -33,7 +33,7 @@ __all__ = ["CAMERAS", "DISTORTIONS", "OUTLIERS", "TRAININGS", "fit_lens"]
 TRAININGS = ("joint", "alternating")
 OUTLIERS = ("reject", "keep")
 CAMERAS = ("auto", "still", "moving")
-# A network for each coefficient follows the setting; of the wide models a fisheye's coefficients alone are linear.
+# A network follows each coefficient; of the wide models a fisheye alone has coefficients that are linear.
 DISTORTIONS = ("auto", *(model for model in MODELS if model not in WIDE or model == "fisheye"))
 
 
