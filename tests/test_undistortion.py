@@ -25,7 +25,7 @@ from neurocal_cli.geometry import Array
 
 SIZE = (640, 480)
 BENDING = [model for model in LENSES if model != "none"]
-OPENCV_HAS = [model for model in BENDING if model not in ("omnidir", "double_sphere", "eucm")]
+OPENCV_HAS = [model for model in BENDING if model not in ("omnidir", "double_sphere", "eucm", "rich")]
 
 
 def camera(model: str, skew: bool = False, f: float = 640.0) -> Camera:

@@ -78,7 +78,7 @@ def told(make: Make, share: float, words: str, seeds: range) -> int:
 
 
 CHANGES = {
-    "drift": (drift, "along the sequence of the views"),
+    "drift": (drift, "so zoom or focus"),  # as a line, or as a step
     "focus that follows": (near_and_far, "from the farthest to the nearest view"),
     "turned left and right": (left_and_right, "turned to the left to those to the right"),
     "every other image scaled": (every_other, "these views are scaled by"),
