@@ -318,7 +318,7 @@ def _lens_lines(calibration: Calibration) -> list[str]:
     errors = [f"{name} {_pixels(choice[name])}" for name in sorted(choice, key=lambda name: choice[name])]
     chosen = calibration.distortion_model
     return [
-        f"distortion model: {chosen}, the simplest whose cross-validation error is as low as any:",
+        f"distortion model: {chosen}, chosen by cross-validation error and number of coefficients:",
         f"  {', '.join(errors)} px",
     ]
 

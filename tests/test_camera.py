@@ -243,7 +243,9 @@ def test_project_jacobian_by_central_differences(model: str, theta: float) -> No
     np.testing.assert_allclose(by_camera, numeric, rtol=1e-6, atol=1e-5)
 
 
-@every_model
+@pytest.mark.parametrize(
+    "model", [pytest.param(m, marks=pytest.mark.slow) if m == "rich" else m for m in MODELS]
+)
 @with_and_without_skew
 def test_unproject_jacobian_by_central_differences(model: str, theta: float) -> None:
     camera, pixels = camera_with(model, theta), some_pixels()

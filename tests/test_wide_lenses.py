@@ -38,6 +38,11 @@ def test_the_minimum_is_found_without_a_guess(model: str, field: float) -> None:
     assert one.rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
 
 
+def test_a_wide_lens_in_a_wrong_minimum_is_reached_through_another_fisheye() -> None:
+    scene = wide_set(193, "eucm")  # the first minimum is not monotonic inside the points
+    assert found(scene).rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
+
+
 def test_auto_takes_a_fisheye_for_one_and_says_so() -> None:
     scene = wide_set(3, "fisheye", 190.0, n_views=10, sigma=0.1)
     one = found(scene, "auto")

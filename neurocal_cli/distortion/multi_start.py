@@ -3,7 +3,7 @@
 The minimum of a strong distortion is found only from a start that is near it. Where the residuals of
 neighbours are correlated, as a wrong distortion leaves them (and a board that is not flat), or where the
 points tell a focal length badly, every model is fitted, each from the one before it, from this start and
-from others; the best fit of the wanted model is the result.
+from others; the best fit of the wanted model is the result. Wide lenses are reached through the fisheye.
 """
 
 from __future__ import annotations
@@ -11,11 +11,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import covariance
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.distortion.candidate_models import fit_candidates, is_weak
+from neurocal_cli.distortion.similar_lens import similar_states
 
 __all__ = ["with_more_starts"]
 
@@ -35,18 +39,28 @@ def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[Came
         Other states to begin with.
     """
     problem, best = solution.problem, solution.adjusted
-    if not problem.free_distortion:
+    if not problem.free_distortion or "xi" in problem.fixed:  # an xi that is held belongs to this lens
         return solution
     views, wanted = problem.views, problem.distortion.model
     cov = covariance(best.normal, problem.free_camera, problem.free_poses, views.n_equations)
     weak = is_weak(problem, best.state, cov)
     if best.converged and not weak and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
         return solution
+    fitted = "fisheye" if wanted in WIDE else wanted
     for start in (best.state, *more_starts()):
-        found = fit_candidates(problem, start, by_views=False, wanted=wanted).get(wanted)
-        if found is None or not found.adjusted.cost.sum() < best.cost.sum():
+        found = fit_candidates(problem, start, by_views=False, wanted=fitted).get(fitted)
+        if found is None or (fitted == wanted and not found.adjusted.cost.sum() < best.cost.sum()):
             continue
-        adjusted = problem.adjust(found.adjusted)
-        if adjusted.cost.sum() < best.cost.sum():
-            best = adjusted
+        for near in _as(wanted, found.adjusted, views):
+            adjusted = problem.adjust(near)
+            if adjusted.cost.sum() < best.cost.sum():
+                best = adjusted
     return replace(solution, adjusted=best)
+
+
+def _as(wanted: str, found: Adjusted, views: Views) -> list[Adjusted]:
+    """The fit itself where it is of the wanted model, else the most similar lenses of that model."""
+    if found.state.model == wanted:
+        return [found]
+    starts = similar_states(found.state, wanted, farthest_angle(views, found.state))
+    return [replace(found, state=start) for start in starts]
