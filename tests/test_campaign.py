@@ -53,6 +53,7 @@ def false_alarms(seeds: range) -> int:
     return count
 
 
+@pytest.mark.slow
 def test_clean_midpoints_are_not_blamed() -> None:
     assert false_alarms(range(6)) == 0
 

@@ -212,6 +212,7 @@ def test_the_corner_rig_from_its_photographs(
     assert values["nsce"] == pytest.approx(3.95, abs=0.2)
 
 
+@pytest.mark.slow
 def test_thirteen_real_pairs_are_fitted_better_than_opencv_fits_its_corners(
     tmp_path: Path, real_files: RealFiles
 ) -> None:

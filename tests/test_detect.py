@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from support.rendered import Recipe, board_pose, condition, picture, single
 from support.seen_grids import labelled_vertices, seen_grid
+from support.slow_cases import slow_but
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Measured, detect
@@ -43,7 +44,7 @@ def opposite(name: str) -> str:
     return f"{kind}:{last[0] - int(c)}:{last[1] - int(r)}"
 
 
-@pytest.mark.parametrize("name", ["base", "two planes", "three planes"])
+@pytest.mark.parametrize("name", slow_but(("base", "two planes"), ("base", "two planes", "three planes")))
 def test_points_are_where_the_ids_say(name: str) -> None:
     for seed in range(2):
         found, seen = detected(name, seed)
@@ -58,6 +59,7 @@ def test_points_are_where_the_ids_say(name: str) -> None:
         assert found.image_size == (640, 480)
 
 
+@pytest.mark.slow
 def test_ids_stay_on_their_places_while_the_board_turns_in_its_plane() -> None:
     scene = single(Recipe(zoom=0.5, square=28, margin=0.3), np.random.default_rng(5))
     firsts = set()

@@ -44,8 +44,10 @@ SLOW_PAGES = {
     for page in (
         "bad-calibration",
         "fisheye",
+        "images",
         "other-programs",
         "pipelines",
+        "report",
         "ros",
         "surveyed-points",
         "undistort",

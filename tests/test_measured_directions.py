@@ -45,7 +45,8 @@ def rms(values: object) -> float:
     return float(np.sqrt(np.mean(np.square(np.asarray(values)))))
 
 
-@pytest.mark.parametrize("sets", slow_but((30,), (30, 60)))
+@pytest.mark.slow
+@pytest.mark.parametrize("sets", [60])
 def test_standard_deviations_of_midpoints_hold(sets: int) -> None:
     """And they hold, counting views, where places along the edges are taken for measurements of their own."""
     one_way, both_ways, disagreement = [], [], []
@@ -73,7 +74,8 @@ def test_standard_deviations_of_a_lens_hold(distortion: str, sets: int) -> None:
     assert 0.85 < rms(errors) < 1.2
 
 
-@pytest.mark.parametrize("rigs", [12, pytest.param(30, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("rigs", [30])
 def test_standard_deviations_of_a_rig_hold(rigs: int) -> None:
     one_way, both_ways = [], []
     world, ends = edges()

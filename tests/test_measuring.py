@@ -70,7 +70,7 @@ def test_midpoints_reach_the_bound(name: str) -> None:
     assert found_errors.rms < 0.0036
 
 
-@pytest.mark.parametrize("points", slow_but(("midpoints",), ("midpoints", "vertices")))
+@pytest.mark.parametrize("points", slow_but((), ("midpoints", "vertices")))
 def test_edges_sharper_than_a_pixel_reach_the_bound(points: Literal["midpoints", "vertices"]) -> None:
     found_errors = errors("straight, psf 0.15", range(1), points)
     assert found_errors.ratio < 1.3  # five times as much if the pixel's box is taken for a Gaussian

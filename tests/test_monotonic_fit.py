@@ -112,6 +112,7 @@ def test_a_fisheye_need_not_see_the_corners() -> None:
     assert where_not_monotonic(Distortion("fisheye", [-0.2, 0.0, 0.0, 0.0]), A, points) == "image"
 
 
+@pytest.mark.slow
 def test_standard_deviations_are_not_too_small() -> None:
     scene, k = bent_set("k1k2", 130)
     errors = []

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.slow_cases import slow_but
 from support.wrong_inputs import flat, in_views, moved, of_cameras
 
 from neurocal_cli import Correspondences, NeurocalError, calibrate
@@ -49,7 +50,7 @@ def test_points_whose_sigma_is_too_small_are_no_outliers() -> None:
     assert "the stated sigmas say nothing of the residuals" in found.verdict.reasons
 
 
-@pytest.mark.parametrize("by_view", [True, False])
+@pytest.mark.parametrize("by_view", slow_but((False,), (True, False)))
 def test_sigmas_that_hold_are_not_blamed(by_view: bool) -> None:
     for seed in range(3):
         rng = np.random.default_rng(seed)

@@ -301,6 +301,7 @@ def check_statistics(k: list[float], centre: tuple[float, float], trials: int, e
     assert np.abs(errors.mean(axis=0) / errors.std(axis=0)).max() < 3.5 / np.sqrt(trials)
 
 
+@pytest.mark.slow
 def test_std_is_true_and_nothing_biased() -> None:
     check_statistics([-0.25, 0.1], (530.0, 370.0), 20, 0.0)
 

@@ -28,9 +28,7 @@ def test_the_start_is_near_the_truth_where_a_pinhole_is_not(seed: int) -> None:
     assert found.in_pixels.entries[0, 0] == pytest.approx(truth.A[0, 0], rel=0.03)
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(seed, marks=() if seed == 552 else pytest.mark.slow) for seed in STRONG]
-)
+@pytest.mark.parametrize("seed", [pytest.param(seed, marks=pytest.mark.slow) for seed in STRONG])
 def test_no_strong_distortion_ends_in_a_refusal_or_a_wrong_minimum(seed: int) -> None:
     points, truth = scene(seed)
     assert reference(points, truth).excess(calibrate(points)) < 1.005

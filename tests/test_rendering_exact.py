@@ -210,6 +210,7 @@ def skewed_and_distorted() -> Scene:
     return replace(scene, pose=board_pose(scene, np.array([110.0, 90.0]), 30.0, 45.0, 0.8, 0.3))
 
 
+@pytest.mark.slow
 def test_skew_distortion_tilt_and_light_agree_with_brute_force() -> None:
     scene = skewed_and_distorted()
     picture = noise_free(scene) / 65535

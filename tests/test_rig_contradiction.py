@@ -160,9 +160,8 @@ def test_the_criterion_is_still_where_there_is_nothing_but_noise() -> None:
     assert np.std(scatter) < 1.5
 
 
-@pytest.mark.parametrize(
-    "seed", [pytest.param(49, marks=pytest.mark.slow), pytest.param(104, marks=pytest.mark.slow), 137]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [49, 104, 137])
 def test_three_pairs_of_cameras_that_are_poorly_known_are_not_blamed(seed: int) -> None:
     """Two of them fit each other best with wrong cameras, and then predict the third far off."""
     some = random_rig(np.random.default_rng(seed), "verging", 3, lens="k1k2")

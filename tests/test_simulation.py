@@ -192,6 +192,7 @@ def test_seventy_data_sets_vary() -> None:
     assert size.max() / size.min() > 100
 
 
+@pytest.mark.slow
 def test_the_default_rates_converge_and_others_do_not() -> None:
     pytest.importorskip("numba")
     study = study_rates(12, seed=0, rates_weights=(0.05, 0.8), rates_gamma=(0.4,))

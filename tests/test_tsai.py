@@ -112,6 +112,7 @@ def turns(method: str, trials: int, **options: object) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_with_noise_its_angles_are_biased_and_those_of_least_squares_are_not() -> None:
     """A mean of 80 errors has a standard deviation of a ninth of theirs."""
     given = {"type": 2, "image_center": (172.0, 121.0), "skew": False}

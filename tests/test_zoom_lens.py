@@ -78,6 +78,7 @@ def test_the_error_by_setting_adds_up_to_the_whole() -> None:
     assert evaluation.max_px == max(s.max_px for s in evaluation.settings)
 
 
+@pytest.mark.slow
 def test_the_same_seed_gives_the_same_lens() -> None:
     points = seen("c", grid(4, 3), seed=3, side=4)
     one, two = (fit_lens(points, distortion="none", topologies=((0, 1),), seed=7) for _ in range(2))
@@ -98,6 +99,7 @@ def test_a_lens_of_one_control() -> None:
     assert camera.std["alpha_u"] > 0
 
 
+@pytest.mark.slow
 def test_settings_need_no_grid() -> None:
     rng = np.random.default_rng(6)
     settings = LOW + rng.uniform(0, 1, (20, 2)) * (HIGH - LOW)
@@ -109,6 +111,7 @@ def test_settings_need_no_grid() -> None:
     assert evaluation.rmse_px < evaluation.baselines["thin_plate_joint"]
 
 
+@pytest.mark.slow
 def test_distortion_is_chosen_and_follows_the_zoom() -> None:
     lens = fit_lens(seen("c", grid(5, 3), seed=9, bends=True), topologies=((0, 2),))
     assert lens.model == "k1"
@@ -119,6 +122,7 @@ def test_distortion_is_chosen_and_follows_the_zoom() -> None:
     assert evaluation.rmse_px < 1.12 * FLOOR
 
 
+@pytest.mark.slow
 def test_no_distortion_is_chosen_where_there_is_none() -> None:
     assert fit_lens(seen("c", grid(5, 3), seed=11), topologies=((0, 2),)).model == "none"
 
@@ -305,6 +309,7 @@ def flat(points: LensPoints) -> LensPoints:
     )
 
 
+@pytest.mark.slow
 def test_a_setting_with_few_points_rests_on_the_others() -> None:
     points = seen("c", grid(5, 3), seed=22, side=5)
     keep = (points.point_setting != 4) | (np.arange(len(points.points)) % 12 == 0)
@@ -315,6 +320,7 @@ def test_a_setting_with_few_points_rests_on_the_others() -> None:
     assert lens.rmse[4] < 3 * FLOOR
 
 
+@pytest.mark.slow
 def test_a_camera_that_moved_is_told() -> None:
     points = seen("c", grid(4, 3), seed=20, side=4)
     world = points.points.world.copy()
