@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from support.distorted import through
 from support.scenes import random_flat_set
 from support.wrong_inputs import flat
 
 from neurocal_cli import Correspondences, Intrinsics, calibrate
+from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.geometry import rotation_step
 from neurocal_cli.verdict.assessment import gather_evidence
 
 
@@ -52,3 +55,23 @@ def test_one_flat_view_does_not_tell_what_it_would_ask_for() -> None:
     points = flat().select(np.arange(3 * 93, 4 * 93))
     found = calibrate(points, type=2, skew=False, image_center=(318.0, 243.0))
     assert gather_evidence(found).asked_for == ()
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_given_poses_are_not_turned(seed: int) -> None:
+    """Far boards have second poses; with poses that are off by a degree these would fit the points better."""
+    scene = through(
+        random_flat_set(np.random.default_rng(seed), 6, False, cols=9, rows=6, f=6000), "k1", [-0.2]
+    )
+    points = scene.points(0.3, np.random.default_rng(1))
+    known = calibrate(points, skew=False, distortion="k1", target="given")
+    rng = np.random.default_rng(seed)
+    given = {
+        name: Pose(rotation_step(rng.normal(0, 0.02, (1, 3)))[0] @ R, known.translations[name])
+        for name, R in known.rotations.items()
+    }
+    found = calibrate(points, type=4, extrinsics=given, distortion="k1", outliers="keep", target="given")
+    R, t = (np.array([getattr(given[name], part) for name in points.view_names]) for part in ("R", "t"))
+    in_camera = np.einsum("nij,nj->ni", R[points.view_index], points.world) + t[points.view_index]
+    errors = points.pixels - found.camera.project(in_camera)[0]
+    assert found.rmse_px == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()))

@@ -124,8 +124,10 @@ def try_mirrored(problem: Problem, adjusted: Adjusted) -> Adjusted:
 
     All views whose second pose fits better as the camera is are turned at once. Others are turned one by one,
     where the camera that goes with the second pose fits all views better: a camera that was found with the
-    wrong pose is drawn towards it.
+    wrong pose is drawn towards it. Poses that are given stay.
     """
+    if not problem.free_poses:
+        return adjusted
     for _ in range(_FLIPS):
         found = _turned_alone(problem, adjusted)
         if found is None:

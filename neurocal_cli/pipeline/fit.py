@@ -52,9 +52,13 @@ def fit(problem: Problem, options: Options) -> Solution:
     if problem.free_distortion and problem.distortion.model == "rich":
         return with_displacement(fit(problem.with_model("fisheye"), options))
     check_points(problem)
-    solution = _first_solution(problem, options)
-    if options.distortion != "auto":
-        solution = _turned(with_more_starts(solution, lambda: _distorted_starts(problem, options)))
+    first = _first_solution(problem, options)
+    if options.distortion == "auto":
+        return _finished(first, options)
+    solution = with_more_starts(first, lambda: _distorted_starts(problem, options))
+    # The poses of several views that share a camera have been turned where that is better.
+    if solution is not first or problem.type == 3 or problem.views.n_views == 1:
+        solution = _turned(solution)
     return _finished(solution, options)
 
 
@@ -150,7 +154,7 @@ def _from_fisheye(problem: Problem, fisheye: Solution) -> Solution:
     if problem.distortion.model == "double_sphere" and abs(best.state.k[0]) < _NO_XI:
         problem = replace(problem, fixed=problem.fixed | {"xi"})
         best = problem.adjust(replace(best, state=replace(best.state, k=best.state.k * [0.0, 1.0])))
-    return replace(fisheye, problem=problem, adjusted=best)
+    return _turned(replace(fisheye, problem=problem, adjusted=best))
 
 
 def _distorted_starts(problem: Problem, options: Options) -> Iterator[CameraState]:
@@ -173,7 +177,7 @@ def _through_distortion(problem: Problem, options: Options) -> Solution | None:
     if found is None or options.distortion == "auto":
         return found
     fitted = fit_candidates(problem, found.state, by_views=False).get(wanted)
-    return None if fitted is None else replace(found, problem=problem, adjusted=fitted.adjusted)
+    return None if fitted is None else _turned(replace(found, problem=problem, adjusted=fitted.adjusted))
 
 
 def _plumb_line_first(problem: Problem, options: Options) -> Solution:
