@@ -60,7 +60,7 @@ def test_each_option_is_in_an_example(words: list[str], command: click.Command) 
 def _slow(words: list[str]) -> bool:
     """Whether the examples take long: zoom lenses, simulations, and the longest lists."""
     slow = (
-        *("detect", "calibrate", "stereo", "lens", "simulate", "compare"),
+        *("detect", "calibrate", "evaluate", "stereo", "lens", "simulate", "compare"),
         *("convert", "rectify", "undistort", "target", "report", "advise"),
     )
     return not words or words[0] in slow or words[1:] in (["stereo"], ["camera"])

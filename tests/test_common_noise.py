@@ -83,7 +83,8 @@ def errors(share: float, weighed: bool, trials: int) -> float:
     return float(np.sqrt(np.mean((np.array(found) - 556.0) ** 2)))
 
 
-@pytest.mark.parametrize("trials", [15, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("trials", [40])
 def test_true_covariances_help_and_wrong_ones_do_no_harm(trials: int) -> None:
     assert errors(0.0, True, trials) < 0.75 * errors(0.0, False, trials)
     assert errors(1.0, True, trials) == pytest.approx(errors(1.0, False, trials), rel=0.02)

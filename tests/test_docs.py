@@ -38,15 +38,17 @@ def test_the_readme_is_short_and_shows_a_picture() -> None:
     assert README.index("![") < README.index("```")
 
 
-# The longest pages. README.md and the tutorial show the same commands.
-SLOW_PAGES = {
+# The longest pages. README.md shows the same commands.
+SLOW_PAGES = {"docs/tutorial.md", "docs/concepts/target.md"} | {
     f"docs/how-to/{page}.md"
     for page in (
         "bad-calibration",
         "fisheye",
         "images",
+        "next-views",
         "other-programs",
         "pipelines",
+        "rectify",
         "report",
         "ros",
         "surveyed-points",
@@ -174,6 +176,7 @@ def test_the_scripts_of_the_pictures_run(tmp_path: Path) -> None:
         subprocess.run([sys.executable, script], check=True, env=environment)
 
 
+@pytest.mark.slow
 def test_the_site_builds(tmp_path: Path) -> None:
     pytest.importorskip("mkdocs")
     words = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "-d", str(tmp_path / "site")]

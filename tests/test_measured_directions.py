@@ -99,7 +99,8 @@ def test_the_level_of_the_noise_is_that_of_the_measurement() -> None:
     assert np.mean(levels) == pytest.approx(1.0, abs=0.05)
 
 
-@pytest.mark.parametrize("sets", [12, pytest.param(40, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("sets", [40])
 def test_no_lens_is_seen_where_there_is_none(sets: int) -> None:
     found = [calibrate(edge_set(seed)[1], skew=False) for seed in range(100, 100 + sets)]
     assert sum(one.distortion_model == "none" for one in found) >= 0.92 * sets - 1

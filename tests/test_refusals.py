@@ -102,7 +102,10 @@ HELD: dict[str, dict[str, Any]] = {"nothing": {}, "skew": {"skew": False}, "cent
 PARALLEL = {("nothing", 3, 0.3), ("skew", 3, 0.0), ("centre", 3, 0.0)}
 
 
-@pytest.mark.parametrize("kind", ["shifted", "turned in their plane", "parallel to the image"])
+@pytest.mark.parametrize(
+    "kind",
+    slow_but(("turned in their plane",), ("shifted", "turned in their plane", "parallel to the image")),
+)
 @pytest.mark.parametrize(
     ("options", "n_views", "sigma"),
     slow_but(PARALLEL, itertools.product(HELD, (3, 5, 20), (0.0, 0.05, 0.3, 1.0))),
@@ -252,7 +255,7 @@ def sane(cal: Calibration) -> None:
         assert depth.min() > -1e-9 * np.abs(cal.points.world).max()
 
 
-@pytest.mark.parametrize("type", slow_but((1, 4), GIVEN))
+@pytest.mark.parametrize("type", slow_but((4,), GIVEN))
 @pytest.mark.parametrize("seed", slow_but((0,), range(4)))
 def test_pixels_of_other_points_or_of_none_are_refused_or_warned_of(type: int, seed: int) -> None:
     rng = np.random.default_rng(seed)

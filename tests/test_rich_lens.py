@@ -96,6 +96,7 @@ def test_its_file_table_and_verdict(rich: Calibration, tmp_path: Path) -> None:
     assert rich.verdict.measures["held_out_px"] == pytest.approx(np.sqrt(2) * NOISE, rel=0.15)
 
 
+@pytest.mark.slow
 def test_a_fisheye_needs_no_displacement() -> None:
     points = views(Lens(), 2, 8)
     camera, plain = calibrated(points, "rich"), calibrated(points, "fisheye")

@@ -77,6 +77,7 @@ def test_the_common_fit_is_no_worse_than_any_rig_between_two_single_cameras() ->
     assert calibrate_stereo(*points, skew=False).rmse_px < apart.rmse_px
 
 
+@pytest.mark.slow
 def test_views_of_one_camera_help_that_camera() -> None:
     scene = flat(n_views=14)
     few = {f"{k:02d}" for k in (1, 2, 3, 4)}

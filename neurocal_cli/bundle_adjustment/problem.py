@@ -28,6 +28,7 @@ __all__ = ["Problem", "intrinsic_matrix", "problem_for"]
 
 _LEAST_DEPTH = 0.1  # of a ray: 84 degrees from a view's middle
 _LARGEST = 1e9  # px; no image is larger
+_RIM, _HALVINGS = 0.02, 30  # of the distance from the centre: noise puts pixels no farther outside
 _MAX_ITERATIONS = 200
 
 
@@ -264,11 +265,12 @@ def _undistorted_views(
     """Views of points without a given distortion, and how the pinhole of each is turned."""
     if distortion.is_identity:
         return arrange(points), None
-    A, turned = intrinsic_matrix(entries), None
+    camera = Camera(Intrinsics.from_matrix(intrinsic_matrix(entries)), distortion)
+    seen = _seen_nearby(camera, points.pixels)
     if distortion.wide:
-        pixels, turned = _turned_pixels(points, Camera(Intrinsics.from_matrix(A), distortion))
+        pixels, turned = _turned_pixels(points, camera.unproject(seen), camera)
     else:
-        pixels = undistorted_pixels(distortion, A, points.pixels)
+        pixels, turned = undistorted_pixels(distortion, camera.A, seen), None
     lost = ~np.isfinite(pixels[:, 0])
     if lost.any():
         row = int(np.argmax(lost))
@@ -280,12 +282,30 @@ def _undistorted_views(
     return arrange(replace(points, pixels=pixels)), turned
 
 
-def _turned_pixels(points: Correspondences, camera: Camera) -> tuple[Array, Array]:
+def _seen_nearby(camera: Camera, pixels: Array) -> Array:
+    """The pixels, those that noise has put outside what the camera sees moved to its rim; nan farther outside."""
+    outside = np.flatnonzero(~np.isfinite(camera.unproject(pixels)[:, 0]))
+    if not outside.size:
+        return pixels
+    centre = np.array([camera.intrinsics.u0, camera.intrinsics.v0])
+    low, high = np.full(outside.size, 1 - _RIM), np.ones(outside.size)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        at = centre + middle[:, None] * (pixels[outside] - centre)
+        sees = np.isfinite(camera.unproject(at)[:, 0])
+        low, high = np.where(sees, middle, low), np.where(sees, high, middle)
+    moved = pixels.copy()
+    moved[outside] = centre + low[:, None] * (pixels[outside] - centre)
+    moved[outside[low == 1 - _RIM]] = np.nan
+    return moved
+
+
+def _turned_pixels(points: Correspondences, rays: Array, camera: Camera) -> tuple[Array, Array]:
     """Pixels (N, 2) of pinholes that look at the middle of each view's rays, and their rotations (V, 3, 3).
 
     A target may be seen far beyond 90 degrees from the axis, but it is seen within a cone of less.
     """
-    rays, index = camera.unproject(points.pixels), points.view_index
+    index = points.view_index
     sums = np.zeros((points.n_views, 3))
     np.add.at(sums, index, np.nan_to_num(rays))
     forward = sums / np.maximum(np.linalg.norm(sums, axis=1, keepdims=True), 1e-300)
