@@ -63,7 +63,7 @@ def _slow(words: list[str]) -> bool:
         *("detect", "calibrate", "evaluate", "stereo", "lens", "simulate", "compare"),
         *("convert", "rectify", "undistort", "target", "report", "advise"),
     )
-    return not words or words[0] in slow or words[1:] in (["stereo"], ["camera"])
+    return not words or words[0] in slow
 
 
 @pytest.mark.parametrize(
