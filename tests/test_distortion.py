@@ -15,6 +15,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_bloc
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError, InputError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import write_calibration
@@ -173,6 +174,18 @@ def test_a_lens_that_folds_inside_the_image_is_refused() -> None:
     points = Correspondences(np.concatenate(worlds), np.concatenate(pixels), names, (352, 240))
     with pytest.raises(DegenerateGeometryError, match=r"is not monotonic .* inside the image"):
         calibrate(points, distortion="k1")
+
+
+def test_a_given_lens_may_fold_in_corners_that_no_point_reaches() -> None:
+    scene = random_flat_set(np.random.default_rng(3), 4, False, cols=9, rows=6, f=900)
+    scene = through(scene, "k1", [-0.5])
+    points = scene.points(0.1, np.random.default_rng(0))
+    centre = np.array([scene.intrinsics.u0, scene.intrinsics.v0])
+    middle = points.select(np.hypot(*(points.pixels - centre).T) < 250)
+    camera = Camera(scene.intrinsics, Distortion("k1", [-0.5]))
+    assert where_not_monotonic(camera.distortion, camera.A, middle) == "image"
+    found = calibrate(middle, type=3, intrinsics=camera, outliers="keep")
+    assert found.rmse_px == pytest.approx(0.1 * np.sqrt(2), rel=0.1)
 
 
 def test_a_lens_of_type_3_cannot_be_chosen() -> None:

@@ -19,7 +19,8 @@ __all__ = ["check_distortion"]
 def check_distortion(solution: Solution) -> Solution:
     """Put a given distortion back, and check that the distortion is monotonic.
 
-    One that is not, where no point is seen, is fitted so that it is, unless the points deny it.
+    One that is not, where no point is seen, is fitted so that it is, unless the points deny it. One that is
+    given stays, if the points are seen where it is monotonic.
 
     Raises
     ------
@@ -36,9 +37,15 @@ def check_distortion(solution: Solution) -> Solution:
         solution = replace(solution, problem=problem, adjusted=adjusted)
     state = solution.state
     where = where_not_monotonic(state.distortion, problem.matrix(state.entries[0]), problem.points)
-    if where is None:
+    # A camera that is given may fold the image's corners; these points are seen beside them.
+    if where is None or (where == "image" and not problem.free_distortion):
         return solution
-    if where == "image" and problem.free_distortion and solution.shared is None:
+    if not problem.free_distortion:
+        raise DegenerateGeometryError(
+            f"the given distortion ({distortion.model}) is not monotonic (maps two directions to one pixel) inside "
+            "the points; check that the camera belongs to these images"
+        )
+    if where == "image" and solution.shared is None:
         found = fit_monotonic(problem, solution.adjusted)
         if found is not None:
             return replace(solution, problem=found[0], adjusted=found[1])
