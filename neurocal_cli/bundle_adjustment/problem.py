@@ -283,7 +283,7 @@ def _undistorted_views(
 
 
 def _seen_nearby(camera: Camera, pixels: Array) -> Array:
-    """The pixels, those that noise has put outside what the camera sees moved to its rim; nan farther outside."""
+    """The pixels; those just outside what the camera sees, by noise, at its rim, and nan farther out."""
     outside = np.flatnonzero(~np.isfinite(camera.unproject(pixels)[:, 0]))
     if not outside.size:
         return pixels

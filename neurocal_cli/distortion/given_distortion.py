@@ -42,8 +42,8 @@ def check_distortion(solution: Solution) -> Solution:
         return solution
     if not problem.free_distortion:
         raise DegenerateGeometryError(
-            f"the given distortion ({distortion.model}) is not monotonic (maps two directions to one pixel) inside "
-            "the points; check that the camera belongs to these images"
+            f"the given distortion ({distortion.model}) is not monotonic (maps two directions to one pixel) "
+            "inside the points; check that the camera belongs to these images"
         )
     if where == "image" and solution.shared is None:
         found = fit_monotonic(problem, solution.adjusted)
