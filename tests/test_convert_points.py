@@ -181,7 +181,7 @@ REFUSED = {
     '{"corners": [[[1, 2], [3, 4]], [[1, 2]]]}': "corners must be the same number of points in each view",
     '{"corners": [[[1, 2]]], "objpoints": [[1, 2, 3], [4, 5, 6]]}': "corners must be 2 points in each view",
     '{"corners": [[["a", 2]]]}': "corners must be the same number",
-    "1 2 3\n": "holds places alone",
+    "1 2 3\n": "/file: holds places alone",
     "1 2 3\n1 2\n": ":2: must be a row of 2 numbers or of 3",
     "# filename x y level\na 1\n": ":2: is no line 'filename x y level'",
     "Calibration results \n====================\n": "Kalibr has no file of corners",

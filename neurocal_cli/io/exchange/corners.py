@@ -331,9 +331,9 @@ def _separate(names: list[str], board: Board | None, unit: str | None) -> Corres
     """Files of numbers: the places on the board, X Y Z, unless a board is given, and u v of each view."""
     tables = [_table(name) for name in names]
     if tables[0].shape[1] == 3 or board is None:
+        if len(tables) == 1:
+            raise FormatError("holds places alone; give the files of the pixels after it", names[0])
         places, tables, names = tables[0], tables[1:], names[1:]
-        if not tables:
-            raise FormatError("holds places alone; give the files of the pixels after it", str(names))
         world = np.zeros((1, len(places), 3))
         world[0, :, : places.shape[1]] = places
         ids, stated = None, unit
