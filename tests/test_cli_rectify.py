@@ -256,16 +256,25 @@ def test_the_summary_says_when_the_common_fit_is_much_worse() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("folder", "square", "words", "limit"),
-    [("opencv_stereo", 25, [], 0.1), ("fisheye_stereo", 24.23, ["--distortion", "fisheye"], 0.6)],
+    ("folder", "square", "kind", "words", "limit"),
+    [
+        ("opencv_stereo", 25, "vertices", ["--no-skew"], 0.1),
+        ("fisheye_stereo", 24.23, "midpoints", ["--distortion", "fisheye"], 0.6),
+    ],
 )
 def test_rows_of_real_rigs_agree(
-    folder: str, square: float, words: list[str], limit: float, real_files: RealFiles, tmp_path: Path
+    folder: str,
+    square: float,
+    kind: str,
+    words: list[str],
+    limit: float,
+    real_files: RealFiles,
+    tmp_path: Path,
 ) -> None:
-    """The fisheye pairs were not taken at the same moment: with a pose for each pair, rows agree to 0.05 px."""
+    """The fisheye pairs were not taken at the same moment; with a pose for each, rows agree to 0.05 px."""
     for side in ("left", "right"):
         images = real_files(f"{folder}/{side}[0-9]*.jpg")
-        size = ["--cols", 9, "--rows", 6, "--square", square]
+        size = ["--cols", 9, "--rows", 6, "--square", square, "--points", kind]
         assert run("detect", *images, *size, "-o", tmp_path / f"{side}.csv").exit_code == 0
     points = [tmp_path / "left.csv", tmp_path / "right.csv"]
     assert run("stereo", *points, *words, "-o", tmp_path / "rig.yaml").exit_code == 0

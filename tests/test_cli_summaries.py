@@ -56,6 +56,9 @@ def test_quiet_leaves_the_warnings_and_twice_quiet_the_errors(points: Path, tmp_
     images = ["detect", SAMPLES / "board01.png", tmp_path / "bad.png", *BOARD]
     assert "bad.png" in run("-q", *images).stderr
     assert run("-qq", *images).stderr == ""
+    assert (
+        "-q stands before the command: neurocal -q evaluate camera" in run("evaluate", "camera", "-q").stderr
+    )
     result = run("-qq", "calibrate", tmp_path / "none.csv")
     assert result.exit_code == 1
     assert result.stderr.startswith("Error: ")
