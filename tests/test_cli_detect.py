@@ -257,13 +257,20 @@ def test_two_images_of_one_name_are_refused(folder: Path, tmp_path: Path) -> Non
     assert f"{folder / 'board01.png'} and {other} would both be the view 'board01'" in result.stderr
 
 
-def test_images_of_two_sizes_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_an_image_of_another_size_is_left_out_and_two_sizes_alike_are_refused(
+    folder: Path, tmp_path: Path
+) -> None:
     image = cv2.imdecode(np.fromfile(folder / "board01.png", np.uint8), cv2.IMREAD_GRAYSCALE)
     write(folder / "large.png", cv2.copyMakeBorder(image, 0, 10, 0, 20, cv2.BORDER_REPLICATE))
     result = detect(folder, *BOARD, "-o", tmp_path / "p.csv")
+    assert result.exit_code == 0
+    assert "large: the image has 420 x 310 px and most have 400 x 300; run detect for each" in result.stderr
+    assert "board detected in 3 of 4 images" in result.stderr
+    assert read_points([tmp_path / "p.csv"]).view_names == ("board01", "board02", "board03")
+    result = detect(folder / "board01.png", folder / "large.png", *BOARD, "-o", tmp_path / "q.csv")
     assert result.exit_code == 1
     assert "the image large has 420 x 310 px but board01 has 400 x 300 px" in result.stderr
-    assert not (tmp_path / "p.csv").exists()
+    assert not (tmp_path / "q.csv").exists()
 
 
 def test_an_image_comes_from_stdin(folder: Path) -> None:

@@ -157,6 +157,9 @@ def test_no_frame_is_chosen_twice_and_none_of_nothing() -> None:
     assert len(choose_frames(frames, 50)) == 3
     assert len(choose_frames(frames[:8], 50)) == 1
     assert choose_frames([], 50) == []
+    photographs = frames[::8]  # a video of one a second
+    assert choose_frames(photographs, 50, 1.0) == [0, 1, 2]
+    assert len(choose_frames(photographs, 50)) == 1
 
 
 def test_a_folder_is_watched_until_no_more_images_come(

@@ -175,6 +175,13 @@ def test_groff_has_nothing_to_complain_of(name: str) -> None:
     assert "SYNOPSIS" in run.stdout
 
 
+@pytest.mark.skipif(shutil.which("mandoc") is None, reason="mandoc is not installed")
+def test_mandoc_has_nothing_to_complain_of() -> None:
+    pages = sorted(str(path) for path in MAN.glob("*.1"))
+    run = subprocess.run(["mandoc", "-Tlint", *pages], capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout, run.stderr) == (0, "", "")
+
+
 def test_defaults_of_the_options_are_those_of_the_library() -> None:
     from neurocal_cli.methods import DISTORTIONS, METHODS, OUTLIERS, TRAINERS, calibrate
     from neurocal_cli.training.backprop import BackpropOptions

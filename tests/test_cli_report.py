@@ -18,9 +18,11 @@ from support.rigs import random_rig, sides
 from neurocal_cli import write_calibration, write_points, write_rig
 from neurocal_cli.calibration import Rejected, Verdict
 from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map
+from neurocal_cli.html_report.heat_map import heat_map
 from neurocal_cli.io.images import encode_png, parse_image
 from neurocal_cli.io.result_files import write_result
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
+from neurocal_cli.verdict.assessment import uncertainty_over_image
 
 VOID = {"meta", "br"}
 
@@ -119,6 +121,7 @@ def test_a_rig_has_a_page(tmp_path: Path) -> None:
     page = Page(result.stdout)
     for shown in ("Calibration of two cameras", "baseline", "Left camera", "Right camera", "neurocal stereo"):
         assert shown in page.text
+    assert result.stdout.count('class="heat" transform') == 2
 
 
 def test_a_lean_file_and_a_json_file_have_pages(tmp_path: Path) -> None:
@@ -221,7 +224,7 @@ def test_fifty_views_are_less_than_3_mb(tmp_path: Path) -> None:
     write_calibration(made_calibration(50), tmp_path / "camera.yaml")
     result = run("report", tmp_path / "camera.yaml")
     assert len(result.stdout.encode()) < 3e6
-    assert Page(result.stdout).tags.count("figure") == 53
+    assert Page(result.stdout).tags.count("figure") == 54
 
 
 def test_residuals_are_drawn_where_and_as_long_as_they_are() -> None:
@@ -234,6 +237,40 @@ def test_residuals_are_drawn_where_and_as_long_as_they_are() -> None:
     scale = enlargement(residuals, (640, 480))
     assert str(scale)[0] in "125"
     assert 0.015 * 640 < 3 * scale * np.sqrt(np.mean((residuals**2).sum(axis=1))) <= 0.04 * 640
+
+
+def test_the_map_has_each_value_where_it_is_and_none_where_there_is_none() -> None:
+    values = 0.1 * 2.0 ** (np.tile(np.arange(9), (5, 1)) / 2)  # 0.1 to 1.6 from left to right
+    values[:3, :3] = np.nan
+    drawn = heat_map(values, (640, 480), np.array([[5.0, 6.0]]), "px", "a map")
+    columns, covered = -(-120 // 8) * 8, 0
+    for path, opacity, low, high in re.findall(
+        r'<path d="([^"]*)" fill-opacity="([\d.]+)"><title>([\d.]+) to ([\d.]+) px', drawn
+    ):
+        cells = [[int(n) for n in c] for c in re.findall(r"M(\d+) (\d+)h(\d+)v1h-\d+z", path)]
+        covered += sum(length for _, _, length in cells)
+        for column, row, length in cells:
+            place = 8 * np.array([column + 0.5, column + length - 0.5]) / columns
+            shown = 0.1 * 2 ** (place / 2)
+            assert 0.95 * float(low) <= shown[0] <= shown[1] <= 1.05 * float(high)  # of two digits
+            assert column >= 3 * columns / 8 or row >= 2 * 15
+        assert 0 < float(opacity) < 1
+    assert covered == columns * 60 - 45 * 45  # the empty corner reaches to the next places
+    assert "M5 6h0" in drawn
+    assert heat_map(np.full((2, 2), np.nan), (640, 480), np.zeros((0, 2)), "px", "a map") == ""
+
+
+def test_the_page_shows_how_uncertain_the_camera_is(tmp_path: Path) -> None:
+    calibration = made_calibration(3)
+    write_calibration(calibration, tmp_path / "camera.yaml")
+    found = uncertainty_over_image(calibration)
+    assert found is not None
+    page = run("report", tmp_path / "camera.yaml").stdout
+    assert f"middle distance; {found.worst:.3g} px at most" in page
+    assert page.count('class="heat" transform') == 1
+    points = replace(calibration.points, image_size=None)
+    write_calibration(replace(calibration, points=points), tmp_path / "unknown.yaml")
+    assert "projected pixel" not in run("report", tmp_path / "unknown.yaml").stdout
 
 
 def test_bars_are_as_high_as_the_errors() -> None:
@@ -266,3 +303,6 @@ def test_a_zoom_lens_has_a_page(tmp_path: Path) -> None:
     result = run("report", tmp_path / "lens.yaml")
     assert result.exit_code == 0, result.stderr
     assert "Calibration of a zoom lens" in Page(result.stdout).text
+    assert (
+        "zoom from 0 to 3000 from left to right and focus from 0 to 900 from top to bottom" in result.stdout
+    )

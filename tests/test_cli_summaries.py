@@ -56,6 +56,9 @@ def test_quiet_leaves_the_warnings_and_twice_quiet_the_errors(points: Path, tmp_
     images = ["detect", SAMPLES / "board01.png", tmp_path / "bad.png", *BOARD]
     assert "bad.png" in run("-q", *images).stderr
     assert run("-qq", *images).stderr == ""
+    assert (
+        "-q stands before the command: neurocal -q evaluate camera" in run("evaluate", "camera", "-q").stderr
+    )
     result = run("-qq", "calibrate", tmp_path / "none.csv")
     assert result.exit_code == 1
     assert result.stderr.startswith("Error: ")
@@ -124,6 +127,45 @@ def summary(*words: Any) -> dict[str, Any]:
     return told
 
 
+def test_what_undistorts_converts_and_prints_sums_up_as_json(tmp_path: Path) -> None:
+    run(
+        "calibrate",
+        SAMPLES / "fisheye.csv",
+        "--distortion",
+        "fisheye",
+        "--no-skew",
+        "-o",
+        tmp_path / "f.yaml",
+    )
+    camera = read_calibration(tmp_path / "f.yaml")
+    (tmp_path / "bad.png").write_bytes(b"no picture")
+    files = (SAMPLES / "fisheye.csv", tmp_path / "bad.png")
+    told = summary("undistort", tmp_path / "f.yaml", *files, "--fov", 100, "-o", tmp_path / "plane")
+    assert told["files"] == {str(files[0]): str(tmp_path / "plane" / "fisheye.csv")}
+    assert "bad.png" in told["failed"][str(files[1])]
+    assert told["shown_deg"][0] == pytest.approx(100, abs=0.2)
+    assert told["shown_deg"][0] < told["spanned_deg"][0]
+    assert told["camera"]["K"][0][2] == pytest.approx(camera.K[0, 2])
+    told = summary("undistort", tmp_path / "f.yaml", "--to", "cylinder", "--maps", tmp_path / "maps.npz")
+    assert told["camera"]["projection"] == "cylinder"
+
+    told = summary(
+        "convert", tmp_path / "f.yaml", "--to", "ros", "--model", "rational", "-o", tmp_path / "r.yaml"
+    )
+    (named,) = told["cameras"]
+    assert (named["distortion"], named["image_size"]) == ("rational", [640, 480])
+    assert 0 < named["moved"]["rms_px"] < named["moved"]["max_px"]
+    told = summary("convert", tmp_path / "f.yaml", "--to", "kalibr", "-o", tmp_path / "k.yaml")
+    assert told["cameras"][0]["moved"] is None
+    told = summary("convert", SAMPLES / "fisheye.csv", "--to", "json", "-o", tmp_path / "points.json")
+    assert (told["n_points"], told["n_views"]) == (len(camera.points) + camera.n_rejected, 9)
+
+    told = summary("board", *BOARD, "--paper", "A3", "-o", tmp_path / "board.svg")
+    assert told["planes"] == [{"name": "", "cols": 9, "rows": 6, "square": 25.0}]
+    assert (told["paper_mm"], told["board_file"]) == ([297.0, 420.0], str(tmp_path / "board.yaml"))
+    assert run("convert", tmp_path / "f.yaml", "--to", "ros", "--json").exit_code == 2
+
+
 @pytest.mark.slow
 def test_a_target_and_a_zoom_lens_sum_up_as_json(tmp_path: Path) -> None:
     run("calibrate", SAMPLES / "bent.csv", "-o", tmp_path / "bent.yaml")
@@ -131,3 +173,8 @@ def test_a_target_and_a_zoom_lens_sum_up_as_json(tmp_path: Path) -> None:
     assert told["bend"] == pytest.approx(0.6, rel=0.5)
     told = summary("lens", "fit", SAMPLES / "zoom.csv", "-o", tmp_path / "lens.yaml")
     assert told["n_settings"] == 35
+    told = summary(
+        "lens", "camera", tmp_path / "lens.yaml", "--zoom", 250, "--focus", 100, "-o", tmp_path / "c.yaml"
+    )
+    assert told["setting"] == {"zoom": 250, "focus": 100}
+    assert told["parameters"]["alpha_u"]["value"] == read_calibration(tmp_path / "c.yaml").intrinsics.alpha_u

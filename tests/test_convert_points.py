@@ -17,6 +17,7 @@ from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.corner_texts import corner_text
 from neurocal_cli.io.exchange.corners import read_corners
+from neurocal_cli.io.exchange.matlab import saved
 
 BOARD = Board.single(5, 4, 25.0)
 SIZE = ["--cols", 5, "--rows", 4, "--square", 25]
@@ -180,9 +181,10 @@ REFUSED = {
     '{"corners": [[[1, 2], [3, 4]], [[1, 2]]]}': "corners must be the same number of points in each view",
     '{"corners": [[[1, 2]]], "objpoints": [[1, 2, 3], [4, 5, 6]]}': "corners must be 2 points in each view",
     '{"corners": [[["a", 2]]]}': "corners must be the same number",
-    "1 2 3\n": "holds places alone",
+    "1 2 3\n": "/file: holds places alone",
     "1 2 3\n1 2\n": ":2: must be a row of 2 numbers or of 3",
     "# filename x y level\na 1\n": ":2: is no line 'filename x y level'",
+    "Calibration results \n====================\n": "Kalibr has no file of corners",
 }
 
 
@@ -192,6 +194,40 @@ def test_a_fault_is_named(text: str, tmp_path: Path) -> None:
     result = run("convert", tmp_path / "file", "--to", "neurocal")
     assert (result.exit_code, result.stdout) == (1, "")
     assert REFUSED[text] in result.stderr
+
+
+def test_corners_of_matlab_run_down_the_columns_of_the_board(tmp_path: Path) -> None:
+    seen = pixels().round()  # so that pixels counted from 1 are exact
+    down = np.arange(20).reshape(4, 5).T.ravel()
+    matlab = {"imagePoints": np.moveaxis(seen[:, down], 0, 2) + 1}
+    board = {"boardSize": np.array([[5.0, 6.0]]), "squareSize": np.array([[25.0]])}
+    for variables, known in ((matlab, BOARD), (matlab | board, None)):
+        (tmp_path / "points.mat").write_bytes(saved(variables))
+        found = read_corners([tmp_path / "points.mat"], known, [])
+        assert found is not None
+        assert list(rows(found).values()) == [
+            rows(points(seen))[f"im{view}", BOARD.planes[0].vertex_ids()[k]]
+            for view in range(3)
+            for k in down
+        ]
+    for wrong, told in (
+        ({"imagePoints": np.zeros((20, 2, 3, 2))}, "those of two cameras"),
+        (matlab | board | {"boardSize": np.array([[np.nan, 6.0]])}, "are not those of a board"),
+    ):
+        (tmp_path / "wrong.mat").write_bytes(saved(wrong))
+        with pytest.raises(FormatError, match=told):
+            read_corners([tmp_path / "wrong.mat"], None, [])
+
+
+def test_calibrate_says_what_to_do_with_corners_of_other_programs(tmp_path: Path) -> None:
+    np.savez(tmp_path / "corners.npz", corners=pixels())
+    (tmp_path / "corners.vnl").write_text("# filename x y level\na.png 1 2 0\n")
+    for name in ("corners.npz", "corners.vnl"):
+        result = run("calibrate", tmp_path / name)
+        assert result.exit_code == 1
+        assert result.stderr.endswith(
+            "neurocal convert --to neurocal makes one of another program's corners\n"
+        )
 
 
 def test_the_wrong_board_is_named(tmp_path: Path) -> None:

@@ -15,7 +15,16 @@ from support.command_line import run
 from support.made_calibration import made_calibration
 from support.rigs import random_rig, sides
 
-from neurocal_cli import Rig, read_calibration, read_rig, write_calibration, write_points, write_rig
+from neurocal_cli import (
+    Calibration,
+    Rig,
+    read_calibration,
+    read_rig,
+    write_calibration,
+    write_points,
+    write_rig,
+)
+from neurocal_cli.errors import FormatError
 from neurocal_cli.io.calibration_yaml import format_calibration
 from neurocal_cli.io.result_files import write_result
 from neurocal_cli.io.rig_yaml import format_rig
@@ -127,6 +136,50 @@ def test_a_file_of_500_views_loads_at_once_and_has_all(tmp_path: Path) -> None:
     write_calibration(cal, tmp_path / "camera.json")
     tree = json.loads((tmp_path / "camera.json").read_text())["neurocal"]
     assert (tree["format"], len(tree["observations"]["rows"]), len(tree["views"])) == (1, len(points), 500)
+
+
+def with_all_digits(views: int, points: int) -> Calibration:
+    """Points with covariances, all numbers of 17 digits."""
+    cal = made_calibration(views)
+    chosen = cal.points.select(np.arange(len(cal.points)) % 190 < points)
+    noise = np.random.default_rng(0).normal(0, 0.1, (len(chosen), 4))
+    covariance = np.column_stack([noise[:, 0] ** 2, noise[:, 0] * noise[:, 1], 2 * noise[:, 1] ** 2])
+    return replace(cal, points=replace(chosen, pixels=chosen.pixels + noise[:, 2:], covariance=covariance))
+
+
+def test_many_numbers_of_many_digits_are_packed(tmp_path: Path) -> None:
+    """A fifth of the characters, and PyYAML takes its time for each."""
+    cal = with_all_digits(150, 190)
+    write_calibration(cal, tmp_path / "camera.yaml")
+    text = (tmp_path / "camera.yaml").read_text()
+    assert len(text) < 7 * 5 * len(cal.points)
+    back = read_calibration(tmp_path / "camera.yaml")
+    assert back.points.covariance is not None
+    assert cal.points.covariance is not None
+    assert back.points.covariance.tobytes() == cal.points.covariance.tobytes()
+    assert back.points.pixels.tobytes() == cal.points.pixels.tobytes()
+    assert format_calibration(back) == text
+    storage = cv2.FileStorage(str(tmp_path / "camera.yaml"), cv2.FILE_STORAGE_READ)
+    rows = storage.getNode("neurocal").getNode("observations").getNode("views")
+    packed = rows.at(2).at(2).string()  # a view has two rows
+    u = np.frombuffer(packed.encode("utf-32-le"), "<u4").astype("<u2").view("<f8")
+    assert u.tolist() == cal.points.pixels[190:350, 0].tolist()
+    first = rows.at(0).at(2).string()
+    for wrong in (first[:-1], f"{first[:-1]}A", "1.0,2.0"):
+        (tmp_path / "wrong.yaml").write_text(text.replace(first, wrong))
+        with pytest.raises(FormatError, match=r"observations\.views\[0\]\[2\] must be"):
+            read_calibration(tmp_path / "wrong.yaml")
+
+
+@pytest.mark.slow
+def test_a_file_of_500_views_with_all_digits_and_covariances_loads_at_once() -> None:
+    text = format_calibration(with_all_digits(500, 93))
+    times = []
+    for _ in range(3):
+        start = time.process_time()
+        yaml.safe_load(text)
+        times.append(time.process_time() - start)
+    assert min(times) < 1.0
 
 
 def test_the_commands_write_what_the_name_says(tmp_path: Path) -> None:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.options import Command, FiniteNumber
+from neurocal_cli.commands.options import Command, FiniteNumber, json_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import say, warn
+from neurocal_cli.commands.summaries import print_summary
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ _ENDINGS = (".svg", ".pdf", ".png")
     show_default="required",
     help="Write the target to this .pdf, .svg or .png file, and the board file beside it.",
 )
+@json_option
 def board(
     board: str | None,
     cols: int | None,
@@ -56,6 +58,7 @@ def board(
     paper: str,
     dpi: float,
     output: str,
+    as_json: bool,
 ) -> None:
     """Draw a chessboard target to print.
 
@@ -76,7 +79,7 @@ def board(
       neurocal board --cols 11 --rows 8 --square 28 --paper A3 -o large.svg
       neurocal board --cols 8 --rows 5 --square 1 --unit inch --paper letter \\
           --dpi 150 -o letter.png
-      neurocal board --board target.yaml -o again.pdf
+      neurocal board --board target.yaml --json -o again.pdf
     """  # noqa: D301 - as in the group
     ending = os.path.splitext(output)[1].lower()
     if ending not in _ENDINGS:
@@ -95,7 +98,7 @@ def board(
         from neurocal_cli.io.board_yaml import write_board
 
         write_board(target, beside)
-    _report(target, sheet, beside)
+    _report(target, sheet, beside, as_json)
 
 
 def _write(sheet: Sheet, output: str, ending: str, dpi: float) -> None:
@@ -108,7 +111,7 @@ def _write(sheet: Sheet, output: str, ending: str, dpi: float) -> None:
         write_whole(output, board_pdf(sheet) if ending == ".pdf" else board_png(sheet, dpi))
 
 
-def _report(target: Board, sheet: Sheet, beside: str | None) -> None:
+def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> None:
     alike = [p for p in target.planes if (p.cols - p.rows) % 2 == 0]
     if alike and len(target.planes) == 1:
         cols, rows = alike[0].cols, alike[0].rows
@@ -118,6 +121,12 @@ def _report(target: Board, sheet: Sheet, beside: str | None) -> None:
                 f"{cols} x {max(2, rows - 1)} would not"
             ]
         )
+    if as_json:
+        keys = ("name", "cols", "rows", "square")
+        planes = [{key: getattr(plane, key) for key in keys} for plane in target.planes]
+        paper = [sheet.width, sheet.height]
+        print_summary({"unit": target.unit, "planes": planes, "paper_mm": paper, "board_file": beside})
+        return
     for plane in target.planes:
         name = f"{plane.name}: " if plane.name else ""
         say(f"{name}{plane.cols} x {plane.rows} inner vertices, square {plane.square:g} {target.unit}")

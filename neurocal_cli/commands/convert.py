@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -11,6 +12,7 @@ from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.options import INPUT, Argument, Command
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 
     from neurocal_cli.board import Board
     from neurocal_cli.io.exchange.camera_set import CameraSet
+    from neurocal_cli.io.exchange.fitting_in import Fitted
     from neurocal_cli.points import Correspondences
 
 __all__ = ["convert"]
@@ -72,6 +75,7 @@ _SIZE = click.IntRange(1, 1_000_000)
     show_default="as the file says",
     help="Size of the images in pixels, if the file does not say.",
 )
+@summary_option
 @click.option(
     "-o",
     "--output",
@@ -92,6 +96,7 @@ def convert(
     square: float | None,
     unit: str | None,
     image_size: tuple[int, int] | None,
+    as_json: bool,
     output: str,
 ) -> None:
     """Convert cameras, rigs and points to the formats of other programs.
@@ -130,7 +135,8 @@ def convert(
           --image-size 640 480 -o camchain.yaml
       neurocal convert camchain.yaml --to neurocal | neurocal convert - --to ros
       neurocal calibrate sample_data/fisheye.csv --no-skew -o fisheye.yaml
-      neurocal convert fisheye.yaml --to ros --model rational -o rational.yaml
+      neurocal convert fisheye.yaml --to ros --model rational --json \\
+          -o rational.yaml
       neurocal detect sample_data/board*.png --cols 9 --rows 6 --square 25 \\
           --points vertices -o points.csv
       neurocal convert points.csv --to mrcal -o corners.vnl
@@ -140,13 +146,14 @@ def convert(
           -o corners.npz
     """  # noqa: D301 - as in the group
     check_one_stdin(*files, board)
+    check_summary(as_json, output)
     check_outputs((None if os.path.isdir(output) else output,), (*files, board))
     target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
     points = _points(files, target_board, unit, image_size)
     if points is not None:
         if model is not None:
             raise UsageError("FILE holds points, which have no distortion model; leave out --model")
-        _write_points(points, target, output)
+        _write_points(points, target, output, as_json)
         return
     if target_board is not None:
         raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
@@ -163,6 +170,27 @@ def convert(
     note(fitted.remarks)
     warn(fitted.losses)
     _write(contents, output, target)
+    if as_json:
+        print_summary(_summary(fitted, cameras.program, target))
+
+
+def _summary(fitted: Fitted, program: str, target: str) -> dict[str, Any]:
+    cameras = [
+        {
+            "name": camera.name,
+            "distortion": camera.distortion.model,
+            "image_size": camera.image_size,
+            "moved": None if moved is None else asdict(moved),
+        }
+        for camera, moved in zip(fitted.cameras.cameras, fitted.moved, strict=True)
+    ]
+    return {
+        "from": program,
+        "to": target,
+        "cameras": cameras,
+        "n_views": len(fitted.cameras.poses),
+        "warnings": [*fitted.losses, *fitted.remarks],
+    }
 
 
 def _points(
@@ -186,13 +214,17 @@ def _points(
     return points
 
 
-def _write_points(points: Correspondences, target: str, output: str) -> None:
+def _write_points(points: Correspondences, target: str, output: str, as_json: bool) -> None:
     from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
     from neurocal_cli.io.writing import write_whole
 
     text = corner_text(points, target, os.path.splitext(output)[1].lower())
-    warn(points_lost(points, target))
+    lost = points_lost(points, target)
+    warn(lost)
     write_whole(output, text)
+    if as_json:
+        print_summary({"to": target, "n_points": len(points), "n_views": points.n_views, "warnings": lost})
+        return
     say(f"{len(points)} points of {points.n_views} view{'s' * (points.n_views != 1)}")
 
 

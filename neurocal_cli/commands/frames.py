@@ -38,7 +38,7 @@ def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[st
 
 def _frames(path: str, folder: str, most: int) -> list[str]:
     from neurocal_cli.detection.frames import choose_frames
-    from neurocal_cli.io.video import save_frame, video_frames
+    from neurocal_cli.io.video import frame_rate, save_frame, video_frames
 
     name = os.path.splitext(os.path.basename(path))[0]
     total = 0
@@ -51,7 +51,7 @@ def _frames(path: str, folder: str, most: int) -> list[str]:
                 progress(f"choosing frames of {name}", 0.0)
                 yield grey
 
-        numbers = choose_frames(counted(), most)  # type: ignore[arg-type]
+        numbers = choose_frames(counted(), most, frame_rate(path))  # type: ignore[arg-type]
     wanted, saved = set(numbers), []
     for number, grey in enumerate(video_frames(path)):
         if number in wanted:

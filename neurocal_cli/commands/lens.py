@@ -245,6 +245,7 @@ def _write(learnt: ZoomLens, output: str, plot: str | None) -> None:
 @click.option(
     "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
 )
+@summary_option
 @output_option("CAMERA.yaml", "the calibration")
 def camera(
     lens_file: str,
@@ -252,6 +253,7 @@ def camera(
     focus: float | None,
     extrapolate: bool,
     camera_name: str,
+    as_json: bool,
     output: str,
 ) -> None:
     """Write the camera at one setting of a zoom lens.
@@ -264,11 +266,12 @@ def camera(
       neurocal lens fit sample_data/zoom.csv -o lens.yaml
       neurocal lens camera lens.yaml --zoom 1250 --focus 400 -o camera.yaml
       neurocal lens camera lens.yaml --zoom 3100 --focus 400 --extrapolate \\
-          --camera-name tele -o tele.yaml
+          --camera-name tele --json -o tele.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     if not camera_name.strip() or not camera_name.isprintable():
         raise UsageError("--camera-name must hold printable characters only; give another name")
+    check_summary(as_json, output)
     check_outputs((output,), (lens_file,))
     from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.lens_yaml import read_lens
@@ -278,7 +281,12 @@ def camera(
     setting, warnings = learnt.setting_of({"zoom": zoom, "focus": focus}, extrapolate)
     calibration = camera_at(learnt, setting, camera_name, tuple(warnings))
     write_calibration(calibration, output)
-    if output != "-":
+    if as_json:
+        from neurocal_cli.report import calibration_json
+
+        chosen = dict(zip(learnt.controls, setting.tolist(), strict=True))
+        print_summary({"setting": chosen, **calibration_json(calibration)})
+    elif output != "-":
         from neurocal_cli.zoom_lens.report import camera_report
 
         say(camera_report(calibration))

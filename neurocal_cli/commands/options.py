@@ -44,6 +44,17 @@ class Argument(click.Argument):
 class Command(click.Command):
     """A command whose help lists its arguments before its options."""
 
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse, and say where --quiet and --verbose stand."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if error.option_name not in ("-q", "--quiet", "-v", "--verbose"):
+                raise
+            line = " ".join(["neurocal", error.option_name, *ctx.command_path.split()[1:]])
+            told = f"{error.option_name} stands before the command: {line}"
+            raise click.NoSuchOption(error.option_name, told, ctx=ctx) from None
+
     def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """Write the arguments, then the options."""
         rows = [(str(p.metavar), p.description) for p in self.params if isinstance(p, Argument)]

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -14,6 +14,7 @@ from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, complain, is_terminal, note, say
+from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
 
 if TYPE_CHECKING:
@@ -95,6 +96,7 @@ _UNTOLD = 2.0  # degrees that nobody misses
     show_default="none",
     help="Write the tables u and v for cv2.remap to this file.",
 )
+@summary_option
 @click.option(
     "-o",
     "--output",
@@ -114,6 +116,7 @@ def undistort(
     interpolation: str,
     new_camera: str | None,
     maps: str | None,
+    as_json: bool,
     output: str,
 ) -> None:
     """Remove the lens distortion from images and points.
@@ -142,7 +145,7 @@ def undistort(
           | neurocal calibrate - --distortion k1 -o small.yaml
       neurocal undistort small.yaml sample_data/board*.png -o undistorted
       neurocal undistort small.yaml sample_data/board01.png --alpha 0 \\
-          --interpolation linear --camera new.yaml -o board01_undistorted.png
+          --interpolation linear --camera new.yaml --json -o board01_undistorted.png
       neurocal calibrate sample_data/fisheye.csv --no-skew -o fisheye.yaml
       neurocal undistort fisheye.yaml sample_data/fisheye.csv --fov 100 -o plane.csv
       neurocal undistort fisheye.yaml --to cylinder --fov 140 --size 800 480 \\
@@ -152,6 +155,7 @@ def undistort(
     _check_view(shape, fov, size, alpha)
     if not files and maps is None and new_camera is None:
         raise UsageError("there is nothing to undistort; give FILE, --maps or --camera")
+    check_summary(as_json and bool(files), output)
     from neurocal_cli.io.camera_files import read_intrinsics
     from neurocal_cli.io.image_paths import find_images
 
@@ -162,15 +166,19 @@ def undistort(
     _check_outputs(camera, paths, outputs, {"the new camera": new_camera, "the tables": maps})
     check_outputs((new_camera, maps, *(outputs if folder is None else ())), (camera, *paths))
     work = _Work(read_intrinsics(camera), _View(shape, fov, size, alpha), interpolation, folder)
-    done = _correct_all(work, paths, outputs) if paths else 0
+    failed = _correct_all(work, paths, outputs) if paths else {}
     note(f"{_some(names)}: {text}" for text, names in work.notes.items())
     if new_camera is not None:
         work.write_camera(new_camera)
     if maps is not None:
         work.write_maps(maps)
+    if as_json:
+        written = {path: place for path, place in zip(paths, outputs, strict=True) if path not in failed}
+        print_summary({"files": written, "failed": failed, **work.summary()})
+        return
     work.tell_loss()
     if len(paths) > 1:
-        say(f"undistorted {done} of {len(paths)} files")
+        say(f"undistorted {len(paths) - len(failed)} of {len(paths)} files")
 
 
 def _check_view(shape: str, fov: float | None, size: tuple[int, int] | None, alpha: float | None) -> None:
@@ -235,23 +243,23 @@ def _check_outputs(
         taken[place] = source
 
 
-def _correct_all(work: _Work, paths: Sequence[str], outputs: Sequence[str]) -> int:
-    """Correct all files; of several those that fail are named and left out. How many were written."""
+def _correct_all(work: _Work, paths: Sequence[str], outputs: Sequence[str]) -> dict[str, str]:
+    """Correct all files; of several those that fail are told and left out. These, with the reasons."""
+    failed: dict[str, str] = {}
     if len(paths) == 1:
         work.correct(paths[0], outputs[0])
-        return 1
-    done = 0
+        return failed
     with ProgressBar() as progress:
         for number, (path, output) in enumerate(zip(paths, outputs, strict=True), start=1):
             try:
                 work.correct(path, output)
-                done += 1
             except (InputError, FormatError) as error:
                 complain(str(error))
+                failed[path] = str(error)
             progress(f"{number} of {len(paths)} files", number / len(paths))
-    if not done:
+    if len(failed) == len(paths):
         raise NeurocalError(f"none of the {len(paths)} files could be undistorted; see the reasons above")
-    return done
+    return failed
 
 
 @dataclass(frozen=True)
@@ -273,6 +281,7 @@ class _Work:
     interpolation: str
     folder: str | None
     notes: dict[str, list[str]] = field(default_factory=dict)
+    left_out: int = 0  # points that the result cannot show
     size: tuple[int, int] | None = None
     remapping: Remapping | None = None
 
@@ -344,6 +353,7 @@ class _Work:
         kept = shown(points, self.camera, new)
         if not kept.any():
             raise InputError(f"{points.source}: no plane shows its points; add --to cylinder")
+        self.left_out += int((~kept).sum())
         if not kept.all():
             notes.append(
                 f"{points.source}: {(~kept).sum()} of {len(points)} points are left out, which are 90 "
@@ -359,17 +369,12 @@ class _Work:
 
     def tell_loss(self) -> None:
         """Say how much of a wide lens's field of view the results leave out."""
-        from neurocal_cli.distortion.undistorted_view import field_of_view
-
         if not self.camera.distortion.wide or self.size is None:
             return
-        new = self.new()
-        whole = field_of_view(self.camera, self.size)
-        seen = field_of_view(new, new.image_size or self.size).common(whole)
         parts = [
             f"{shown:.0f} of the {there:.0f} degrees {where}"
             for shown, there, where in zip(
-                seen.degrees, whole.degrees, ("from left to right", "from top to bottom"), strict=True
+                *self.fields_of_view(self.size), ("from left to right", "from top to bottom"), strict=True
             )
             if there - shown >= _UNTOLD
         ]
@@ -380,6 +385,31 @@ class _Work:
             )
             name = f"a {shape}" if shape != "equirectangular" else "the picture"
             say(f"{name} shows {' and '.join(parts)} that the images span; {more} shows more")
+
+    def fields_of_view(self, size: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float]]:
+        """What the results show and what the images span, from left to right and top to bottom [degrees]."""
+        from neurocal_cli.distortion.undistorted_view import field_of_view
+
+        new = self.new()
+        whole = field_of_view(self.camera, size)
+        return field_of_view(new, new.image_size or size).common(whole).degrees, whole.degrees
+
+    def summary(self) -> dict[str, Any]:
+        """Tell what the results are, for programs."""
+        shown, spanned = (None, None) if self.size is None else self.fields_of_view(self.size)
+        camera = {
+            key: getattr(value, "tolist", lambda v=value: v)() for key, value in self.described().items()
+        }
+        return {"n_left_out": self.left_out, "shown_deg": shown, "spanned_deg": spanned, "camera": camera}
+
+    def described(self) -> dict[str, Any]:
+        """The camera of the results, by names."""
+        from neurocal_cli.distortion.panorama import Panorama
+
+        new = self.new()
+        if isinstance(new, Panorama):
+            return {"projection": new.shape, "f": new.f, "u0": new.u0, "v0": new.v0}
+        return {"projection": "plane", "K": new.A}
 
     def write_camera(self, path: str) -> None:
         """Write the camera of what was corrected."""
@@ -395,18 +425,11 @@ class _Work:
 
     def write_maps(self, path: str) -> None:
         """Write the tables, and the camera of the pictures that they make."""
-        from neurocal_cli.distortion.panorama import Panorama
         from neurocal_cli.io.exchange.dictionary import npz_bytes
         from neurocal_cli.io.writing import write_whole
 
-        remapping = self.remap()
-        new = remapping.new
-        u, v = remapping.tables()
-        if isinstance(new, Panorama):
-            camera = {"projection": new.shape, "f": new.f, "u0": new.u0, "v0": new.v0}
-        else:
-            camera = {"projection": "plane", "K": new.A}
-        write_whole(path, npz_bytes({"u": u, "v": v, **camera}))
+        u, v = self.remap().tables()
+        write_whole(path, npz_bytes({"u": u, "v": v, **self.described()}))
 
 
 def _size(size: tuple[int, int] | None) -> str:

@@ -18,7 +18,8 @@ from neurocal_cli.geometry import Array
 
 __all__ = ["choose_frames"]
 
-_STRETCH = 8  # frames, a quarter of a second: of a hand that shakes, some moment is still
+_STRETCH = 0.25  # seconds: of a hand that shakes, some moment is still
+_LONGEST = 60  # frames
 _WIDTH = 640  # px; sharpness is seen there as well, and costs less
 _THUMB = (48, 36)  # px
 _SHARP = 0.4  # of the median sharpness of the stretches
@@ -34,7 +35,7 @@ class _Best:
     thumb: Array
 
 
-def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int) -> list[int]:
+def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int, rate: float = 30.0) -> list[int]:
     """Choose frames by their numbers, in the order of the video.
 
     Parameters
@@ -42,11 +43,14 @@ def choose_frames(frames: Iterable[NDArray[np.uint8]], most: int) -> list[int]:
     frames : iterable of (height, width) uint8 arrays
     most : int
         Frames to choose at most.
+    rate : float
+        Frames a second; of a slow video, such as one of single photographs, each frame may be chosen.
     """
+    length = int(np.clip(round(_STRETCH * rate), 1, _LONGEST))
     stretches: list[_Best] = []
     for number, grey in enumerate(frames):
         seen = _seen(number, grey)
-        if number % _STRETCH == 0:
+        if number % length == 0:
             stretches.append(seen)
         elif seen.sharpness > stretches[-1].sharpness:
             stretches[-1] = seen

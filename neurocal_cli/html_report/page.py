@@ -32,7 +32,7 @@ th,td{padding:.25rem .8rem .25rem 0;text-align:right;vertical-align:top;white-sp
 border-bottom:1px solid var(--edge)}td.text{text-align:left;white-space:normal;min-width:12rem}
 th:first-child,td:first-child{text-align:left}
 th button{all:unset;cursor:pointer;text-decoration:underline dotted}th button:focus-visible{outline:2px solid}
-.figures{display:grid;gap:1rem;grid-template-columns:repeat(auto-fit,minmax(min(100%,300px),1fr))}
+.figures{display:grid;gap:1rem;grid-template-columns:repeat(auto-fill,minmax(min(100%,380px),1fr))}
 .views{display:grid;gap:.6rem;grid-template-columns:repeat(auto-fill,minmax(min(100%,170px),1fr))}
 .wider{grid-template-columns:repeat(auto-fill,minmax(min(100%,250px),1fr))}
 figure{margin:0;break-inside:avoid}figcaption{color:var(--soft);font-size:.85rem;overflow-wrap:anywhere}
@@ -41,6 +41,7 @@ svg{display:block;width:100%;height:auto;fill:var(--ink)}.views svg{cursor:zoom-
 .dots{stroke:var(--accent);stroke-linecap:round;fill:none}.lines{stroke:var(--line);fill:none}
 .out{stroke:var(--poor);fill:none}image{opacity:.6}
 image~.dots{stroke:#00b7ff}image~.lines,image~.out{stroke:#ff1f4b}
+.heat{fill:var(--accent);shape-rendering:crispEdges}.marks{stroke:var(--ink);stroke-linecap:round;fill:none}
 .axis{stroke:var(--soft);stroke-width:.03;fill:none}.bar{fill:var(--accent)}
 dialog{width:min(96vw,1200px);border:1px solid var(--edge);background:var(--paper);color:var(--ink)}
 dialog::backdrop{background:#000a}dl{display:grid;grid-template-columns:auto 1fr;gap:.2rem 1rem}

@@ -8,13 +8,16 @@ from html import escape
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map, scatter
+from neurocal_cli.html_report.heat_map import heat_map
 from neurocal_cli.html_report.origin import Origin
 from neurocal_cli.html_report.page import definitions, figure, page, section, table, verdict_block
 from neurocal_cli.report import parameter_rows, printable
 from neurocal_cli.stereo.report import camera_rows, rig_rows
 from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.verdict.assessment import uncertainty_over_image
 from neurocal_cli.verdict.report import verdict_lines
 from neurocal_cli.zoom_lens.judgement import judge_lens
 from neurocal_cli.zoom_lens.report import lens_report
@@ -23,6 +26,7 @@ from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 __all__ = ["calibration_page", "lens_page", "rig_page"]
 
 _MOST_REJECTED = 200  # rows
+_SETTINGS = 25  # along a control
 
 
 def calibration_page(
@@ -85,12 +89,41 @@ def lens_page(lens: ZoomLens, origin: Origin) -> str:
     parts = [
         verdict_block(verdict, _facts(verdict)),
         section("Summary", f'<div class="wide"><pre>{escape(lens_report(lens))}</pre></div>'),
+        section("Uncertainty over the settings", f'<div class="figures">{_over_settings(lens)}</div>'),
         section(
             "How to repeat it",
             _origin(f"neurocal lens fit POINTS.csv --seed {lens.seed} -o LENS.yaml", origin, {}),
         ),
     ]
     return page("Calibration of a zoom lens", parts)
+
+
+def _over_settings(lens: ZoomLens) -> str:
+    """A map of the focal length's relative standard deviation over the range of zoom and focus."""
+    low, span = lens.low, np.maximum(lens.high - lens.low, 1e-300)
+    share = np.linspace(0, 1, _SETTINGS)
+    grid = np.stack(np.meshgrid(share, share if len(low) > 1 else [0.0, 1.0]), axis=-1)
+    settings = low + span * grid.reshape(-1, 2)[:, : len(low)]
+    try:
+        prediction = lens.predict(settings)
+    except InputError:  # nothing to show of networks that give no camera there
+        return ""
+    percent = 100 * prediction.std[:, 0] / prediction.local[:, 0]
+    height = 0.75 if len(low) > 1 else 0.15
+    dots = np.column_stack([(lens.settings - low) / span, np.full((len(lens.settings), 1), 0.5)])[:, :2]
+    ranges = " and ".join(
+        f"{name} from {a:.6g} to {b:.6g} {where}"
+        for name, a, b, where in zip(
+            lens.controls, low, lens.high, ("from left to right", "from top to bottom"), strict=False
+        )
+    )
+    return figure(
+        heat_map(
+            percent.reshape(len(grid), -1), (640.0, 640 * height), dots * (640.0, 640 * height), "%",
+            "standard deviation of the focal length",
+        ),
+        f"Standard deviation of alpha_u in per cent, {ranges}. Dots are the calibrated settings.",
+    )  # fmt: skip
 
 
 def _camera_parts(
@@ -111,16 +144,37 @@ def _camera_parts(
                 f"Residuals (projected minus observed) of all points, {scale:.3g} times enlarged. Where "
                 "there are no points the camera is extrapolated.",
             ),
+            _uncertainty(calibration),
             figure(
                 scatter(residuals),
                 "du and dv. Noise makes a round cloud about the middle; the circle is three times its rms.",
             ),
             figure(error_bars(names, errors, calibration.rmse_px), "Error of each view, in their order."),
         ]
-        parts.append(section("Residuals", f'<div class="figures">{"".join(drawings)}</div>'))
+        parts.append(section("Residuals and uncertainty", f'<div class="figures">{"".join(drawings)}</div>'))
         parts += _view_parts(calibration, residuals, size, scale, photographs)
     parts += [_rejected(calibration), _warnings(calibration.warnings)]
     return parts
+
+
+def _uncertainty(calibration: Calibration) -> str:
+    """A map of the standard deviation of projected pixels at the points' middle distance."""
+    found = uncertainty_over_image(calibration)
+    if found is None or calibration.image_size is None:
+        return ""
+    rows = len(np.unique(found.pixels[:, 1]))
+    drawing = heat_map(
+        found.std[1].reshape(rows, -1),
+        calibration.image_size,
+        calibration.points.pixels,
+        "px",
+        "standard deviation of projected pixels",
+    )
+    return figure(
+        drawing,
+        "How uncertain the camera is: standard deviation of a projected pixel, for points at the middle "
+        f"distance; {found.worst:.3g} px at most. Dots are the points of all views.",
+    )
 
 
 def _residuals(calibration: Calibration) -> Array:

@@ -112,7 +112,7 @@ def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
     return decode(data, source, kind), source
 
 
-def decode(data: bytes, source: str, kind: str = "a text file") -> str:
+def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "") -> str:
     """Decode UTF-8, with or without a byte order mark.
 
     Parameters
@@ -122,6 +122,8 @@ def decode(data: bytes, source: str, kind: str = "a text file") -> str:
         Name for messages.
     kind : str
         What the file should be, for the message about a binary file.
+    instead : str
+        Appended to that message.
 
     Raises
     ------
@@ -136,7 +138,7 @@ def decode(data: bytes, source: str, kind: str = "a text file") -> str:
     if b"\0" in data:
         if _alternates_with_nul(data):
             raise FormatError("is UTF-16 text; save it as UTF-8", source)
-        raise FormatError(f"is a binary file, not {kind}; give {kind}", source)
+        raise FormatError(f"is a binary file, not {kind}; give {kind}{instead}", source)
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:

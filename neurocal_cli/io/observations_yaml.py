@@ -1,7 +1,7 @@
 """The points that a calibration was found from, as a block of its file.
 
 A row for each point; or, in a long file, each place of the target once, and a row for each view whose numbers
-are texts.
+are texts: decimals, or packed where there are so many digits that PyYAML would take long.
 """
 
 from __future__ import annotations
@@ -19,9 +19,11 @@ from neurocal_cli.io.text_columns import (
     LONGEST,
     column_lines,
     join_ranges,
-    number_texts,
+    number_words,
+    packed_text,
     read_columns,
     read_numbers,
+    read_packed,
     read_ranges,
 )
 from neurocal_cli.io.tree_fields import Field
@@ -34,6 +36,8 @@ _PLACE = ("X", "Y", "Z")
 _PIXEL = ("u", "v")
 _COVARIANCE = ("suu", "suv", "svv")
 _ACROSS = ("nu", "nv")
+
+_MOST_CHARACTERS = 1_500_000  # of decimals: half a second of PyYAML
 
 
 def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
@@ -74,13 +78,23 @@ def _long_lines(points: Correspondences, measured: Array) -> Iterator[str]:
     coordinates = {name: points.world[first, k] for k, name in enumerate(_PLACE)}
     yield "places:  # each place of the target once; its columns"
     yield from (f"  {line}" for line in column_lines({**labels, **coordinates}))
+    words = [number_words(column) for column in measured.T]
+    characters = sum(len(word) + 1 for column in words for word in column)
+    packed = characters > _MOST_CHARACTERS
+    if packed:
+        yield "numbers: packed"
     yield "views:  # name, its points among the places, and a text for each of the columns that follow Z"
+    if packed:
+        yield "  # np.frombuffer(text.encode('utf-32-le'), '<u4').astype('<u2').view('<f8')"
     starts = np.flatnonzero(np.diff(points.view_index, prepend=-1))
     for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(points)], strict=True):
         name = quoted(points.view_names[points.view_index[start]])
         for k in range(start, end, LONGEST):
             rows = slice(k, min(k + LONGEST, end))
-            texts = [text for column in measured[rows].T for text in number_texts(column)]
+            if packed:
+                texts = [packed_text(column) for column in measured[rows].T]
+            else:
+                texts = [f"'{','.join(column[rows])}'" for column in words]
             yield f"    - [{name}, {', '.join([repr(join_ranges(place[rows])), *texts])}]"
 
 
@@ -173,6 +187,9 @@ def _long_columns(observations: Field) -> dict[str, list[Any]]:
     names = _names(observations)
     places = read_columns(observations["places"], frozenset(("point",)))
     measured = [name for name in names if name not in places and name != "view"]
+    packed = "numbers" in observations
+    if packed and observations["numbers"].text() != "packed":
+        observations["numbers"].fail("packed, or not there")
     if set(places) - {"point"} != set(_PLACE) or "view" not in names:
         observations["places"].fail("the columns X, Y, Z and point, if the points have names")
     columns: dict[str, list[Any]] = {name: [] for name in names}
@@ -185,7 +202,7 @@ def _long_columns(observations: Field) -> dict[str, list[Any]]:
         for name, values in places.items():
             columns[name] += [values[row] for row in rows]
         for name, text in zip(measured, texts, strict=True):
-            numbers = read_numbers([text])
+            numbers = read_packed(text) if packed else read_numbers([text])
             if len(numbers) != len(rows):
                 text.fail(f"{len(rows)} numbers")
             columns[name] += numbers

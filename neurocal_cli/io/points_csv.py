@@ -23,6 +23,7 @@ POINTS = Schema(
     optional=("view", "point", "sigma", *COVARIANCE, *ACROSS, *SETTINGS),
     labels=frozenset({"view", "point"}),
     headerless=("X", "Y", "Z", "u", "v"),
+    instead="; neurocal convert --to neurocal makes one of another program's corners",
 )
 
 

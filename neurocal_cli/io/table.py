@@ -162,7 +162,7 @@ def _no_rows(source: str, schema: Schema, layout: Layout) -> FormatError:
 def _plain_lines(data: bytes, source: str, schema: Schema) -> bytes:
     r"""UTF-8 without a mark and with ``\n`` line ends; refuses bytes that are not UTF-8."""
     if not data.isascii() or b"\0" in data:
-        decode(data, source, f"a CSV file of {schema.kind}")
+        decode(data, source, f"a CSV file of {schema.kind}", schema.instead)
     data = data.removeprefix(b"\xef\xbb\xbf")
     return data.replace(b"\r\n", b"\n").replace(b"\r", b"\n") if b"\r" in data else data
 

@@ -43,6 +43,8 @@ class Schema:
     required, optional : tuple of str
     labels : frozenset of str
         The columns that hold text; all others hold numbers.
+    instead : str
+        What to do with a file that is none at all, for messages.
     headerless : tuple of str
         Columns of a file without a header; empty: the header is required.
     """
@@ -52,6 +54,7 @@ class Schema:
     optional: tuple[str, ...] = ()
     labels: frozenset[str] = frozenset()
     headerless: tuple[str, ...] = ()
+    instead: str = ""
 
     @property
     def known(self) -> tuple[str, ...]:
@@ -259,6 +262,8 @@ def _check_names(names: list[str], source: str, number: int, schema: Schema) -> 
     lower = {name.lower(): name for name in names}
     similar = [f"{lower[name.lower()]} as {name}" for name in missing if name.lower() in lower]
     hint = f"write {', '.join(similar)}" if similar else f"name the columns {','.join(schema.required)}"
+    if len(missing) == len(schema.required) and not similar:
+        hint += schema.instead
     found = ",".join(names)
     raise FormatError(
         f"column{'s' * (len(missing) > 1)} {', '.join(missing)} missing from the header "

@@ -16,9 +16,10 @@ from neurocal_cli.io.image_headers import is_video_header
 from neurocal_cli.io.images import captured_stderr, encode_png
 from neurocal_cli.io.writing import write_whole
 
-__all__ = ["is_video", "save_frame", "video_frames"]
+__all__ = ["frame_rate", "is_video", "save_frame", "video_frames"]
 
 _HEAD = 16  # bytes that tell a kind of file
+_USUAL, _FASTEST = 30.0, 1e4  # frames a second
 
 
 def is_video(path: str) -> bool:
@@ -57,6 +58,15 @@ def video_frames(path: str) -> Iterator[NDArray[np.uint8]]:
             "images from it, as with `ffmpeg -i VIDEO -vf fps=1 frame%03d.png`",
             one_line(path),
         )
+
+
+def frame_rate(path: str) -> float:
+    """Frames a second, as the video says; 30 where it says nothing that can be."""
+    with captured_stderr():
+        capture = cv2.VideoCapture(path)
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        capture.release()
+    return rate if 0 < rate < _FASTEST else _USUAL
 
 
 def save_frame(grey: NDArray[np.uint8], path: str) -> None:

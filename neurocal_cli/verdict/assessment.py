@@ -60,7 +60,7 @@ from neurocal_cli.verdict.stated_noise import stated_noise
 from neurocal_cli.verdict.view_change import ViewChange, view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
-__all__ = ["assess", "gather_evidence"]
+__all__ = ["assess", "gather_evidence", "uncertainty_over_image"]
 
 _STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
 _IN_PLANE = 1e-9  # depth over the largest one that rounding leaves of 0
@@ -85,7 +85,7 @@ def gather_evidence(calibration: Calibration) -> Evidence:
 
 def assess(calibration: Calibration) -> Verdict | None:
     """Good, usable or poor, with the reasons; None for a calibration that holds no points of its own."""
-    if not calibration.views or set(calibration.points.view_names) != set(calibration.views):
+    if not _has_points(calibration):
         return None
     behind = _views_behind(calibration)
     if behind:
@@ -96,6 +96,18 @@ def assess(calibration: Calibration) -> Verdict | None:
             {},
         )
     return reach_verdict(calibration, gather_evidence(calibration))
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def uncertainty_over_image(calibration: Calibration) -> ProjectionUncertainty | None:
+    """How uncertain projected pixels are; None without points or the size of the images."""
+    if not _has_points(calibration) or _views_behind(calibration):
+        return None
+    return _AtMinimum(calibration).projection()
+
+
+def _has_points(calibration: Calibration) -> bool:
+    return bool(calibration.views) and set(calibration.points.view_names) == set(calibration.views)
 
 
 def _views_behind(calibration: Calibration) -> int:
@@ -172,7 +184,7 @@ class _AtMinimum:
             correlation=alike,
             condition=self.condition,
             coverage=cover(self.points, views, self.state),
-            projection=self._projection(),
+            projection=self.projection(),
             repeated=repeated_views(self.points),
             poses=self.repeated.n_poses,
             change=self._change(noise),
@@ -257,7 +269,8 @@ class _AtMinimum:
         chi = z @ np.linalg.pinv(cov / np.outer(scale, scale), hermitian=True) @ z
         return float(chi * self.spare / max(self.cost, 1e-300) / len(z))
 
-    def _projection(self) -> ProjectionUncertainty | None:
+    def projection(self) -> ProjectionUncertainty | None:
+        """How uncertain projected pixels are all over the image, if its size is known."""
         if self.points.image_size is None:
             return None
         view = self.points.view_index

@@ -5,7 +5,8 @@
 * mrcal's ``corners.vnl``: a line for each corner, ``filename x y [level]``, row by row;
 * text files of numbers: one with the places on the board, and one for each view.
 
-Corners that name no place on the board need the board. MATLAB counts pixels from 1.
+Corners that name no place on the board need the board. MATLAB counts pixels from 1, and corners down the
+columns of the board. Kalibr has no file of corners: it finds them in a bag anew in each run.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.board import Board
+from neurocal_cli.board import Board, Plane
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_tree import image_size
@@ -57,6 +58,7 @@ _WORLD = (
 )
 _VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
 _TABLE = re.compile(r"\A(?:#[^\n]*\n|\s*\n)*[^\n#]*\bX\b[^\n]*\bv\b", re.IGNORECASE)
+_KALIBR = re.compile(r"\ACalibration results\s*\n=+\s*\n")
 _NUMBERS = re.compile(r"\A(?:[-+0-9.eE]+[ \t,;]+){1,2}[-+0-9.eE]+\s*\n")
 
 
@@ -98,6 +100,12 @@ def read_corners(
     if b"\0" in data:
         return None
     text = decode(data, source)
+    if _KALIBR.match(text):
+        raise FormatError(
+            "is a report of Kalibr, which holds no points, and Kalibr has no file of corners; give its "
+            "camchain for the cameras, and the images of its bag to neurocal detect for points",
+            source,
+        )
     if _VNL.match(text):
         return _vnl(text, source, board)
     if _NUMBERS.match(text):
@@ -126,8 +134,21 @@ def _dictionary(root: Field, board: Board | None, unit: str | None) -> Correspon
     return _corners(root, board, unit)
 
 
-def _corners(root: Field, board: Board | None, unit: str | None, first: float = 0.0) -> Correspondences:
-    """Points of a dictionary; `first` is the number of the first pixel."""
+def _corners(
+    root: Field, board: Board | None, unit: str | None, first: float = 0.0, down: bool = False
+) -> Correspondences:
+    """Points of a dictionary.
+
+    Parameters
+    ----------
+    root : Field
+    board : Board, optional
+    unit : str, optional
+    first : float
+        Number of the first pixel.
+    down : bool
+        Whether corners without places run down the columns of the board, one after the other.
+    """
     field = next(root[name] for name in _IMAGE if name in root)
     pixels = _stack(field, 2) - first
     views = len(pixels)
@@ -140,7 +161,8 @@ def _corners(root: Field, board: Board | None, unit: str | None, first: float = 
     stated = root["unit"].text() if "unit" in root else unit
     ids = [entry.text() for entry in root["points"].items()] if "points" in root else None
     if world is None:
-        world, ids, stated = *_of_board(board, pixels.shape[1], field), board.unit if board else stated
+        world, ids = _of_board(board, pixels.shape[1], field, down)
+        stated = board.unit if board else stated
     if world.shape[1] != pixels.shape[1] or len(world) not in (1, views):
         field.fail(f"{world.shape[1]} points in each view, as there are places on the board")
     world = np.broadcast_to(world, (views, *world.shape[1:]))
@@ -148,8 +170,8 @@ def _corners(root: Field, board: Board | None, unit: str | None, first: float = 
     return replace(points, image_size=image_size(root))
 
 
-def _of_board(board: Board | None, count: int, field: Field) -> tuple[Array, list[str]]:
-    """The vertices of a board of one plane, (1, N, 3), and their ids."""
+def _of_board(board: Board | None, count: int, field: Field, down: bool = False) -> tuple[Array, list[str]]:
+    """The vertices of a board of one plane, (1, N, 3), and their ids, along its rows or down its columns."""
     if board is None:
         raise FormatError(
             f"{field.path} has {count} corners a view, but not their places on the board; give --cols, "
@@ -164,7 +186,11 @@ def _of_board(board: Board | None, count: int, field: Field) -> tuple[Array, lis
             field.source,
         )
     (plane,) = board.planes
-    return plane.vertices().reshape(1, -1, 3), list(plane.vertex_ids())
+    order = np.arange(count)
+    if down:
+        order = order.reshape(plane.rows, plane.cols).T.ravel()
+    ids = list(plane.vertex_ids())
+    return plane.vertices().reshape(1, -1, 3)[:, order], [ids[k] for k in order]
 
 
 def _stack(field: Field, width: int) -> Array:
@@ -227,9 +253,30 @@ def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> 
         root.value["image_size"] = [int(side) for side in np.ravel(tree["ImageSize"])[::-1]]
     root.value.setdefault("unit", unit_of(tree))
     stack = np.asarray(tree[field], dtype=float)
+    if stack.ndim == 4:  # M x 2 x P x cameras
+        raise FormatError(
+            f"{field} are those of two cameras; save {field}(:,:,:,1) and {field}(:,:,:,2) apart",
+            source,
+        )
     if stack.ndim == 3:  # M x 2 x P
         root.value[field] = np.moveaxis(stack, 2, 0).tolist()
-    return _corners(root, board, unit, first=FIRST_PIXEL)
+    return _corners(root, board or _matlab_board(tree, unit, source), unit, first=FIRST_PIXEL, down=True)
+
+
+def _matlab_board(tree: dict[str, Any], unit: str | None, source: str) -> Board | None:
+    """The board of the variables that MATLAB's examples use: [rows, columns] of squares, and their side."""
+    size = next((tree[name] for name in ("boardSize", "patternDims") if name in tree), None)
+    side = next((tree[name] for name in ("squareSize", "squareSizeInMM") if name in tree), None)
+    if size is None or side is None:
+        return None
+    try:
+        rows, cols = (int(count) - 1 for count in np.ravel(size))
+        plane = Plane("", cols, rows, float(np.ravel(side)[0]))
+    except (InputError, ValueError, TypeError, OverflowError, IndexError) as error:
+        raise FormatError(
+            "boardSize and squareSize are not those of a board; give --cols, --rows and --square", source
+        ) from error
+    return Board((plane,), "mm" if "squareSizeInMM" in tree else unit or "unknown")
 
 
 def _plain(value: Any) -> Any:
@@ -284,9 +331,9 @@ def _separate(names: list[str], board: Board | None, unit: str | None) -> Corres
     """Files of numbers: the places on the board, X Y Z, unless a board is given, and u v of each view."""
     tables = [_table(name) for name in names]
     if tables[0].shape[1] == 3 or board is None:
+        if len(tables) == 1:
+            raise FormatError("holds places alone; give the files of the pixels after it", names[0])
         places, tables, names = tables[0], tables[1:], names[1:]
-        if not tables:
-            raise FormatError("holds places alone; give the files of the pixels after it", str(names))
         world = np.zeros((1, len(places), 3))
         world[0, :, : places.shape[1]] = places
         ids, stated = None, unit

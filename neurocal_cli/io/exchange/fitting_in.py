@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.distortion.nearest_camera import NearestCamera, nearest_camera, with_model
+from neurocal_cli.distortion.nearest_camera import Distance, NearestCamera, nearest_camera, with_model
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
@@ -16,6 +16,8 @@ __all__ = ["Fitted", "fitted_in"]
 
 _NO_SKEW = 1e-3  # a loss below this [px] is nobody's concern
 _NO_LOSS = 5e-3  # nor is this share of the image
+
+_Fitting = tuple[Camera, NearestCamera | None, str]  # None, "": nothing that matters is lost
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,11 +31,14 @@ class Fitted:
         What is not as it was, with the pixels that it makes, for a warning.
     remarks : tuple of str
         What is not in the file, for a note.
+    moved : tuple of Distance or None
+        What the losses say, as numbers: how far the pixels of each camera are moved.
     """
 
     cameras: CameraSet
     losses: tuple[str, ...] = ()
     remarks: tuple[str, ...] = ()
+    moved: tuple[Distance | None, ...] = ()
 
 
 def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None = None) -> Fitted:
@@ -69,14 +74,15 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None
     if model is not None and model not in target.models:
         held = ", ".join(target.models)
         raise InputError(f"{target.program} has no distortion model {model}; choose one of {held}")
-    losses, remarks, fitted = [], [], []
+    losses, remarks, fitted, moved = [], [], [], []
     for camera, points in zip(cameras.cameras, _pixels_of(cameras), strict=True):
         if model is None:
-            new, loss = _fitted(camera, target, force, points)
+            new, near, loss = _fitted(camera, target, force, points)
         else:
-            new, loss = _of_model(camera, model, target, points)
+            new, near, loss = _of_model(camera, model, target, points)
         fitted.append(new)
         losses += [f"{camera.name}: {loss}"] if loss else []
+        moved.append(None if near is None else near.over_image)
     changed = any(new is not old for new, old in zip(fitted, cameras.cameras, strict=True))
     own = target.program == "neurocal"
     if cameras.origin is not None and (changed or not own):
@@ -88,7 +94,9 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None
     if cameras.poses and not target.poses:
         remarks.append(f"a file of {target.program} has no place for the poses of {len(cameras.poses)} views")
     origin = cameras.origin if own and not changed else None
-    return Fitted(replace(cameras, cameras=tuple(fitted), origin=origin), tuple(losses), tuple(remarks))
+    return Fitted(
+        replace(cameras, cameras=tuple(fitted), origin=origin), tuple(losses), tuple(remarks), tuple(moved)
+    )
 
 
 def _pixels_of(cameras: CameraSet) -> list[Array | None]:
@@ -100,26 +108,30 @@ def _pixels_of(cameras: CameraSet) -> list[Array | None]:
     return [part.points.pixels for part in parts]
 
 
-def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> tuple[Camera, str]:
+def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> _Fitting:
     straight = target.skew or not camera.intrinsics.skewed
     if with_model(camera.distortion, model) is not None and straight:
-        return _as_model(camera, model), ""
+        return _as_model(camera, model), None, ""
     near = nearest_camera(camera, model, target.skew, points)
-    return near.camera, f"the nearest {model}{'' if straight else ' without skew'} {_pixels(near)}"
+    return near.camera, near, f"the nearest {model}{'' if straight else ' without skew'} {_pixels(near)}"
 
 
-def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -> tuple[Camera, str]:
+def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -> _Fitting:
     model = next((m for m in target.models if with_model(camera.distortion, m) is not None), None)
     straight = target.skew or not camera.intrinsics.skewed
     if model is not None and straight:
-        return _as_model(camera, model), ""
+        return _as_model(camera, model), None, ""
     if model is not None:
         near = nearest_camera(camera, model, False, points)
         if near.over_image.max_px < _NO_SKEW:
-            return _straightened(near.camera), ""
-        return _straightened(near.camera), (
-            f"programs of {target.program} ignore skew, so the nearest camera without it is written; "
-            f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
+            return _straightened(near.camera), None, ""
+        return (
+            _straightened(near.camera),
+            near,
+            (
+                f"programs of {target.program} ignore skew, so the nearest camera without it is written; "
+                f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
+            ),
         )
     near = min(
         (nearest_camera(camera, m, target.skew, points) for m in target.models),
@@ -131,7 +143,7 @@ def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -
     )
     if not force:
         raise InputError(f"{camera.name}: {what}; give --force to write it, or calibrate with this model")
-    return near.camera, what
+    return near.camera, near, what
 
 
 def _as_model(camera: Camera, model: str) -> Camera:
