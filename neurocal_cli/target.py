@@ -43,6 +43,9 @@ class Target:
         By how much the found target raises the logarithm of the evidence.
     point : (n,) labels, optional
         Ids.
+    stated : (n, 3) array, optional [world unit]
+        Standard deviations of the given points, where a survey states them. The found ones are then nearest
+        to the given ones by these, and `sizes` has the factor that they are taken with.
     """
 
     given: Array
@@ -53,6 +56,7 @@ class Target:
     flat: bool
     evidence: float
     point: NDArray[np.str_] | None = None
+    stated: Array | None = None
 
     @property
     def offsets(self) -> Array:
@@ -89,6 +93,9 @@ class Target:
         point = None
         if self.point is not None and other.point is not None:
             point = np.concatenate([self.point, other.point[new]])
+        stated = None
+        if self.stated is not None and other.stated is not None:
+            stated = np.concatenate([self.stated, other.stated[new]])
         return replace(
             self,
             given=np.concatenate([self.given, other.given[new]]),
@@ -96,6 +103,7 @@ class Target:
             std=np.concatenate([std, other.std[new]]),
             plane=np.concatenate([self.plane, other.plane[new]]),
             point=point,
+            stated=stated,
         )
 
     def bend(self) -> float:

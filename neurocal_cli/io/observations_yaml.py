@@ -33,6 +33,7 @@ __all__ = ["observation_lines", "read_observations"]
 _PLACE = ("X", "Y", "Z")
 _PIXEL = ("u", "v")
 _COVARIANCE = ("suu", "suv", "svv")
+_WORLD_STD = ("sX", "sY", "sZ")
 _ACROSS = ("nu", "nv")
 
 
@@ -42,6 +43,9 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
     if points.covariance is not None:
         measured += _COVARIANCE
         blocks.append(points.covariance)
+    if points.world_std is not None:
+        measured += _WORLD_STD
+        blocks.append(points.world_std)
     if points.across is not None:
         measured += _ACROSS
         blocks.append(points.across)
@@ -139,6 +143,7 @@ def read_observations(
             view=labels.get("view"),
             point=labels.get("point"),
             covariance=numbers(_COVARIANCE) if set(_COVARIANCE) <= set(columns) else None,
+            world_std=numbers(_WORLD_STD) if set(_WORLD_STD) <= set(columns) else None,
             across=numbers(_ACROSS) if set(_ACROSS) <= set(columns) else None,
             image_size=image_size,
             image_center=image_center,

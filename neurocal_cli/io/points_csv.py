@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.io.points_join import ACROSS, COVARIANCE, SETTINGS, correspondences
+from neurocal_cli.io.points_join import ACROSS, COVARIANCE, SETTINGS, WORLD_STD, correspondences
 from neurocal_cli.io.table import Schema, read_table
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
@@ -20,7 +20,7 @@ __all__ = ["POINTS", "format_points", "read_points", "write_points"]
 POINTS = Schema(
     kind="points",
     required=("X", "Y", "Z", "u", "v"),
-    optional=("view", "point", "sigma", *COVARIANCE, *ACROSS, *SETTINGS),
+    optional=("view", "point", "sigma", *COVARIANCE, *WORLD_STD, *ACROSS, *SETTINGS),
     labels=frozenset({"view", "point"}),
     headerless=("X", "Y", "Z", "u", "v"),
 )
@@ -78,6 +78,9 @@ def format_points(points: Correspondences) -> str:
     if points.covariance is not None:
         blocks.append(points.covariance)
         names += COVARIANCE
+    if points.world_std is not None:
+        blocks.append(points.world_std)
+        names += WORLD_STD
     if points.across is not None:
         blocks.append(points.across)
         names += ACROSS

@@ -21,6 +21,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.pipeline.fit import fit_again
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
+from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
@@ -54,6 +55,8 @@ def with_target(
     solution, rejected
         The ones given where the target stays as it is.
     """
+    if choice != "given" and problem.points.world_std is not None and not solution.refusal:
+        return with_survey(problem, solution, rejected, options)
     rich = solution.state.model == "rich"  # it bends as a target does
     if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected

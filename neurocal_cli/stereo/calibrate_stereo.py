@@ -109,7 +109,8 @@ def _on_one_target(
                 break
         return cameras
 
-    cameras = calibrated("given")
+    surveyed = left.world_std is not None or right.world_std is not None
+    cameras = calibrated(choice if surveyed else "given")
     for _ in range(_ROUNDS):
         target = common_target(cameras, choice)
         if target is None:

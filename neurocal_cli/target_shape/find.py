@@ -23,7 +23,7 @@ from neurocal_cli.target_shape.left_out import holds_for_views_left_out
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, posterior
 from neurocal_cli.target_shape.prior import prior_of
 
-__all__ = ["LEAST_GAIN", "Found", "enough_views", "find_target"]
+__all__ = ["LEAST_GAIN", "Found", "at_world", "enough_views", "find_target", "sight_of"]
 
 _STEPS = 10
 # Unknowns of the dense system. From more on some views are taken; of far more no target is looked for.
@@ -117,7 +117,7 @@ def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Proble
     points = problem.points.select(rows)
     place = [views.names.index(name) for name in points.view_names]
     state = replace(known, R=known.R[place], t=known.t[place])
-    return _at(replace(problem, points=points), adjusted, state, points.world)
+    return at_world(replace(problem, points=points), adjusted, state, points.world)
 
 
 def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known: Target | None) -> Found:
@@ -126,7 +126,7 @@ def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known:
     for problem, adjusted in fits:
         points = problem.points if known is None else known.as_given(problem.points)
         world = found.target.applied(points).world
-        moved.append(_at(problem, adjusted, in_pixels(problem, adjusted.state), world))
+        moved.append(at_world(problem, adjusted, in_pixels(problem, adjusted.state), world))
     return replace(found, fits=tuple(moved))
 
 
@@ -185,7 +185,7 @@ class _Search:
         self.offsets, self.sizes = found.offsets, found.sizes
         world = self.given + self.prior.in_world(self.offsets)
         self.fits = [
-            _at(*fit, in_pixels(fit[0], fit[1].state), world[label])
+            at_world(*fit, in_pixels(fit[0], fit[1].state), world[label])
             for fit, label in zip(self.fits, self.label, strict=True)
         ]
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
@@ -203,7 +203,7 @@ class _Search:
             state = in_pixels(problem, adjusted.state)
             turned = state.R @ R.T
             state = replace(state, R=turned, t=s * state.t - turned @ t)
-            self.fits[k] = _at(problem, adjusted, state, world[label])
+            self.fits[k] = at_world(problem, adjusted, state, world[label])
 
     def _target(self, found: Posterior, gain: float) -> Target:
         axes = self.prior.axes
@@ -227,7 +227,9 @@ def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> S
     return Sight(views, adjusted.state, problem.free_camera, problem.free_poses, ordered)
 
 
-def _at(problem: Problem, adjusted: Adjusted, state: CameraState, world: Array) -> tuple[Problem, Adjusted]:
+def at_world(
+    problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
+) -> tuple[Problem, Adjusted]:
     """A camera with its views for other places of the points: the minimum near a state in pixels."""
     new = replace(problem.with_points(replace(problem.points, world=world)), restraint=problem.restraint)
     return new, new.adjust(replace(adjusted, state=normalised(state, new.views)))
