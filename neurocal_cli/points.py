@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from neurocal_cli.distances import Distance
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
@@ -53,6 +54,8 @@ class Correspondences:
     world_std : (N, 3) array, optional [world unit]
         Standard deviation of each world point's X, Y and Z, as a survey states it; 0: exactly there. The
         same for the same world point in all views. All zero is None.
+    distances : tuple of Distance
+        Measured on the board that the points are of; they hold its scale.
 
     Attributes
     ----------
@@ -81,6 +84,7 @@ class Correspondences:
     lines: NDArray[np.int64] | None = None
     sources: Mapping[str, str] | None = None
     world_std: Array | None = None
+    distances: tuple[Distance, ...] = ()
     view_names: tuple[str, ...] = field(init=False)
     view_index: NDArray[np.int64] = field(init=False)
 
@@ -108,6 +112,11 @@ class Correspondences:
         self._set(view_names=names, view_index=_frozen(index))
         if self.covariance is not None:
             self._check_covariance(_matrix("covariance", self.covariance, 3))
+        if self.distances and self.point is None:
+            raise InputError(
+                f"{self.source}: distances are between points with ids; add the column point, or leave the "
+                "distances out"
+            )
         if self.world_std is not None:
             self._check_world_std(_matrix("world_std", self.world_std, 3))
         if self.across is not None:

@@ -17,7 +17,7 @@ from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.evaluation import CameraEvaluation
-from neurocal_cli.target import Target
+from neurocal_cli.target import Target, scale_of
 from neurocal_cli.verdict.report import verdict_json, verdict_lines
 
 __all__ = [
@@ -87,7 +87,11 @@ def calibration_report(calibration: Calibration) -> str:
         [_headline(calibration)],
         align(parameter_rows(calibration)),
         _view_lines(calibration.views),
-        [*_training_lines(calibration), *target_lines(calibration.target, calibration.unit)],
+        [
+            *_training_lines(calibration),
+            *target_lines(calibration.target, calibration.unit),
+            *_scale_lines(calibration),
+        ],
         [] if calibration.verdict is None else verdict_lines(calibration.verdict),
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
@@ -105,6 +109,16 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
     return [
         f"target: {' and '.join(parts)}; its points lie {found:.2g} {printable(unit)} rms from where they "
         "were given"
+    ]
+
+
+def _scale_lines(calibration: Calibration) -> list[str]:
+    distances = calibration.points.distances
+    if not distances:
+        return []
+    return [
+        f"scale: held by {plural(len(distances), 'measured distance')}, std "
+        f"{100 * scale_of(calibration.points).std:.2g} %"
     ]
 
 

@@ -97,6 +97,9 @@ def _metadata_lines(points: Correspondences) -> list[str]:
         lines.append(f"# image_center: {points.image_center[0]!r} {points.image_center[1]!r}")
     if points.unit != points.unit.strip(" \t,;") or re.search(r"[\r\n\0]", points.unit) or not points.unit:
         raise InputError(f"the unit {points.unit!r} cannot be written; name it in a word, such as mm")
+    if points.distances:
+        rows = [[one.start, one.end, one.length, one.std] for one in points.distances]
+        lines.append(f"# distances: {json.dumps(rows)}")
     return [*lines, f"# unit: {points.unit}"]
 
 

@@ -17,7 +17,7 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.geometry import Array, nearest_similarity
-from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
 from neurocal_cli.target_shape.information import Information, Sight, information_of
 from neurocal_cli.target_shape.left_out import holds_for_views_left_out
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, posterior
@@ -191,11 +191,16 @@ class _Search:
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
 
     def _align(self) -> None:
-        """Turn, shift and scale the target to be nearest to the given one; no pixel sees that."""
+        """Turn, shift and scale the target to be nearest to the given one; no pixel sees that.
+
+        Where distances were measured, they hold the scale.
+        """
         if not all(problem.free_poses for problem, _ in self.fits):
             return
         world = self.given + self.prior.in_world(self.offsets)
         s, R, t = nearest_similarity(world, self.given)
+        held = scale_of_points(s * world @ R.T + t, self.ids, self.fits[0][0].points.distances).factor
+        s, t = held * s, held * t
         world = s * world @ R.T + t
         self.offsets = self.prior.along_axes(world - self.given)
         for k, label in enumerate(self.label):
