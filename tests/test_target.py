@@ -22,8 +22,8 @@ from neurocal_cli.io.board_yaml import format_board, parse_board
 from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
 from neurocal_cli.io.points_csv import read_points
 from neurocal_cli.io.rig_yaml import read_rig
+from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-from neurocal_cli.stereo.common_target import on_one_target
 from neurocal_cli.stereo.evaluation import evaluate_stereo
 from neurocal_cli.target import board_of, planes_of
 
