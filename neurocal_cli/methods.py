@@ -19,7 +19,7 @@ from neurocal_cli.initialisation.options import Progress, options_for
 from neurocal_cli.pipeline.fit import fit
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.pipeline.result import calibration_of
-from neurocal_cli.pipeline.target_choice import with_target
+from neurocal_cli.pipeline.target_choice import lines_that_are_bent, with_target
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.verdict.assessment import assess
@@ -163,7 +163,12 @@ def calibrate(
             solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
         )
         _refuse_misfit(found)
-        if choice in ("flat", "free") and found.target is None:
+        bent = ""
+        if choice != "given" and solution.straight_lines is not None:
+            bent = lines_that_are_bent(solution, found.unit)
+        if bent:
+            found = replace(found, warnings=(*found.warnings, bent))
+        elif choice in ("flat", "free") and found.target is None:
             found = replace(found, warnings=(*found.warnings, _NOT_FOUND))
         elif found.target is None:
             found = replace(found, warnings=(*found.warnings, *_unused(points, choice)))
