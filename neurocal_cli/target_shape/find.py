@@ -33,7 +33,9 @@ _EXACT = 1e-6  # px: rounding, which tells nothing of a target
 _EARLY = 0.5  # of the gain, that the first step must promise
 _SETTLED = 0.02  # of the cameras' standard deviations
 _LARGEST = 0.02  # of the target's size: more is no target that happens to be bent
-_STRETCHED = 0.02  # prints are by a few thousandths; more is a square of another size along one side
+# Prints are stretched by a few thousandths; more is a square of another size along one side. A target that
+# was found below the limit may settle a little beyond it, where the lens is chosen for it.
+_STRETCHED, _STRETCHED_AGAIN = 0.02, 0.025
 _FEWEST, _FEWEST_OF_FOLDED = 3, 2  # different views of most points
 LEAST_GAIN = 6.0
 """Of the logarithm of the evidence, for a target to be found unasked. Of 90 clean sets none gains more than
@@ -136,6 +138,7 @@ class _Search:
     def __init__(self, fits: Sequence[tuple[Problem, Adjusted]], flat: bool, known: Target | None) -> None:
         self.fits, self.flat = list(fits), flat
         worlds = [problem.points.world for problem, _ in fits]
+        self.most_stretched = _STRETCHED if known is None else _STRETCHED_AGAIN
         if known is None:
             self.given, label, self.ids = distinct_points([problem.points for problem, _ in fits])
             self.plane = planes_of(self.given, self.ids)
@@ -171,7 +174,9 @@ class _Search:
             return None
         self._align()
         target = self._target(found, gain)
-        return Found(target, tuple(self.fits), found.evidence) if target.stretch() < _STRETCHED else None
+        if not target.stretch() < self.most_stretched:
+            return None
+        return Found(target, tuple(self.fits), found.evidence)
 
     def _sights(self) -> list[Sight]:
         return [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
