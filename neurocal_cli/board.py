@@ -7,15 +7,16 @@ The edges between neighbouring vertices carry the mid-points: ``h:c:r`` halfway 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from neurocal_cli.distances import Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
-__all__ = ["Board", "Plane"]
+__all__ = ["Board", "Plane", "smooth_between"]
 
 Triple = tuple[float, float, float]
 
@@ -121,7 +122,15 @@ class Plane:
         if not self.measured:
             return world
         known = np.array(self.measured)
-        return world + _spline(known[:, :2], known[:, 2:] - self.at(known[:, :2]), np.asarray(grid))
+        return world + smooth_between(known[:, :2], known[:, 2:] - self.at(known[:, :2]), np.asarray(grid))
+
+    def rescaled(self, factor: float) -> Plane:
+        """The same plane with all lengths multiplied by a factor, around the world's origin."""
+        if factor == 1.0:
+            return self
+        x, y, z = (factor * value for value in self.origin)
+        measured = tuple((c, r, *(factor * value for value in place)) for c, r, *place in self.measured)
+        return replace(self, square=factor * self.square, origin=(x, y, z), measured=measured)
 
     def vertices(self) -> Array:
         """World coordinates of the vertices, ``[r, c]``; (rows, cols, 3) array [world unit]."""
@@ -178,15 +187,18 @@ class Board:
         Several of them need names, all different.
     unit : str
         Of all lengths.
+    distances : tuple of Distance
+        Measured on the board; they hold its scale.
 
     Raises
     ------
     InputError
-        No plane, or names that are missing or the same.
+        No plane, names that are missing or the same, a distance to another board.
     """
 
     planes: tuple[Plane, ...]
     unit: str = "mm"
+    distances: tuple[Distance, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "planes", tuple(self.planes))
@@ -198,11 +210,35 @@ class Board:
         doubled = sorted({name for name in names if names.count(name) > 1})
         if doubled:
             raise InputError(f"two planes have the name {doubled[0]!r}; rename one")
+        for one in self.distances:
+            self.place(one.start), self.place(one.end)
 
     @classmethod
     def single(cls, cols: int, rows: int, square: float, unit: str = "mm") -> Board:
         """Board of one plane without a name, at the world's origin."""
         return cls((Plane("", cols, rows, square),), unit)
+
+    def place(self, label: str) -> Array:
+        """World coordinates (3,) of a vertex ``[plane/]c:r``, where it really is; c and r may be any numbers.
+
+        Raises
+        ------
+        InputError
+            No such place.
+        """
+        name, c, r = grid_place(label)
+        plane = self.planes[0] if not name and len(self.planes) == 1 else self.plane(name)
+        return np.asarray(plane.truly_at(np.array([[c, r]]))[0])
+
+    @property
+    def scale(self) -> Scale:
+        """What the measured distances say of the scale."""
+        return fitted_scale(self.place, self.distances)
+
+    def as_measured(self) -> Board:
+        """The board as large as its measured distances say."""
+        factor = self.scale.factor
+        return replace(self, planes=tuple(plane.rescaled(factor) for plane in self.planes))
 
     def plane(self, name: str) -> Plane:
         """Find the plane with a name.
@@ -218,7 +254,7 @@ class Board:
         raise InputError(f"the board has no plane {name!r}; it has {[p.name for p in self.planes]}")
 
 
-def _spline(places: Array, values: Array, at: Array) -> Array:
+def smooth_between(places: Array, values: Array, at: Array) -> Array:
     """The thin-plate spline through values (n, 3) at places (n, 2), elsewhere (N, 2)."""
     from scipy.interpolate import RBFInterpolator
 

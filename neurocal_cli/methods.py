@@ -19,7 +19,7 @@ from neurocal_cli.initialisation.options import Progress, options_for
 from neurocal_cli.pipeline.fit import fit
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.pipeline.result import calibration_of
-from neurocal_cli.pipeline.target_choice import with_target
+from neurocal_cli.pipeline.target_choice import lines_that_are_bent, with_target
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.verdict.assessment import assess
@@ -97,7 +97,8 @@ def calibrate(
     target : {"auto", "given", "flat", "free"} or Target
         Where the points of the target are: given, as they are given; free, found with the camera; flat,
         found, but each left in its plane; auto: found where the data ask for it (`target_shape`). A target
-        that was found already: there.
+        that was found already: there. Points whose standard deviations are stated (`world_std`) are found by
+        these, unless given.
     preferred : str
         With ``distortion="auto"``, a model to take where no other predicts decidedly better, such as that
         of the other camera of a rig.
@@ -148,7 +149,7 @@ def calibrate(
 
             found = calibrate_by(method, problem, camera_name)
             _refuse_misfit(found)
-            return replace(found, judgement=assess)
+            return replace(found, warnings=(*found.warnings, *_unused(points, choice)), judgement=assess)
         if outliers == "reject":
             solution, rejected = fit_robustly(problem, options)
         else:
@@ -162,8 +163,15 @@ def calibrate(
             solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
         )
         _refuse_misfit(found)
-        if choice in ("flat", "free") and found.target is None:
+        bent = ""
+        if choice != "given" and solution.straight_lines is not None:
+            bent = lines_that_are_bent(solution, found.unit)
+        if bent:
+            found = replace(found, warnings=(*found.warnings, bent))
+        elif choice in ("flat", "free") and found.target is None:
             found = replace(found, warnings=(*found.warnings, _NOT_FOUND))
+        elif found.target is None:
+            found = replace(found, warnings=(*found.warnings, *_unused(points, choice)))
         return replace(found, judgement=assess)
     except DegenerateGeometryError as error:
         text, copies = str(error), repeated_views(points)
@@ -198,6 +206,18 @@ def _distortion_of(method: str, distortion: str) -> str:
     if distortion == "auto":
         return "k1" if method == "tsai" else "none"
     return distortion
+
+
+def _unused(points: Correspondences, target: str) -> tuple[str, ...]:
+    """Note that the survey's standard deviations play no part."""
+    if points.world_std is None:
+        return ()
+    why = (
+        "the target is given"
+        if target == "given"
+        else "the method or the number of points has no use for them"
+    )
+    return (f"the points' standard deviations sX,sY,sZ are not used, because {why}",)
 
 
 def _refuse_misfit(calibration: Calibration) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from neurocal_cli.distances import Distance
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
@@ -50,6 +51,11 @@ class Correspondences:
         Line of each row in its file, for messages.
     sources : dict of str by view, optional
         The file of each view where several files were read, for messages.
+    world_std : (N, 3) array, optional [world unit]
+        Standard deviation of each world point's X, Y and Z, as a survey states it; 0: exactly there. The
+        same for the same world point in all views. All zero is None.
+    distances : tuple of Distance
+        Measured on the board that the points are of; they hold its scale.
 
     Attributes
     ----------
@@ -77,6 +83,8 @@ class Correspondences:
     source: str = "points"
     lines: NDArray[np.int64] | None = None
     sources: Mapping[str, str] | None = None
+    world_std: Array | None = None
+    distances: tuple[Distance, ...] = ()
     view_names: tuple[str, ...] = field(init=False)
     view_index: NDArray[np.int64] = field(init=False)
 
@@ -104,6 +112,13 @@ class Correspondences:
         self._set(view_names=names, view_index=_frozen(index))
         if self.covariance is not None:
             self._check_covariance(_matrix("covariance", self.covariance, 3))
+        if self.distances and self.point is None:
+            raise InputError(
+                f"{self.source}: distances are between points with ids; add the column point, or leave the "
+                "distances out"
+            )
+        if self.world_std is not None:
+            self._check_world_std(_matrix("world_std", self.world_std, 3))
         if self.across is not None:
             self._check_across(_matrix("across", self.across, 2))
         if self.image_size is not None:
@@ -161,6 +176,7 @@ class Correspondences:
             view=pick(self.view),
             point=pick(self.point),
             covariance=pick(self.covariance),
+            world_std=pick(self.world_std),
             across=pick(self.across),
             lines=pick(self.lines),
         )
@@ -192,6 +208,20 @@ class Correspondences:
                 "definite; correct or remove the row"
             )
         self._set(covariance=_frozen(covariance))
+
+    def _check_world_std(self, std: Array) -> None:
+        if len(std) != len(self.world):
+            raise InputError(
+                f"{self.source}: world_std needs one row for each of the {len(self.world)} points"
+            )
+        good = ((std >= 0) & (std <= _LARGEST)).all(axis=1)  # False for nan as well
+        if not good.all():
+            row = int(np.argmin(good))
+            raise InputError(
+                f"{self.place(row)}: the world point's standard deviation sX,sY,sZ must be numbers of at "
+                "least 0; correct or remove the row"
+            )
+        self._set(world_std=_frozen(std) if std.any() else None)
 
     def _check_across(self, across: Array) -> None:
         if len(across) != len(self.world):

@@ -17,7 +17,7 @@ from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.evaluation import CameraEvaluation
-from neurocal_cli.target import Target
+from neurocal_cli.target import Target, scale_of
 from neurocal_cli.verdict.report import verdict_json, verdict_lines
 
 __all__ = [
@@ -87,7 +87,11 @@ def calibration_report(calibration: Calibration) -> str:
         [_headline(calibration)],
         align(parameter_rows(calibration)),
         _view_lines(calibration.views),
-        [*_training_lines(calibration), *target_lines(calibration.target, calibration.unit)],
+        [
+            *_training_lines(calibration),
+            *target_lines(calibration.target, calibration.unit),
+            *_scale_lines(calibration),
+        ],
         [] if calibration.verdict is None else verdict_lines(calibration.verdict),
     ]
     return "\n\n".join("\n".join(block) for block in blocks if block)
@@ -97,6 +101,8 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
     """The target that was found, in a line; none where it was taken as given."""
     if target is None:
         return []
+    if target.stated is not None:
+        return [_surveyed_line(target, unit)]
     parts = [f"bent by {target.bend():.2g} {printable(unit)}"] if not target.flat else []
     parts.append(f"stretched by {100 * target.stretch():.2g} %")
     found = np.sqrt((target.offsets**2).sum(axis=1).mean())
@@ -104,6 +110,28 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
         f"target: {' and '.join(parts)}; its points lie {found:.2g} {printable(unit)} rms from where they "
         "were given"
     ]
+
+
+def _scale_lines(calibration: Calibration) -> list[str]:
+    distances = calibration.points.distances
+    if not distances:
+        return []
+    return [
+        f"scale: held by {plural(len(distances), 'measured distance')}, std "
+        f"{100 * scale_of(calibration.points).std:.2g} %"
+    ]
+
+
+def _surveyed_line(target: Target, unit: str) -> str:
+    found = np.sqrt((target.offsets**2).sum(axis=1).mean())
+    held = int((target.stated == 0).all(axis=1).sum()) if target.stated is not None else 0
+    exact = f"; {plural(held, 'point')} of {len(target.found)} held" if held else ""
+    factor = target.sizes["stated"]
+    taken = "" if factor == 1 else f" taken {factor:.2g} times as large, as the residuals ask for"
+    return (
+        f"surveyed points: found {found:.2g} {printable(unit)} rms from where they were stated, by their "
+        f"standard deviations{taken}{exact}"
+    )
 
 
 def evaluation_report(evaluation: CameraEvaluation, verdict: Verdict | None = None) -> str:
@@ -193,6 +221,7 @@ def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
         "offset_rms": float(np.sqrt((target.offsets**2).sum(axis=1).mean())),
         "std_rms": number_or_none(float(np.sqrt((target.std**2).mean()))),
         "n_points": len(target.found),
+        **({} if target.stated is None else {"stated_std_factor": float(target.sizes["stated"])}),
     }
 
 

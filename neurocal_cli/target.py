@@ -8,12 +8,22 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.board import Board, Plane
+from neurocal_cli.board import Board, Plane, smooth_between
+from neurocal_cli.distances import NO_SCALE, Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["TARGETS", "Target", "board_of", "distinct_points", "is_flat", "planes_of"]
+__all__ = [
+    "TARGETS",
+    "Target",
+    "board_of",
+    "distinct_points",
+    "is_flat",
+    "planes_of",
+    "scale_of",
+    "scale_of_points",
+]
 
 TARGETS = ("auto", "given", "flat", "free")
 
@@ -43,6 +53,9 @@ class Target:
         By how much the found target raises the logarithm of the evidence.
     point : (n,) labels, optional
         Ids.
+    stated : (n, 3) array, optional [world unit]
+        Standard deviations of the given points, where a survey states them. The found ones are then nearest
+        to the given ones by these, and `sizes` has the factor that they are taken with.
     """
 
     given: Array
@@ -53,6 +66,7 @@ class Target:
     flat: bool
     evidence: float
     point: NDArray[np.str_] | None = None
+    stated: Array | None = None
 
     @property
     def offsets(self) -> Array:
@@ -89,6 +103,9 @@ class Target:
         point = None
         if self.point is not None and other.point is not None:
             point = np.concatenate([self.point, other.point[new]])
+        stated = None
+        if self.stated is not None and other.stated is not None:
+            stated = np.concatenate([self.stated, other.stated[new]])
         return replace(
             self,
             given=np.concatenate([self.given, other.given[new]]),
@@ -96,6 +113,7 @@ class Target:
             std=np.concatenate([std, other.std[new]]),
             plane=np.concatenate([self.plane, other.plane[new]]),
             point=point,
+            stated=stated,
         )
 
     def bend(self) -> float:
@@ -120,8 +138,15 @@ class Target:
         return worst
 
 
-def board_of(target: Target, unit: str) -> Board:
+def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) -> Board:
     """The chessboard that a target is, with its points as they were found.
+
+    Parameters
+    ----------
+    target : Target
+    unit : str
+    distances : tuple of Distance
+        Measured on it.
 
     Raises
     ------
@@ -136,7 +161,41 @@ def board_of(target: Target, unit: str) -> Board:
     for label, given, found in zip(target.point.tolist(), target.given, target.found, strict=True):
         name, place = _place(str(label))
         planes.setdefault(name, []).append((place, given, found))
-    return Board(tuple(_plane(name, rows) for name, rows in planes.items()), unit)
+    return Board(tuple(_plane(name, rows) for name, rows in planes.items()), unit, distances)
+
+
+def scale_of(points: Correspondences) -> Scale:
+    """What the distances that came with points say of the scale of these points.
+
+    Raises
+    ------
+    InputError
+        Points or distances that are of no chessboard.
+    """
+    if not points.distances:
+        return NO_SCALE
+    world, _, ids = distinct_points([points])
+    return scale_of_points(world, ids, points.distances)
+
+
+def scale_of_points(world: Array, ids: NDArray[np.str_] | None, distances: tuple[Distance, ...]) -> Scale:
+    """The same of the different points (n, 3) of a target with their ids."""
+    if not distances or ids is None:
+        return NO_SCALE
+    names = [_place(str(label)) for label in ids.tolist()]
+    planes = np.array([name for name, _ in names])
+    grid = np.array([place for _, place in names])
+
+    def place(label: str) -> Array:
+        name, c, r = grid_place(label)
+        rows = planes == name if name else np.ones(len(planes), dtype=bool)
+        if not rows.any():
+            raise InputError(f"a distance was measured on the plane {name!r}, which has no points; remove it")
+        known, at = np.column_stack([np.ones(rows.sum()), grid[rows]]), np.array([1.0, c, r])
+        flat = np.linalg.lstsq(known, world[rows], rcond=None)[0]
+        return at @ flat + smooth_between(grid[rows], world[rows] - known @ flat, at[None, 1:])[0]
+
+    return fitted_scale(place, distances)
 
 
 def _place(label: str) -> tuple[str, tuple[float, float]]:

@@ -59,6 +59,8 @@ def same(a, b):
     assert a.covariance is None or a.covariance.tobytes() == b.covariance.tobytes()
     assert (a.across is None) == (b.across is None)
     assert a.across is None or a.across.tobytes() == b.across.tobytes()
+    assert (a.world_std is None) == (b.world_std is None)
+    assert a.world_std is None or a.world_std.tobytes() == b.world_std.tobytes()
     assert (a.image_size, a.image_center, a.unit) == (b.image_size, b.image_center, b.unit)
 
 
@@ -132,6 +134,14 @@ def test_files_with_and_without_directions_are_read_as_one(tmp_path):
     assert points.across.tolist() == [[0, 1], [0, 0]]
 
 
+def test_the_std_of_world_points_is_kept_and_0_where_a_file_has_none(tmp_path):
+    (tmp_path / "a.csv").write_text("X,Y,Z,u,v,sX,sY,sZ\n1,2,3,4,5,0.1,0.2,0\n")
+    (tmp_path / "b.csv").write_text("X,Y,Z,u,v\n1,2,3,4,5\n")
+    points = read_points([tmp_path / "a.csv", tmp_path / "b.csv"])
+    assert points.world_std.tolist() == [[0.1, 0.2, 0], [0, 0, 0]]
+    assert read_points(tmp_path / "b.csv").world_std is None
+
+
 def test_sigma_becomes_a_round_covariance(read):
     assert read("X,Y,Z,u,v,sigma\n1,2,3,4,5,0.5\n").covariance.tolist() == [[0.25, 0, 0.25]]
     assert read("X,Y,Z,u,v,suu,suv,svv\n1,2,3,4,5,2,1,3\n").covariance.tolist() == [[2, 1, 3]]
@@ -191,6 +201,8 @@ FAULTS = {
     "X,Y,Z,u,v,sigma\n1,2,3,4,5,1e200\n": "a.csv:2: the pixel's covariance",
     "X,Y,Z,u,v,suu,suv,svv\n1,2,3,4,5,1,2,1\n": "a.csv:2: the pixel's covariance",
     "X,Y,Z,u,v,suu\n1,2,3,4,5,1\n": "a.csv: has suu only",
+    "X,Y,Z,u,v,sZ\n1,2,3,4,5,1\n": "a.csv: has sZ only; give all of sX,sY,sZ",
+    "X,Y,Z,u,v,sX,sY,sZ\n1,2,3,4,5,1,-1,1\n": "a.csv:2: the world point's standard deviation sX,sY,sZ",
     "X,Y,Z,u,v,nu\n1,2,3,4,5,1\n": "a.csv: has nu only; give both nu,nv",
     "X,Y,Z,u,v,nu,nv\n1,2,3,4,5,1,1e200\n": "a.csv:2: the direction nu,nv in which the point was measured",
     "X,Y,Z,u,v,sigma,suu,suv,svv\n1,2,3,4,5,1,1,0,1\n": "a.csv: has both sigma and suu,suv,svv",
@@ -273,6 +285,7 @@ def correspondences(draw):
         point=ids,
         covariance=covariance,
         across=draw(st.none() | arrays(float, (n, 2), elements=NUMBERS)),
+        world_std=draw(st.none() | arrays(float, (n, 3), elements=st.floats(0, 1e99))),
         image_size=draw(st.none() | st.tuples(st.integers(1, 99999), st.integers(1, 99999))),
         image_center=draw(st.none() | st.tuples(NUMBERS, NUMBERS)),
         unit=draw(st.sampled_from(["mm", "m", "square", "µm", "my unit"])),

@@ -304,3 +304,12 @@ def test_the_shapes_are_what_they_are_called() -> None:
     assert not offsets("flat", 1.0, rng).any()
     assert np.ptp(offsets("parabola", 0.5, rng)[:, 2]) == pytest.approx(0.5, abs=0.35)
     assert not offsets("in_plane", 0.1, rng)[:, 2].any()
+
+
+def test_plumb_line_says_that_the_board_is_bent() -> None:
+    points, _ = photographed("parabola", 0, 8)
+    found = calibrate(points, distortion="plumb-line", skew=False)
+    assert found.target is None
+    assert [text for text in found.warnings if text.startswith("the target is bent by 0.")]
+    flat = calibrate(photographed("flat", 0, 8)[0], distortion="plumb-line", skew=False)
+    assert not any("bent" in text for text in flat.warnings)

@@ -15,7 +15,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
 from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
 
-__all__ = ["parameter_covariance", "parameter_warnings", "pose_std"]
+__all__ = ["parameter_covariance", "parameter_warnings", "pose_std", "with_scale"]
 
 # What users are warned of; no result depends on it.
 # A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
@@ -74,6 +74,11 @@ def pose_std(R: Array, centre: Array, scale: Array, covariance: Array) -> Array:
     J[:, 3:, 3:] = np.eye(3) * scale[:, None, None]
     block = J @ covariance @ np.swapaxes(J, 1, 2)
     return np.asarray(np.sqrt(np.maximum(np.diagonal(block, axis1=1, axis2=2), 0.0)))
+
+
+def with_scale(std: Array, t: Array, relative: float) -> Array:
+    """Standard deviations (V, 6) with that of the target's scale: the translations (V, 3) follow it."""
+    return np.asarray(np.hypot(std, relative * np.abs(np.concatenate([np.zeros_like(t), t], axis=1))))
 
 
 def parameter_warnings(

@@ -335,6 +335,7 @@ _OPTIONS = [
         default="auto",
         help="Where the points of the target are: given takes X, Y, Z as they are; free finds with the "
         "camera how the target is bent and printed, which takes 3 views or more; flat does so within its "
-        "plane; auto finds it where the points ask for it.",
+        "plane; auto finds it where the points ask for it. Points with columns sX, sY, sZ are found by these "
+        "standard deviations, unless given.",
     ),
 ]

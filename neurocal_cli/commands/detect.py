@@ -150,6 +150,8 @@ def detect(
         raise UsageError(
             "the size of the board is missing; give --cols, --rows and --square, or --board BOARD.yaml"
         )
+    note([_rescaled(target)] if target.distances else [])
+    target = target.as_measured()
     strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
     wanted = _wanted(target, points, gamma, overlay, cache, strict)
     if watch is None:
@@ -159,6 +161,15 @@ def detect(
     outcomes = _of_one_size(outcomes)
     _report(outcomes, target, as_json)
     _write(outcomes, target, overlay, output)
+
+
+def _rescaled(board: Board) -> str:
+    scale = board.scale
+    said = f"; {scale.contradiction}" if scale.contradiction else ""
+    return (
+        f"the measured distances make the board {scale.factor:.6g} times as large as its squares, std "
+        f"{100 * scale.std:.2g} %{said}"
+    )
 
 
 def _wanted(
@@ -335,7 +346,7 @@ def _write(outcomes: Sequence[tuple[str, Outcome]], board: Board, overlay: str |
     from neurocal_cli.io.writing import write_whole
 
     found = {name: outcome.detection for name, outcome in outcomes if outcome.detection is not None}
-    text = format_points(gather(found, board.unit))
+    text = format_points(replace(gather(found, board.unit), distances=board.distances))
     if overlay is not None:
         os.makedirs(overlay, exist_ok=True)
         for name, outcome in outcomes:

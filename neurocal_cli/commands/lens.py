@@ -115,6 +115,14 @@ def lens() -> None:
     help="Fix the angle between the image axes at 90 degrees.",
 )
 @click.option(
+    "--target",
+    type=click.Choice(["auto", "given", "flat", "free"]),
+    default="auto",
+    help="Where the points of a board in several views are, the same at all settings: given takes X, Y, Z as "
+    "they are; free finds how the board is bent and printed; flat does so within its plane; auto finds it "
+    "where the points ask for it.",
+)
+@click.option(
     "--seed",
     type=click.IntRange(min=0),
     metavar="S",
@@ -134,6 +142,7 @@ def fit(
     hidden: tuple[int, int] | None,
     outliers: str,
     no_skew: bool,
+    target: str,
     seed: int,
     plot: str | None,
     as_json: bool,
@@ -162,14 +171,14 @@ def fit(
       neurocal lens fit sample_data/zoom.csv --distortion k1 --no-skew \\
           --camera still --training alternating --plot lens.png -o lens.yaml
       neurocal lens fit sample_data/zoom.csv --hidden 2 2 --outliers keep --seed 1 \\
-          --json -o lens.yaml
+          --target given --json -o lens.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     check_one_stdin(*points)
     check_summary(as_json, output)
     check_plot(plot, output)
     check_outputs((output, plot), points)
-    learnt = _learn(points, distortion, training, camera, hidden, outliers, no_skew, seed)
+    learnt = _learn(points, distortion, training, camera, hidden, outliers, no_skew, target, seed)
     _write(learnt, output, plot)
     from neurocal_cli.zoom_lens.report import lens_json, lens_report
 
@@ -190,6 +199,7 @@ def _learn(
     hidden: tuple[int, int] | None,
     outliers: str,
     no_skew: bool,
+    target: str,
     seed: int,
 ) -> ZoomLens:
     from neurocal_cli.io.lens_points import read_lens_data
@@ -211,6 +221,7 @@ def _learn(
             camera=camera,
             skew=not no_skew,
             seed=seed,
+            target=target,
             topologies=topologies,
             progress=progress,
         )

@@ -63,7 +63,8 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
 
         kind = os.path.splitext(plot)[1][1:].lower()
         write_whole(plot, draw_target(calibration.target, calibration.unit, kind))
-    write_board(board_of(calibration.target, calibration.unit), output)
+    board = board_of(calibration.target, calibration.unit, calibration.points.distances)
+    write_board(board, output)
     if as_json:
         print_summary(target_json(calibration.target, calibration.unit) or {})
     else:

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from neurocal_cli.board import Board, Plane
+from neurocal_cli.distances import Distance
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
-from neurocal_cli.io.yaml_text import flow, mapping, number, text
+from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import parse_yaml, read_yaml
 
 __all__ = ["format_board", "parse_board", "read_board", "write_board"]
 
 _COUNTS = ("cols", "rows")
 _VECTORS = ("origin", "x_axis", "y_axis")
+_DISTANCE_KEYS = ("from", "to", "length", "std")
 _PLANE_KEYS = ("name", *_COUNTS, "square", *_VECTORS, "points")
 
 
@@ -62,20 +65,39 @@ def format_board(board: Board) -> str:
         rows = flow(np.array(plane.measured))[2:-2].split("], [")
         lines += [f"  - {first}", *(f"    {entry}" for entry in others)]
         lines += ["    points:  # column, row, X, Y, Z", *(f"      - [{row}]" for row in rows)]
+    if board.distances:
+        lines.append("distances:")
+    for one in board.distances:
+        ends = {"from": quoted(one.start), "to": quoted(one.end)}
+        lines.append(f"  - {mapping(**ends, length=number(one.length), std=number(one.std))}")
     return "\n".join([*lines, ""])
 
 
 def _board(root: Field) -> Board:
-    _only(root, ("unit", "planes"))
+    _only(root, ("unit", "planes", "distances"))
     fields = list(root["planes"].items())
     if not fields:
         root["planes"].fail("a list of at least one plane")
     unit = root["unit"].text() if "unit" in root else "mm"
     planes = tuple(_plane(field, alone=len(fields) == 1) for field in fields)
     try:
-        return Board(planes, unit)
+        board = Board(planes, unit)
     except InputError as error:
         raise FormatError(f"planes: {error}", root.source) from error
+    return replace(board, distances=_distances(root, board)) if "distances" in root else board
+
+
+def _distances(root: Field, board: Board) -> tuple[Distance, ...]:
+    found = []
+    for field in root["distances"].items():
+        _only(field, _DISTANCE_KEYS)
+        start, end = (field[key].text() for key in ("from", "to"))
+        try:
+            found.append(Distance(start, end, field["length"].number(), field["std"].number()))
+            board.place(start), board.place(end)
+        except InputError as error:
+            raise FormatError(f"{field.path}: {error}", field.source) from error
+    return tuple(found)
 
 
 def _plane(field: Field, *, alone: bool) -> Plane:

@@ -12,6 +12,7 @@ from neurocal_cli import __version__
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.target_yaml import read_target, target_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
@@ -39,7 +40,8 @@ def format_lens(lens: ZoomLens) -> str:
         A unit or reason that is not valid UTF-8.
     """
     lines = [f"{_BLOCK}:"]
-    for part in (_record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)):
+    parts = _record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)
+    for part in (*parts, target_lines(lens.target, long=False)):
         lines += [f"  {line}" for line in part]
     return "\n".join([*lines, ""])
 
@@ -196,6 +198,7 @@ def _lens(block: Field) -> ZoomLens:
         image_size=(width, height) if width and height else None,
         unit=block["unit"].text(),
         warnings=tuple(field.text() for field in block["warnings"].items()),
+        target=read_target(block.get("target")),
     )
 
 

@@ -7,12 +7,14 @@ are texts: decimals, or packed where there are so many digits that PyYAML would 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
 from operator import add
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.distances import Distance
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.text_columns import (
@@ -27,7 +29,7 @@ from neurocal_cli.io.text_columns import (
     read_ranges,
 )
 from neurocal_cli.io.tree_fields import Field
-from neurocal_cli.io.yaml_text import flow, quoted
+from neurocal_cli.io.yaml_text import flow, number, quoted
 from neurocal_cli.points import Correspondences
 
 __all__ = ["observation_lines", "read_observations"]
@@ -35,6 +37,7 @@ __all__ = ["observation_lines", "read_observations"]
 _PLACE = ("X", "Y", "Z")
 _PIXEL = ("u", "v")
 _COVARIANCE = ("suu", "suv", "svv")
+_WORLD_STD = ("sX", "sY", "sZ")
 _ACROSS = ("nu", "nv")
 
 _MOST_CHARACTERS = 1_500_000  # of decimals: half a second of PyYAML
@@ -46,12 +49,20 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
     if points.covariance is not None:
         measured += _COVARIANCE
         blocks.append(points.covariance)
+    if points.world_std is not None:
+        measured += _WORLD_STD
+        blocks.append(points.world_std)
     if points.across is not None:
         measured += _ACROSS
         blocks.append(points.across)
     columns = ["view", *(["point"] if points.point is not None else []), *_PLACE, *measured]
     yield "observations:"
     yield f"  columns: [{', '.join(columns)}]"
+    if points.distances:
+        yield "  distances:  # from, to, length, std"
+        for one in points.distances:
+            ends = f"{quoted(one.start)}, {quoted(one.end)}"
+            yield f"    - [{ends}, {number(one.length)}, {number(one.std)}]"
     if len(points) == 0:
         yield "  rows: []"
     elif long:
@@ -153,7 +164,9 @@ def read_observations(
             view=labels.get("view"),
             point=labels.get("point"),
             covariance=numbers(_COVARIANCE) if set(_COVARIANCE) <= set(columns) else None,
+            world_std=numbers(_WORLD_STD) if set(_WORLD_STD) <= set(columns) else None,
             across=numbers(_ACROSS) if set(_ACROSS) <= set(columns) else None,
+            distances=_distances(observations.get("distances")),
             image_size=image_size,
             image_center=image_center,
             unit=unit,
@@ -161,6 +174,17 @@ def read_observations(
         )
     except InputError as error:
         raise FormatError(str(error)) from error
+
+
+def _distances(field: Field | None) -> tuple[Distance, ...]:
+    found = []
+    for row in [] if field is None else field.items():
+        cells = list(row.items())
+        if len(cells) != len(fields(Distance)):
+            row.fail("a list of from, to, length, std")
+        start, end, length, std = cells
+        found.append(Distance(start.text(), end.text(), length.number(), std.number()))
+    return tuple(found)
 
 
 def _names(observations: Field) -> list[str]:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.io.points_join import ACROSS, COVARIANCE, SETTINGS, correspondences
+from neurocal_cli.io.points_join import ACROSS, COVARIANCE, SETTINGS, WORLD_STD, correspondences
 from neurocal_cli.io.table import Schema, read_table
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
@@ -20,7 +20,7 @@ __all__ = ["POINTS", "format_points", "read_points", "write_points"]
 POINTS = Schema(
     kind="points",
     required=("X", "Y", "Z", "u", "v"),
-    optional=("view", "point", "sigma", *COVARIANCE, *ACROSS, *SETTINGS),
+    optional=("view", "point", "sigma", *COVARIANCE, *WORLD_STD, *ACROSS, *SETTINGS),
     labels=frozenset({"view", "point"}),
     headerless=("X", "Y", "Z", "u", "v"),
     instead="; neurocal convert --to neurocal makes one of another program's corners",
@@ -79,6 +79,9 @@ def format_points(points: Correspondences) -> str:
     if points.covariance is not None:
         blocks.append(points.covariance)
         names += COVARIANCE
+    if points.world_std is not None:
+        blocks.append(points.world_std)
+        names += WORLD_STD
     if points.across is not None:
         blocks.append(points.across)
         names += ACROSS
@@ -95,6 +98,9 @@ def _metadata_lines(points: Correspondences) -> list[str]:
         lines.append(f"# image_center: {points.image_center[0]!r} {points.image_center[1]!r}")
     if points.unit != points.unit.strip(" \t,;") or re.search(r"[\r\n\0]", points.unit) or not points.unit:
         raise InputError(f"the unit {points.unit!r} cannot be written; name it in a word, such as mm")
+    if points.distances:
+        rows = [[one.start, one.end, one.length, one.std] for one in points.distances]
+        lines.append(f"# distances: {json.dumps(rows)}")
     return [*lines, f"# unit: {points.unit}"]
 
 

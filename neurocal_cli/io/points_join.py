@@ -13,10 +13,11 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.table import Table
 from neurocal_cli.points import Correspondences
 
-__all__ = ["ACROSS", "COVARIANCE", "SETTINGS", "correspondences"]
+__all__ = ["ACROSS", "COVARIANCE", "SETTINGS", "WORLD_STD", "correspondences"]
 
 COVARIANCE = ("suu", "suv", "svv")
 ACROSS = ("nu", "nv")
+WORLD_STD = ("sX", "sY", "sZ")
 SETTINGS = ("zoom", "focus")
 
 
@@ -38,7 +39,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
     for table in tables:
         table.note_unknown(notes)
     _check_settings(tables, notes)
-    return _single(tables[0]) if len(tables) == 1 else _joined(tables, notes)
+    return _single(tables[0]) if len(tables) == 1 else _as_one(tables, notes)
 
 
 def _single(table: Table) -> Correspondences:
@@ -47,16 +48,18 @@ def _single(table: Table) -> Correspondences:
         view=table.labels.get("view"),
         point=_distinct(table),
         covariance=_covariance(table),
-        across=_across(table),
+        world_std=_together(table, WORLD_STD),
+        across=_together(table, ACROSS),
         image_size=table.metadata.image_size,
         image_center=table.metadata.image_center,
+        distances=table.metadata.distances or (),
         unit=table.metadata.unit or "mm",
         source=table.source,
         lines=table.lines,
     )
 
 
-def _joined(tables: list[Table], notes: list[str]) -> Correspondences:
+def _as_one(tables: list[Table], notes: list[str]) -> Correspondences:
     views = [_views_of_file(table) for table in tables]
     owners = _owners(tables, views)
     with_point = [table.source for table in tables if "point" in table.labels]
@@ -73,9 +76,11 @@ def _joined(tables: list[Table], notes: list[str]) -> Correspondences:
         view=np.concatenate(views),
         point=points,
         covariance=_joined_covariance(tables),
-        across=_joined_across(tables),
+        world_std=_joined(tables, WORLD_STD),
+        across=_joined(tables, ACROSS),
         image_size=_agreed("image_size", tables),
         image_center=_agreed("image_center", tables),
+        distances=_agreed("distances", tables) or () if points is not None else (),
         unit=_agreed("unit", tables) or "mm",
         source=tables[0].source,
         lines=np.concatenate([table.lines for table in tables]),
@@ -181,19 +186,24 @@ def _joined_covariance(tables: list[Table]) -> Array | None:
     return np.vstack(present) if present else None
 
 
-def _across(table: Table) -> Array | None:
-    """(N, 2) direction in which each point was measured, if there."""
-    given = [name for name in ACROSS if name in table.numbers]
-    if given and len(given) < len(ACROSS):
-        raise FormatError(f"has {given[0]} only; give both nu,nv", table.source)
-    return table.stack(ACROSS) if given else None
+def _together(table: Table, names: tuple[str, ...]) -> Array | None:
+    """Columns of which a file has all or none: the direction of a measurement, the world point's std."""
+    given = [name for name in names if name in table.numbers]
+    if given and len(given) < len(names):
+        raise FormatError(
+            f"has {', '.join(given)} only; give {'both' if len(names) == 2 else 'all of'} {','.join(names)}",
+            table.source,
+        )
+    return table.stack(names) if given else None
 
 
-def _joined_across(tables: list[Table]) -> Array | None:
-    blocks = [_across(table) for table in tables]
+def _joined(tables: list[Table], names: tuple[str, ...]) -> Array | None:
+    """The same of several files, zero where one has none."""
+    blocks = [_together(table, names) for table in tables]
     if all(block is None for block in blocks):
         return None
-    return np.vstack([np.zeros((len(t), 2)) if b is None else b for t, b in zip(tables, blocks, strict=True)])
+    zeros = [np.zeros((len(table), len(names))) for table in tables]
+    return np.vstack([zero if block is None else block for zero, block in zip(zeros, blocks, strict=True)])
 
 
 def _distinct(table: Table) -> NDArray[Any] | None:

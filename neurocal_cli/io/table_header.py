@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections import Counter
@@ -9,7 +10,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
-from neurocal_cli.errors import FormatError
+from neurocal_cli.distances import Distance
+from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.files import one_line
 
 __all__ = [
@@ -28,7 +30,7 @@ is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?")
 # 1,5 for 1.5, as spreadsheets of half of Europe write it.
 is_decimal_comma = re.compile(r"[+-]?[0-9]*,[0-9]+(?:[eE][+-]?[0-9]+)?").fullmatch
 
-_METADATA = re.compile(r"#\s*(image_size|image_center|unit)\s*:(.*)", re.DOTALL)
+_METADATA = re.compile(r"#\s*(image_size|image_center|unit|distances)\s*:(.*)", re.DOTALL)
 _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 
@@ -71,11 +73,13 @@ class Metadata:
     image_size : (width, height), optional [px]
     image_center : (u0, v0), optional [px]
     unit : str, optional
+    distances : tuple of Distance, optional
     """
 
     image_size: tuple[int, int] | None = None
     image_center: tuple[float, float] | None = None
     unit: str | None = None
+    distances: tuple[Distance, ...] | None = None
 
     def take(self, line: str, source: str, number: int) -> None:
         """Note a ``# key: value`` line; other comments are passed over."""
@@ -106,9 +110,17 @@ def _centre(text: str) -> tuple[float, float] | None:
     return float(words[0]), float(words[1])
 
 
+def _distances(text: str) -> tuple[Distance, ...] | None:
+    try:
+        return tuple(Distance(*row) for row in json.loads(text))
+    except (ValueError, TypeError, InputError):
+        return None
+
+
 _VALUES: dict[str, tuple[Callable[[str], Any], str]] = {
     "image_size": (_size, "two whole numbers as in `# image_size: 640 480`"),
     "image_center": (_centre, "two numbers as in `# image_center: 320 240`"),
+    "distances": (_distances, 'a list as in `# distances: [["0:0", "8:5", 212.3, 0.05]]`'),
     "unit": (lambda text: text or None, "a name as in `# unit: mm`"),
 }
 

@@ -16,6 +16,7 @@ from neurocal_cli.target import Target
 __all__ = ["read_target", "target_lines"]
 
 _NUMBERS = ("X", "Y", "Z", "X_given", "Y_given", "Z_given", "sX", "sY", "sZ")
+_STATED = ("sX_stated", "sY_stated", "sZ_stated")
 
 
 def target_lines(target: Target | None, long: bool) -> Iterator[str]:
@@ -32,6 +33,8 @@ def target_lines(target: Target | None, long: bool) -> Iterator[str]:
     columns["plane"] = target.plane
     numbers = np.hstack([target.found, target.given, target.std])
     columns |= {name: numbers[:, k] for k, name in enumerate(_NUMBERS)}
+    if target.stated is not None:
+        columns |= {name: target.stated[:, k] for k, name in enumerate(_STATED)}
     yield from (f"  {line}" for line in table_lines(columns, long, indent=2))
 
 
@@ -46,9 +49,11 @@ def read_target(field: Field | None) -> Target | None:
     if field is None:
         return None
     columns = read_table(field, frozenset(("point",)))
-    if set(columns) - {"point"} != {"plane", *_NUMBERS}:
+    stated = _STATED if set(_STATED) <= set(columns) else ()
+    if set(columns) - {"point", *stated} != {"plane", *_NUMBERS}:
         field.fail(f"a table with plane, {', '.join(_NUMBERS)}")
     numbers = np.array([columns[name].array(-1) for name in _NUMBERS]).T
+    std = np.array([columns[name].array(-1) for name in stated]).T if stated else None
     sizes = {name: field["sizes"][name].number() for name in field["sizes"].keys()}  # noqa: SIM118
     return Target(
         found=numbers[:, :3],
@@ -59,4 +64,5 @@ def read_target(field: Field | None) -> Target | None:
         flat=field["flat"].boolean(),
         evidence=field["evidence"].number(),
         point=np.array([cell.text() for cell in columns["point"].items()]) if "point" in columns else None,
+        stated=std,
     )

@@ -11,6 +11,7 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
     parameter_covariance,
     parameter_warnings,
     pose_std,
+    with_scale,
 )
 from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
@@ -20,6 +21,7 @@ from neurocal_cli.bundle_adjustment.units import translations
 from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopReason, ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
+from neurocal_cli.target import scale_of
 from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covariance
 
 __all__ = ["calibration_of"]
@@ -92,6 +94,7 @@ def calibration_of(
             *parameter_warnings(intrinsics, state.distortion, std, chosen),
             *_corner_warning(problem),
             *_repeated_warning(repeated),
+            *filter(None, [scale_of(problem.points).contradiction]),
             *_mirrored_warning(seen_from_behind(views, state)),
             *_rejection_warnings(rejected, len(problem.points)),
         ),
@@ -120,6 +123,8 @@ def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[s
         R = np.stack([problem.poses[name].R for name in views.names])
         t = np.stack([problem.poses[name].t for name in views.names])
     std = pose_std(R, centre, views.scale, cov.poses)
+    if problem.free_poses:
+        std = with_scale(std, t, scale_of(problem.points).std)
     rms = np.sqrt(np.add.reduceat(squared, views.first) / views.counts)
     R.setflags(write=False)
     t.setflags(write=False)

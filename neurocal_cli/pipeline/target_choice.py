@@ -21,6 +21,7 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.pipeline.fit import fit_again
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
+from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
@@ -28,10 +29,11 @@ from neurocal_cli.verdict.given_parameters import asked_for
 from neurocal_cli.verdict.stated_noise import stated_noise
 from neurocal_cli.verdict.view_groups import view_groups
 
-__all__ = ["with_target"]
+__all__ = ["lines_that_are_bent", "with_target"]
 
 _ROUNDS = 3
 _WORTH = 0.8  # of the views' number, where some repeat a pose
+_OF_LINES = "k1k2p1p2"  # as `plumb-line` finds
 _TOLD_APART = 5.0  # standard deviations, as for the verdict
 
 
@@ -54,6 +56,8 @@ def with_target(
     solution, rejected
         The ones given where the target stays as it is.
     """
+    if choice != "given" and problem.points.world_std is not None and not solution.refusal:
+        return with_survey(problem, solution, rejected, options)
     rich = solution.state.model == "rich"  # it bends as a target does
     if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected
@@ -76,6 +80,28 @@ def with_target(
         if new.distortion.model == lens:
             break
     return best
+
+
+def lines_that_are_bent(solution: Solution, unit: str) -> str:
+    """What a bent board does to a distortion that was found from straight lines; empty where it is not bent.
+
+    The bend is told by a free distortion, because the one from the lines has taken it in.
+    """
+    problem = solution.problem.with_model(_OF_LINES)
+    fit = problem, problem.adjust(solution.adjusted)
+    _, label, _ = distinct_points([problem.points])
+    if not problem.free_poses or not enough_views(label, problem.views.n_views):
+        return ""
+    found = find_target([fit], least_gain=LEAST_GAIN)
+    if found is None or _other_reason(replace(solution, problem=fit[0], adjusted=fit[1]), found):
+        return ""
+    target = found.target
+    off = float(np.sqrt((target.offsets**2).sum(axis=1).mean()))
+    return (
+        f"the target is bent by {target.bend():.2g} {unit}, and its points lie {off:.2g} {unit} rms from "
+        "where they are given; its lines are not straight, and the distortion that they tell has taken that "
+        "in; find it from the points instead (--distortion auto)"
+    )
 
 
 def _other_reason(solution: Solution, found: Found) -> bool:

@@ -10,8 +10,8 @@ from typing import Any
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import UsageError
 from neurocal_cli.methods import calibrate
+from neurocal_cli.pipeline.common_target import common_target
 from neurocal_cli.points import Correspondences
-from neurocal_cli.stereo.common_target import common_target
 from neurocal_cli.stereo.fit_rig import fit_rig
 from neurocal_cli.stereo.pairing import pair_points, pair_views
 from neurocal_cli.stereo.rig import Rig
@@ -109,7 +109,8 @@ def _on_one_target(
                 break
         return cameras
 
-    cameras = calibrated("given")
+    surveyed = left.world_std is not None or right.world_std is not None
+    cameras = calibrated(choice if surveyed else "given")
     for _ in range(_ROUNDS):
         target = common_target(cameras, choice)
         if target is None:

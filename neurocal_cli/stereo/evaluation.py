@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
+from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.assessment import assess_rig
-from neurocal_cli.stereo.common_target import on_one_target
 from neurocal_cli.stereo.fit_rig import fit_rig, poses_on_rig
 from neurocal_cli.stereo.pairing import Pairs, ViewPairs, pair_points, pair_views
 from neurocal_cli.stereo.rig import Rig

@@ -11,9 +11,9 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
+from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.stereo.adjust import AdjustedRig, adjust_rig
 from neurocal_cli.stereo.assessment import assess_rig
-from neurocal_cli.stereo.common_target import on_one_target
 from neurocal_cli.stereo.contradiction import contradiction, is_significant
 from neurocal_cli.stereo.pair_covariance import not_smaller, rig_covariance
 from neurocal_cli.stereo.pairing import ViewPairs, pair_points, pair_views

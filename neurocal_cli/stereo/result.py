@@ -13,6 +13,7 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
     parameter_covariance,
     parameter_warnings,
     pose_std,
+    with_scale,
 )
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
@@ -31,6 +32,7 @@ from neurocal_cli.stereo.pair_covariance import not_smaller
 from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import Columns, Observations, rig_jacobian
 from neurocal_cli.stereo.rig import Rig
+from neurocal_cli.target import scale_of
 
 __all__ = ["assemble_rig", "non_monotonic_sides"]
 
@@ -94,6 +96,7 @@ class _RigAssembly:
     ) -> None:
         self.problem, self.calibrations, self.adjusted = problem, calibrations, adjusted
         self.columns = Columns.of(adjusted.state)
+        self.scale_std = scale_of(calibrations[0].points).std
         self.shared = np.flatnonzero(free)
         inverse = schur_covariance(adjusted.normal, self.shared, self.columns.pose)
         if not inverse.smallest > _SINGULAR:
@@ -164,6 +167,8 @@ class _RigAssembly:
         baseline = np.linalg.norm(pose.t)
         J[6, 3:] = self.problem.frames.unit * (pose.t / baseline if baseline > 0 else 0.0)
         block = J @ self._shared_block(self.columns.rig) @ J.T
+        followed = np.array([0.0, 0.0, 0.0, *pose.t, baseline])  # the scale of the target
+        block += self.scale_std**2 * np.outer(followed, followed)
         std = np.sqrt(np.maximum(np.diagonal(block), 0.0)).tolist()
         return block[:6, :6], dict(zip((*POSE_NAMES, "baseline"), std, strict=True))
 
@@ -190,7 +195,7 @@ class _RigAssembly:
             changes = self._intrinsic_changes(given, intrinsics, camera, observed, columns)
         rms = np.sqrt(squares / observed.batches.counts)
         R, t = self._world_poses(side)
-        stds = self._pose_stds(side, R)
+        stds = with_scale(self._pose_stds(side, R), t, self.scale_std)
         R.setflags(write=False)
         t.setflags(write=False)
         views = {

@@ -17,7 +17,8 @@ from neurocal_cli.stereo.reprojection import Columns, Observations, RigState, ri
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.information import Information, point_terms
 from neurocal_cli.target_shape.posterior import known_sizes
-from neurocal_cli.target_shape.prior import prior_of
+from neurocal_cli.target_shape.prior import prior_of_target
+from neurocal_cli.target_shape.surveyed import noise_variance
 
 __all__ = ["with_target_uncertainty"]
 
@@ -26,12 +27,16 @@ def with_target_uncertainty(
     target: Target, problem: RigProblem, adjusted: AdjustedRig, free: NDArray[np.bool_]
 ) -> Array | None:
     """(F, F) covariance of the free shared parameters of the rig; None where nothing determines them."""
-    prior = prior_of(target.given, target.plane)
+    prior = prior_of_target(target)
     info = _information(target, problem, adjusted.state, free).turned(prior.axes)
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
     offsets = prior.along_axes(target.offsets)
+    variance = info.cost / max(spare, 1.0)
+    info = info.around_given(offsets)
     try:
-        found = known_sizes(info.around_given(offsets), prior, target.sizes, info.cost / max(spare, 1.0))
+        if prior.stated is not None:
+            variance = noise_variance(info, prior, target.sizes["stated"])
+        found = known_sizes(info, prior, target.sizes, variance)
     except np.linalg.LinAlgError:
         return None
     return found.variance * found.camera

@@ -129,6 +129,8 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     asked = seen.free, seen.free_poses
     basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared)
     plain = covariance(basis.normal, *asked, basis.n_equations + seen.by_prior, basis.shared)
+    if basis.poses is not None:
+        plain = replace(plain, poses=basis.poses)
     if seen.shared is not None:
         return CameraCovariance(basis, plain, plain)
     found = counting_views(plain, basis.normal, *asked, basis.n_equations, seen.repeated, basis.moves_without)

@@ -17,13 +17,13 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.geometry import Array, nearest_similarity
-from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
 from neurocal_cli.target_shape.information import Information, Sight, information_of
 from neurocal_cli.target_shape.left_out import holds_for_views_left_out
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, posterior
 from neurocal_cli.target_shape.prior import prior_of
 
-__all__ = ["LEAST_GAIN", "Found", "enough_views", "find_target"]
+__all__ = ["LEAST_GAIN", "Found", "at_world", "enough_views", "find_target", "sight_of"]
 
 _STEPS = 10
 # Unknowns of the dense system. From more on some views are taken; of far more no target is looked for.
@@ -33,7 +33,9 @@ _EXACT = 1e-6  # px: rounding, which tells nothing of a target
 _EARLY = 0.5  # of the gain, that the first step must promise
 _SETTLED = 0.02  # of the cameras' standard deviations
 _LARGEST = 0.02  # of the target's size: more is no target that happens to be bent
-_STRETCHED = 0.02  # prints are by a few thousandths; more is a square of another size along one side
+# Prints are stretched by a few thousandths; more is a square of another size along one side. A target that
+# was found below the limit may settle a little beyond it, where the lens is chosen for it.
+_STRETCHED, _STRETCHED_AGAIN = 0.02, 0.025
 _FEWEST, _FEWEST_OF_FOLDED = 3, 2  # different views of most points
 LEAST_GAIN = 6.0
 """Of the logarithm of the evidence, for a target to be found unasked. Of 90 clean sets none gains more than
@@ -117,7 +119,7 @@ def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Proble
     points = problem.points.select(rows)
     place = [views.names.index(name) for name in points.view_names]
     state = replace(known, R=known.R[place], t=known.t[place])
-    return _at(replace(problem, points=points), adjusted, state, points.world)
+    return at_world(replace(problem, points=points), adjusted, state, points.world)
 
 
 def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known: Target | None) -> Found:
@@ -126,7 +128,7 @@ def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known:
     for problem, adjusted in fits:
         points = problem.points if known is None else known.as_given(problem.points)
         world = found.target.applied(points).world
-        moved.append(_at(problem, adjusted, in_pixels(problem, adjusted.state), world))
+        moved.append(at_world(problem, adjusted, in_pixels(problem, adjusted.state), world))
     return replace(found, fits=tuple(moved))
 
 
@@ -136,6 +138,7 @@ class _Search:
     def __init__(self, fits: Sequence[tuple[Problem, Adjusted]], flat: bool, known: Target | None) -> None:
         self.fits, self.flat = list(fits), flat
         worlds = [problem.points.world for problem, _ in fits]
+        self.most_stretched = _STRETCHED if known is None else _STRETCHED_AGAIN
         if known is None:
             self.given, label, self.ids = distinct_points([problem.points for problem, _ in fits])
             self.plane = planes_of(self.given, self.ids)
@@ -171,7 +174,9 @@ class _Search:
             return None
         self._align()
         target = self._target(found, gain)
-        return Found(target, tuple(self.fits), found.evidence) if target.stretch() < _STRETCHED else None
+        if not target.stretch() < self.most_stretched:
+            return None
+        return Found(target, tuple(self.fits), found.evidence)
 
     def _sights(self) -> list[Sight]:
         return [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
@@ -185,17 +190,22 @@ class _Search:
         self.offsets, self.sizes = found.offsets, found.sizes
         world = self.given + self.prior.in_world(self.offsets)
         self.fits = [
-            _at(*fit, in_pixels(fit[0], fit[1].state), world[label])
+            at_world(*fit, in_pixels(fit[0], fit[1].state), world[label])
             for fit, label in zip(self.fits, self.label, strict=True)
         ]
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
 
     def _align(self) -> None:
-        """Turn, shift and scale the target to be nearest to the given one; no pixel sees that."""
+        """Turn, shift and scale the target to be nearest to the given one; no pixel sees that.
+
+        Where distances were measured, they hold the scale.
+        """
         if not all(problem.free_poses for problem, _ in self.fits):
             return
         world = self.given + self.prior.in_world(self.offsets)
         s, R, t = nearest_similarity(world, self.given)
+        held = scale_of_points(s * world @ R.T + t, self.ids, self.fits[0][0].points.distances).factor
+        s, t = held * s, held * t
         world = s * world @ R.T + t
         self.offsets = self.prior.along_axes(world - self.given)
         for k, label in enumerate(self.label):
@@ -203,7 +213,7 @@ class _Search:
             state = in_pixels(problem, adjusted.state)
             turned = state.R @ R.T
             state = replace(state, R=turned, t=s * state.t - turned @ t)
-            self.fits[k] = _at(problem, adjusted, state, world[label])
+            self.fits[k] = at_world(problem, adjusted, state, world[label])
 
     def _target(self, found: Posterior, gain: float) -> Target:
         axes = self.prior.axes
@@ -227,7 +237,9 @@ def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> S
     return Sight(views, adjusted.state, problem.free_camera, problem.free_poses, ordered)
 
 
-def _at(problem: Problem, adjusted: Adjusted, state: CameraState, world: Array) -> tuple[Problem, Adjusted]:
+def at_world(
+    problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
+) -> tuple[Problem, Adjusted]:
     """A camera with its views for other places of the points: the minimum near a state in pixels."""
     new = replace(problem.with_points(replace(problem.points, world=world)), restraint=problem.restraint)
     return new, new.adjust(replace(adjusted, state=normalised(state, new.views)))

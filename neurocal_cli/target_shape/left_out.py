@@ -45,7 +45,8 @@ def holds_for_views_left_out(
         return True
 
     def information(folds: NDArray[np.intp]) -> Information:
-        some = [_of(sight, np.isin(np.arange(sight.views.n_views) % n_folds, folds)) for sight in sights]
+        which = [np.isin(np.arange(sight.views.n_views) % n_folds, folds) for sight in sights]
+        some = [_of(sight, w) for sight, w in zip(sights, which, strict=True) if w.any()]
         return information_of(some, len(offsets)).turned(prior.axes).around_given(offsets)
 
     n_folds = min(n_views, _FOLDS)

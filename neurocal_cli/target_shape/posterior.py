@@ -15,8 +15,8 @@ The evidence, with the noise's variance marginalised too, tells whether there ar
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,7 +26,7 @@ from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
 from neurocal_cli.target_shape.system import Solved, System
 
-__all__ = ["Posterior", "cost_at", "evidence_of_given", "known_sizes", "posterior"]
+__all__ = ["Posterior", "cost_at", "evidence_of_given", "known_sizes", "posterior", "quadratic_at"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +52,8 @@ class Posterior:
         How many of the offsets' unknowns the data determine.
     evidence : float
         Its logarithm; a priori every value of a camera's normalised parameters is as likely as any.
+    poses : (P, 6, 6) array, optional
+        Covariance of each pose in units of the noise's variance, where the points are surveyed.
     """
 
     offsets: Array
@@ -63,9 +65,11 @@ class Posterior:
     sizes: dict[str, float]
     determined: float
     evidence: float
+    poses: Array | None = None
 
 
 _SINGLE = {"place": [0, 1], "height": [2]}  # axes of a point by itself
+_STATED = "stated"  # all of them, where a survey states their standard deviations: the factor of these
 _OUT_OF_PLANE = ("bend", "height")
 _START = {
     "fold": 3e-3,
@@ -160,6 +164,8 @@ def posterior(
 def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Posterior:
     """The same with sizes and a variance of the noise that are known.
 
+    The variance stays that of the noise where sizes are stated: they do not follow the residuals.
+
     Raises
     ------
     numpy.linalg.LinAlgError
@@ -167,7 +173,24 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
     """
     parts = _Parts(info, prior, flat=False)
     noise = np.sqrt(variance)
-    return parts.posterior(parts.at({name: size / noise for name, size in sizes.items()}))
+    found = parts.posterior(parts.at({name: size / noise for name, size in sizes.items()}))
+    if prior.stated is None:
+        return found
+    return replace(found, variance=variance, std=found.std * np.sqrt(variance / found.variance))
+
+
+def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[float, float]]:
+    """Minimum and determinant for surveyed points by the ratio of their factor to the noise's std.
+
+    The logarithm of the determinant is that of H less that of the precisions.
+    """
+    parts = _Parts(info, prior, flat=False)
+
+    def at(ratio: float) -> tuple[float, float]:
+        now = parts.at({_STATED: ratio})
+        return max(now.solved.cost, _NO_COST), now.solved.logdet - now.logprior
+
+    return at
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,6 +201,7 @@ class _Solution:
     solved: Solved
     variance: float
     evidence: float
+    logprior: float
 
 
 class _Parts:
@@ -200,17 +224,27 @@ class _Parts:
         smooth = np.empty(self.system.m)
         for name, places in self.prior.groups.items():
             smooth[places] = (self.prior.size / ratios[name]) ** 2
-        place, height = (ratios[name] ** -2 for name in _SINGLE)
-        solved = self.system.solve(smooth, np.array([place, place, height]))
-        logprior = float(np.log(smooth).sum()) + self.system.n * float(2 * np.log(place) + np.log(height))
+        single = self._of_points(ratios)
+        solved = self.system.solve(smooth, single)
+        logprior = float(np.log(smooth).sum()) + float(np.log(single).sum())
         evidence = _log_evidence(self.spare, solved.cost, solved.logdet - logprior)
-        return _Solution(ratios, solved, solved.cost / self.spare, evidence)
+        return _Solution(ratios, solved, solved.cost / self.spare, evidence, logprior)
+
+    def _of_points(self, ratios: Mapping[str, float]) -> Array:
+        """(n, 3) precisions of the points by themselves, in units of the noise's."""
+        if self.prior.stated is not None:
+            return np.asarray((ratios[_STATED] * self.prior.stated) ** -2)
+        place, height = (ratios[name] ** -2 for name in _SINGLE)
+        return np.tile([place, place, height], (self.system.n, 1))
 
     def _coefficients(self, now: _Solution, name: str) -> tuple[Array, Array, float]:
         """A part's coefficients, their variances, and the offset for a coefficient of 1."""
         if name in self.prior.groups:
             places = self.prior.groups[name]
             return now.solved.smooth[places], now.solved.smooth_variance[places], self.prior.size
+        if self.prior.stated is not None:
+            stated = self.prior.stated
+            return now.solved.single / stated, now.solved.single_variance / stated**2, 1.0
         columns = _SINGLE[name]
         return now.solved.single[:, columns], now.solved.single_variance[:, columns], 1.0
 
@@ -260,4 +294,5 @@ class _Parts:
             sizes={name: float(ratio * noise) for name, ratio in now.ratios.items()},
             determined=determined,
             evidence=now.evidence,
+            poses=now.solved.poses,
         )

@@ -8,6 +8,9 @@ A priori each part of the offsets is Gaussian with a size that the data tell (`p
 - warp: in the plane, smooth;
 - place and height: of each point by itself, in the plane and out of it.
 
+Points that were surveyed have the standard deviations that the survey states, each by itself along the
+world's axes, and nothing else (`surveyed_prior`). They also say where the world's axes are, and its scale.
+
 Smooth means the covariance exp(-|x - y|^2 / (2 l^2)) between two points of a plane, a Gaussian process; its
 largest eigenfunctions stand for it. A target that is solid all through warps in all directions alike.
 """
@@ -20,12 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.target import is_flat
+from neurocal_cli.target import Target, is_flat
 
-__all__ = ["Prior", "prior_of"]
+__all__ = ["Prior", "prior_of", "prior_of_target", "surveyed_prior"]
 
 _LENGTH = 0.35  # of a plane's size, as printed boards bend; tests/test_target_shape.py tries others
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are nothing
+_HELD = 1e-7  # of the target's size: a surveyed point that is exactly where it is stated
 _MOST = 150  # points that the eigenfunctions are found from
 
 
@@ -45,6 +49,8 @@ class Prior:
         Orthonormal directions that no photograph tells: shifts, turns and a scale of the whole target.
     size : float
         Of the target [world unit].
+    stated : (n, 3) array, optional [world unit]
+        Standard deviations of surveyed points.
     """
 
     axes: Array
@@ -52,6 +58,7 @@ class Prior:
     groups: dict[str, NDArray[np.intp]]
     gauge: Array
     size: float
+    stated: Array | None = None
 
     def along_axes(self, world: Array) -> Array:
         """Offsets (n, 3) in the world's axes, along each point's own."""
@@ -91,6 +98,21 @@ def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:
         first += part.shape[2]
     basis = size * np.concatenate([part for _, part in parts], axis=2)
     return Prior(axes, basis, groups, _gauge(given, axes), size)
+
+
+def surveyed_prior(given: Array, stated: Array) -> Prior:
+    """Prior of points (n, 3) with standard deviations (n, 3) that a survey states [world unit]."""
+    n = len(given)
+    size = float(np.ptp(given - given.mean(axis=0), axis=0).max())
+    axes = np.broadcast_to(np.eye(3), (n, 3, 3))
+    return Prior(axes, np.zeros((n, 3, 0)), {}, np.zeros((3 * n, 0)), size, np.maximum(stated, _HELD * size))
+
+
+def prior_of_target(target: Target) -> Prior:
+    """Prior that a target was found with."""
+    if target.stated is not None:
+        return surveyed_prior(target.given, target.stated)
+    return prior_of(target.given, target.plane)
 
 
 def _gauge(given: Array, axes: Array) -> Array:

@@ -73,7 +73,7 @@ class System:
         self.logdet_poses = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
 
     def solve(self, smooth: Array, single: Array) -> Solved:
-        """At given precisions (m,) of the smooth parts and (3,) of a point by itself."""
+        """At given precisions (m,) of the smooth parts and (n, 3) of each point by itself."""
         return self._points_first(smooth, single) if self.points_first else self._poses_first(smooth, single)
 
     def _poses_first(self, smooth: Array, single: Array) -> Solved:
@@ -82,7 +82,7 @@ class System:
         M = self.dense[:dim, :dim].copy()
         at = np.arange(dim)
         M[at[f:s], at[f:s]] += smooth
-        M[at[s:], at[s:]] += np.tile(single, self.n)
+        M[at[s:], at[s:]] += single.ravel()
         inverse, logdet = _inverse(M)
         x = inverse @ self.dense[:dim, -1]
         cost = float(self.dense[-1, -1] - self.dense[:dim, -1] @ x)
@@ -93,12 +93,23 @@ class System:
         var = self._variance(inverse[f:s, f:s], cross, var_single, along_gauge)
         return Solved(
             x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
-            np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], with_offsets, var,
+            np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], with_offsets, var, self._poses(inverse),
         )  # fmt: skip
+
+    def _poses(self, inverse: Array) -> Array | None:
+        """(P, 6, 6) covariance of the poses, from that of all the others; only where points are surveyed.
+
+        Elsewhere what no photograph tells of the target would be in it.
+        """
+        if self.prior.stated is None:
+            return None
+        own = np.linalg.inv(self.info.pose)
+        gain = own @ np.concatenate([self.pose_shared, self.info.pose_point.reshape(self.P, 6, -1)], axis=2)
+        return np.asarray(own + gain @ inverse @ np.swapaxes(gain, 1, 2))
 
     def _points_first(self, smooth: Array, single: Array) -> Solved:
         info, s, f, n, P = self.info, self.s, self.f, self.n, self.P
-        root = np.linalg.inv(np.linalg.cholesky(info.point + np.diag(single)))  # (n, 3, 3)
+        root = np.linalg.inv(np.linalg.cholesky(info.point + single[:, :, None] * np.eye(3)))  # (n, 3, 3)
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, 6 * P, 3).swapaxes(1, 2)
         rows = root @ np.concatenate([self.point_shared, poses, info.point_right[..., None]], axis=2)
         flat = rows.reshape(3 * n, -1)
@@ -135,6 +146,7 @@ class System:
         return Solved(
             x[:f], x[f:s], e, cost, logdet, np.diagonal(inverse)[f:s], var_single,
             inverse[:f, :f], self._with_offsets(inverse[:f, f:s], cross[:f]), var,
+            inverse[s:, s:].reshape(P, 6, P, 6)[np.arange(P), :, np.arange(P)],
         )  # fmt: skip
 
     def _with_offsets(self, smooth: Array, single: Array) -> Array:
@@ -178,6 +190,8 @@ class Solved:
         Covariance of the cameras and the whole offsets.
     offset_variance : (n, 3) array
         Of the whole offsets, without what no photograph tells.
+    poses : (P, 6, 6) array, optional
+        Covariance of each pose.
     """
 
     camera: Array
@@ -190,6 +204,7 @@ class Solved:
     camera_covariance: Array
     camera_offsets: Array
     offset_variance: Array
+    poses: Array | None = None
 
 
 def _inverse(M: Array) -> tuple[Array, float]:

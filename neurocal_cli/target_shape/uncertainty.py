@@ -21,7 +21,8 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.information import Sight, by_world, information_of, labelled
 from neurocal_cli.target_shape.posterior import known_sizes
-from neurocal_cli.target_shape.prior import Prior, prior_of
+from neurocal_cli.target_shape.prior import Prior, prior_of_target
+from neurocal_cli.target_shape.surveyed import noise_variance
 
 __all__ = ["CovarianceBasis", "covariance_basis"]
 
@@ -47,12 +48,15 @@ class CovarianceBasis:
         Equations, less the unknowns of the target that they determine.
     moves_without : callable or None
         How far the free parameters move without the views of each pose.
+    poses : (V, 6, 6) array or None
+        Covariance of the poses, where it does not follow from the normal matrices.
     """
 
     normal: Array
     shared: Array | None
     n_equations: float
     moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None
+    poses: Array | None = None
 
 
 def covariance_basis(
@@ -90,7 +94,7 @@ def covariance_basis(
     ordered = world if views.order is None else world[views.order]
     known = _target_uncertainty(target, views, state, free, free_poses, ordered)
     return CovarianceBasis(
-        known.normal, known.entries, views.n_equations - known.determined, known.moves_without
+        known.normal, known.entries, views.n_equations - known.determined, known.moves_without, known.poses
     )
 
 
@@ -106,11 +110,14 @@ class _TargetUncertainty:
         As from `reprojection.normal_blocks`, with the efficient scores of what is free of the camera.
     determined : float
         Unknowns of the target that the data determine.
+    poses : (V, 6, 6) array or None
+        Covariance of the poses, where the points are surveyed.
     """
 
     entries: Array
     normal: Array
     determined: float
+    poses: Array | None
     _sight: Sight
     _offsets: Array
     _prior: Prior
@@ -152,19 +159,24 @@ def _target_uncertainty(
 ) -> _TargetUncertainty:
     """Of one camera; world (N, 3) in the order of `views`."""
     label = target.rows_of(world)
-    prior = prior_of(target.given, target.plane)
+    prior = prior_of_target(target)
     sight = Sight(views, state, free, free_poses, label)
     info = information_of([sight], len(target.given)).turned(prior.axes)
     offsets = prior.along_axes(target.offsets)
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
     variance = info.cost / spare
-    found = known_sizes(info.around_given(offsets), prior, target.sizes, variance)
+    info = info.around_given(offsets)
+    if prior.stated is not None:
+        variance = noise_variance(info, prior, target.sizes["stated"])
+    found = known_sizes(info, prior, target.sizes, variance)
     followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
     followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # points of no target: -1
     normal = _efficient(views, state, np.flatnonzero(free), labelled(views, label), followed)
     return _TargetUncertainty(
-        found.variance * found.camera, normal, found.determined, sight, offsets, prior, target.sizes, variance
-    )
+        found.variance * found.camera, normal, found.determined,
+        found.variance * found.poses if free_poses and found.poses is not None else None,
+        sight, offsets, prior, target.sizes, variance,
+    )  # fmt: skip
 
 
 def _efficient(

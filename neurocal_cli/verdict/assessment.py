@@ -56,7 +56,7 @@ from neurocal_cli.verdict.projection_uncertainty import (
 )
 from neurocal_cli.verdict.repeated_views import repeated_views
 from neurocal_cli.verdict.rules import Verdict, reach_verdict
-from neurocal_cli.verdict.stated_noise import stated_noise
+from neurocal_cli.verdict.stated_noise import stated_noise, stated_survey
 from neurocal_cli.verdict.view_change import ViewChange, view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
@@ -191,7 +191,11 @@ class _AtMinimum:
             board=self._board(),
             mirrored=tuple(seen_from_behind(views, self.state)),
             asked_for=asked_for(views, self.state, self.calibration.fixed, self.free_poses),
-            noise=(*stated, *noise_shape(self.points, residuals, alike)),
+            noise=(
+                *stated,
+                *stated_survey(self.calibration.target),
+                *noise_shape(self.points, residuals, alike),
+            ),
             groups=None if stated else self._groups(),
         )
 

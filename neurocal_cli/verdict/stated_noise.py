@@ -1,4 +1,4 @@
-"""Whether the residuals bear out the standard deviations that the points came with."""
+"""Whether the residuals bear out the standard deviations that pixels and points came with."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.common_noise import common_share, measured
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
+from neurocal_cli.target import Target
 from neurocal_cli.verdict.findings import Finding, name_some
 
-__all__ = ["stated_noise"]
+__all__ = ["stated_noise", "stated_survey"]
 
 _SHARE = 0.5  # of the noise that is the same for all points, whatever they state
 _FACTOR = 2.0  # between views whose sigma is too small and others; a std of 12 points is known to a fifth
@@ -46,3 +47,17 @@ def stated_noise(points: Correspondences, residuals: Array) -> Iterator[Finding]
         yield 1, f"{name_some(names)}: the stated sigma is {factor:.2g} times too small", advice
     else:
         yield 1, "the stated sigmas say nothing of the residuals", advice
+
+
+def stated_survey(target: Target | None) -> Iterator[Finding]:
+    """Say whether surveyed points are as exact as stated."""
+    factor = 1.0 if target is None or target.stated is None else target.sizes["stated"]
+    if factor == 1.0:
+        return
+    small = factor > 1.0
+    yield (
+        1,
+        f"the standard deviations sX,sY,sZ of the points are {factor if small else 1 / factor:.2g} times too "
+        f"{'small' if small else 'large'}; they are taken as the residuals ask for",
+        "state sX,sY,sZ as the survey has them, in the unit of the points",
+    )

@@ -17,6 +17,7 @@ from neurocal_cli.methods import calibrate
 from neurocal_cli.zoom_lens.baseline_models import baselines_of
 from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData
 from neurocal_cli.zoom_lens.settings import LensPoints, describe
+from neurocal_cli.zoom_lens.target import on_target
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
 __all__ = ["LensEvaluation", "SettingError", "evaluate_lens"]
@@ -74,7 +75,7 @@ def evaluate_lens(lens: ZoomLens, points: LensPoints) -> LensEvaluation:
     InputError
         Points without the controls of the lens, or of another image size.
     """
-    points, warnings = _matched(lens, points)
+    points, warnings = _matched(lens, on_target(points, lens.target))
     x = lens.scaled(points.settings)
     prediction = lens.predict(points.settings)
     local, constants = prediction.local, prediction.constants

@@ -8,6 +8,7 @@ import numpy as np
 
 from neurocal_cli.camera.distortion import MODELS, WIDE
 from neurocal_cli.errors import UsageError
+from neurocal_cli.target import TARGETS
 from neurocal_cli.zoom_lens.committee import Budget
 from neurocal_cli.zoom_lens.cross_validation import left_out_errors
 from neurocal_cli.zoom_lens.distortion_selection import choose_model
@@ -25,6 +26,7 @@ from neurocal_cli.zoom_lens.outlier_settings import contradiction, most_suspect
 from neurocal_cli.zoom_lens.result import assemble, provisional
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.static_calibration import common_tables, first_constants
+from neurocal_cli.zoom_lens.target import lens_target, on_target
 from neurocal_cli.zoom_lens.training import train_all
 from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting, ZoomLens
 
@@ -46,6 +48,7 @@ def fit_lens(
     skew: bool = True,
     seed: int = 0,
     *,
+    target: str = "auto",
     topologies: tuple[tuple[int, int], ...] | None = None,
     progress: Progress | None = None,
 ) -> ZoomLens:
@@ -69,6 +72,8 @@ def fit_lens(
         False holds theta at pi/2.
     seed : int
         Of all random weights.
+    target : {"auto", "given", "flat", "free"}
+        As for `calibrate`. All settings share one target; with a still camera it stays as given.
     topologies : tuple of (int, int), optional
         Numbers of hidden units to choose from: in the first layer for each control, and in the second.
     progress : callable, optional
@@ -90,6 +95,7 @@ def fit_lens(
         ("training", training, TRAININGS),
         ("outliers", outliers, OUTLIERS),
         ("camera", camera, CAMERAS),
+        ("target", target, TARGETS),
     ):
         if value not in choices:
             raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
@@ -102,12 +108,14 @@ def fit_lens(
         training, camera == "still" or (camera == "auto" and bool(one_view)), skew, budget, seed
     )
     reject = outliers == "reject"
+    found = None if options.still else lens_target(lens, target, distortion, skew, seed, report)
+    lens = on_target(lens, found)
     if distortion == "auto":
         start = choose_model(lens, options, reject, report)
     else:
         start = calibrate_settings(lens, distortion, options, reject, report)
     start, joints = _train(start, options, reject, report)
-    return assemble(start, joints, options)
+    return replace(assemble(start, joints, options), target=found)
 
 
 def _train(

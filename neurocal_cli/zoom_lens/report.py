@@ -10,7 +10,7 @@ import numpy as np
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
-from neurocal_cli.report import align, number_or_none, rounded
+from neurocal_cli.report import align, number_or_none, rounded, target_json, target_lines
 from neurocal_cli.verdict.report import verdict_json, verdict_lines
 from neurocal_cli.zoom_lens.evaluation import LensEvaluation
 from neurocal_cli.zoom_lens.judgement import judge_lens
@@ -49,6 +49,7 @@ def lens_report(lens: ZoomLens) -> str:
         )
     scale = _SCALES[lens.members[0].nets.scale]
     training = _TRAININGS.get(lens.training, lens.training)
+    tail += target_lines(lens.target, lens.unit)
     tail.append(f"networks: committee of {len(lens.members)}, alpha on a {scale} scale, {training}")
     tail.append("converged" if lens.converged else "not converged: training stopped before the error settled")
     blocks.append("\n".join(tail))
@@ -73,6 +74,7 @@ def lens_json(lens: ZoomLens) -> dict[str, Any]:
         "noise_floor_px": None if lens.known else number_or_none(float(np.sqrt(2 * lens.variance))),
         "left_out_px": number_or_none(float(lens.left_out_px)),
         "members": len(lens.members),
+        "target": target_json(lens.target, lens.unit),
         "converged": bool(lens.converged),
         "warnings": list(lens.warnings),
         **({} if verdict is None else {"verdict": verdict_json(verdict)}),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.target import Target
 from neurocal_cli.zoom_lens.joint_training import posterior
 from neurocal_cli.zoom_lens.parameter_networks import LensNets
 from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
@@ -96,6 +97,8 @@ class ZoomLens:
     image_size : (width, height) or None
     unit : str
     warnings : tuple of str
+    target : Target or None
+        The one that was found from all settings together; the lens rests on it.
     """
 
     controls: tuple[str, ...]
@@ -120,6 +123,7 @@ class ZoomLens:
     image_size: tuple[int, int] | None = None
     unit: str = "mm"
     warnings: tuple[str, ...] = ()
+    target: Target | None = None
 
     @property
     def low(self) -> Array:

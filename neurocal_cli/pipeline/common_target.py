@@ -16,6 +16,7 @@ from neurocal_cli.errors import NeurocalError
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
+from neurocal_cli.target_shape.surveyed import find_surveyed
 
 __all__ = ["common_target", "on_one_target"]
 
@@ -34,6 +35,10 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     Target or None
         None where it stays as given.
     """
+    if choice != "given" and any(
+        camera.target is not None and camera.target.stated is not None for camera in cameras
+    ):
+        return _surveyed(cameras)
     fixed = any(camera.straight_lines is not None or camera.method != "neuro" for camera in cameras)
     if choice == "given" or fixed:
         return None
@@ -52,6 +57,19 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     found = (find_lens_and_target if chosen else find_target)(
         fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf
     )
+    return None if found is None else found.target
+
+
+def _surveyed(cameras: Sequence[Calibration]) -> Target | None:
+    """Surveyed points, found with all cameras; each may have found them by itself."""
+    stated = [
+        camera if camera.target is None else replace(camera, points=camera.target.as_given(camera.points))
+        for camera in cameras
+    ]
+    try:
+        found = find_surveyed([_fit(camera) for camera in stated])
+    except NeurocalError:
+        return None
     return None if found is None else found.target
 
 

@@ -1,0 +1,132 @@
+"""Distances that were measured on a target: they hold its scale, which no photograph tells."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+
+__all__ = ["NO_SCALE", "Distance", "Scale", "fitted_scale", "grid_place"]
+
+_NUMBER = r"-?(?:[0-9]+\.?[0-9]*|\.[0-9]+)"
+_LABEL = re.compile(rf"(?:(?P<plane>.*)/)?(?P<c>{_NUMBER}):(?P<r>{_NUMBER})")
+_ANOTHER_UNIT = 0.1  # a scale further from 1 is no print of the stated board
+
+
+@dataclass(frozen=True)
+class Distance:
+    """A measured distance between two places of a board.
+
+    Parameters
+    ----------
+    start, end : str
+        Ids ``[plane/]c:r`` of vertices. c and r may be any numbers: -1:-1 is the outer corner of the first
+        square.
+    length, std : float [world unit]
+        What was measured, and its standard deviation.
+
+    Raises
+    ------
+    InputError
+        A place that is no id, or a length or standard deviation that is not positive.
+    """
+
+    start: str
+    end: str
+    length: float
+    std: float
+
+    def __post_init__(self) -> None:
+        if grid_place(self.start) == grid_place(self.end):
+            raise InputError(f"the distance from {self.start!r} to {self.end!r} is none; name two places")
+        for name in ("length", "std"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < np.inf:
+                raise InputError(
+                    f"the {name} of the distance from {self.start} to {self.end} must be a positive number, "
+                    f"found {value!r}"
+                )
+            object.__setattr__(self, name, float(value))
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What measured distances say of the scale of a target.
+
+    Attributes
+    ----------
+    factor : float
+        By which all lengths have to be multiplied.
+    std : float
+        Of the factor. Distances that contradict each other make it larger.
+    contradiction : str
+        What contradicts the others, if so.
+    """
+
+    factor: float = 1.0
+    std: float = 0.0
+    contradiction: str = ""
+
+
+NO_SCALE = Scale()
+_CONTRADICTED = 4.0  # standard deviations of a distance
+
+
+def grid_place(label: str) -> tuple[str, float, float]:
+    """Plane, column and row of an id ``[plane/]c:r``.
+
+    Raises
+    ------
+    InputError
+        No such id.
+    """
+    match = _LABEL.fullmatch(label) if isinstance(label, str) else None
+    if match is None:
+        raise InputError(f"{label!r} is no place on a board; write a vertex as column:row, such as 0:0")
+    return match["plane"] or "", float(match["c"]), float(match["r"])
+
+
+def fitted_scale(places: Callable[[str], Array], distances: Sequence[Distance]) -> Scale:
+    """Fit the scale of a target to distances, each weighed by its standard deviation.
+
+    Parameters
+    ----------
+    places : callable
+        World coordinates (3,) of an id, as they are believed to be.
+    distances : sequence of Distance
+
+    Raises
+    ------
+    InputError
+        A place that the target does not have; distances of another unit.
+    """
+    if not distances:
+        return NO_SCALE
+    believed = np.array([np.linalg.norm(places(one.end) - places(one.start)) for one in distances])
+    length = np.array([one.length for one in distances])
+    std = np.array([one.std for one in distances])
+    weight = 1.0 / std**2
+    factor = float((weight * believed * length).sum() / (weight * believed**2).sum())
+    if not abs(factor - 1.0) < _ANOTHER_UNIT:
+        raise InputError(
+            f"the measured distances make the board {factor:.4g} times as large as its squares; check their "
+            "unit and their places"
+        )
+    z = (length - factor * believed) / std
+    spare = len(distances) - 1
+    more = max(1.0, float(np.sqrt((z**2).sum() / spare))) if spare else 1.0
+    worst = int(np.abs(z).argmax())
+    contradiction = ""
+    if abs(z[worst]) > _CONTRADICTED:
+        one = distances[worst]
+        contradiction = (
+            f"the measured distance from {one.start} to {one.end} is {z[worst] * one.std:+.3g} off the board "
+            f"that suits them all, {abs(z[worst]):.2g} standard deviations; measure again, or state a larger "
+            "std"
+        )
+    return Scale(factor, more * float(1.0 / np.sqrt((weight * believed**2).sum())), contradiction)

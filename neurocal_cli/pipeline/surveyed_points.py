@@ -1,0 +1,120 @@
+"""A camera from surveyed points, whose standard deviations are stated.
+
+At first every point is weighed, and judged, by the noise that its pixels have together with its place in
+space. Then the places are found with the camera, because all views of a point share its error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
+from neurocal_cli.bundle_adjustment.reweighting import reweighted
+from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.calibration import Rejected
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.options import Options
+from neurocal_cli.median import median
+from neurocal_cli.pipeline.fit import fit_again
+from neurocal_cli.pipeline.outlier_rejection import fit_robustly
+from neurocal_cli.points import Correspondences
+from neurocal_cli.target_shape.surveyed import find_surveyed
+
+__all__ = ["with_survey"]
+
+_MEDIAN = 1.3863  # of chi-squared of two degrees of freedom
+_HALVINGS = 30
+_LEAST_NOISE = 1e-3  # of the residuals' level
+
+
+def with_survey(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options
+) -> tuple[Solution, Rejected]:
+    """Find camera and points together.
+
+    Parameters
+    ----------
+    problem : Problem
+        With all points, where their survey has them.
+    solution, rejected
+        As if they were exactly there.
+    options : Options
+
+    Raises
+    ------
+    DegenerateGeometryError
+        Points that cannot give an answer, with the reason.
+    InputError
+        A point with two standard deviations.
+    """
+    points = problem.points
+    judged = replace(points, covariance=_with_places(solution, points), lines=np.arange(len(points)))
+    if len(rejected) or rejected.views:
+        weighed, rejected = fit_robustly(problem.with_points(judged), options)
+        if rejected.points is not None:
+            assert rejected.points.lines is not None
+            rejected = replace(rejected, points=points.select(rejected.points.lines))
+    else:
+        weighed = fit_again(solution, judged, options)
+    kept = weighed.problem.points.lines
+    assert kept is not None
+    if weighed.refusal:
+        return weighed, rejected
+    own = weighed.problem.with_points(points.select(kept))
+    if not own.free_distortion:
+        own = own.with_seen_pixels()
+    start = own.adjust(replace(weighed.adjusted, state=normalised(weighed.in_pixels, own.views)))
+    found = find_surveyed([(own, start)])
+    if found is None:
+        return replace(weighed, problem=own, adjusted=start), rejected
+    (own, adjusted), *_ = found.fits
+    return reweighted(replace(weighed, problem=own, adjusted=adjusted, target=found.target)), rejected
+
+
+def _with_places(solution: Solution, points: Correspondences) -> Array:
+    """(N, 3) covariance of the pixels together with the places of their points [px^2].
+
+    The noise of the pixels alone is as large as the median residual leaves it.
+    """
+    own = np.array([1.0, 0.0, 1.0]) if points.covariance is None else points.covariance
+    own = np.broadcast_to(own, (len(points), 3))
+    names = {name: k for k, name in enumerate(solution.problem.views.names)}
+    view = np.array([names.get(name, -1) for name in points.view_names])[points.view_index]
+    state = solution.in_pixels
+    in_camera = (state.R[view] @ points.world[..., None])[..., 0] + state.t[view]
+    matrix = solution.problem.matrix(solution.state.entries[0])
+    camera = Camera(Intrinsics.from_matrix(matrix), state.distortion)
+    J = camera.project_jacobian(in_camera)[1] @ state.R[view]
+    assert points.world_std is not None
+    J = J * points.world_std[:, None]
+    place = np.stack(
+        [(J[:, 0] ** 2).sum(axis=1), (J[:, 0] * J[:, 1]).sum(axis=1), (J[:, 1] ** 2).sum(axis=1)]
+    )
+    seen, known = predicted_pixels(state, points.world, view)
+    known = known & (view >= 0) & np.isfinite(place).all(axis=0)
+    r, place = seen[known] - points.pixels[known], place.T[known]
+
+    def level(variance: float) -> float:
+        return float(median(_squared(r, variance * own[known] + place))) / _MEDIAN
+
+    high = float(median(_squared(r, own[known]))) / _MEDIAN
+    low = high * _LEAST_NOISE**2
+    for _ in range(_HALVINGS):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if level(middle) > 1.0 else (low, middle)
+    covariance = high * own
+    covariance[known] += place
+    return covariance
+
+
+def _squared(r: Array, covariance: Array) -> Array:
+    """(N,) r^T C^-1 r."""
+    suu, suv, svv = covariance.T
+    du, dv = r.T
+    return np.asarray((svv * du * du - 2 * suv * du * dv + suu * dv * dv) / (suu * svv - suv * suv))

@@ -1,0 +1,184 @@
+"""Points in space whose standard deviations a survey states: where they are, found with the cameras.
+
+Each point is a priori Gaussian around its stated place, in the world's axes. Beside the points' places the
+noise of the pixels is unknown, and so is whether the survey's standard deviations hold: its variance sigma^2
+and a factor f on them all are told by the likelihood of the residuals with everything else marginalised
+(restricted maximum likelihood, Patterson and Thompson 1971),
+
+    -2 log L = m log sigma^2 + log det H - log det Lambda + E / sigma^2,    Lambda = sigma^2 / (f s)^2,
+
+with m residuals to spare, and H, Lambda and E as in `posterior`. As long as the residuals do not contradict
+the survey, f is 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.units import in_pixels
+from neurocal_cli.errors import InputError
+from neurocal_cli.geometry import Array
+from neurocal_cli.points import Correspondences
+from neurocal_cli.target import Target, distinct_points
+from neurocal_cli.target_shape.find import Found, at_world, sight_of
+from neurocal_cli.target_shape.information import Information, information_of
+from neurocal_cli.target_shape.posterior import evidence_of_given, known_sizes, quadratic_at
+from neurocal_cli.target_shape.prior import Prior, surveyed_prior
+
+__all__ = ["find_surveyed", "noise_variance"]
+
+_STEPS = 10
+_SETTLED = 0.02  # of the standard deviations of cameras and points
+_MOST_DENSE = 3000  # unknowns
+_GRID, _GOLDEN_STEPS = 25, 14
+_LEAST_NOISE, _LARGEST_NOISE = 1e-3, 2.0  # of the residuals' level with the points as given
+_LEAST_RATIO = 1e-3  # of the noise, by points that are no worse than the pixels
+_CONTRADICTED = 5.0  # of the logarithm of the likelihood: one survey of 600 that is right
+_OFF = 1.4  # a factor that matters
+
+
+def find_surveyed(fits: Sequence[tuple[Problem, Adjusted]]) -> Found | None:
+    """Find where surveyed points are.
+
+    Parameters
+    ----------
+    fits : sequence of (Problem, Adjusted)
+        Cameras that saw the points where the survey has them, each at its minimum.
+
+    Returns
+    -------
+    Found or None
+        None where there are too many points and views at once, or they determine nothing.
+
+    Raises
+    ------
+    InputError
+        A point with two standard deviations.
+    """
+    all_points = [problem.points for problem, _ in fits]
+    given, label, ids = distinct_points(all_points)
+    stated = _stated(all_points, len(given), label)
+    n_views = sum(problem.views.n_views for problem, _ in fits)
+    if min(3 * len(given), 6 * n_views) > _MOST_DENSE:
+        return None
+    prior = surveyed_prior(given, stated)
+    assert prior.stated is not None
+    labels = np.split(label, np.cumsum([len(points) for points in all_points])[:-1])
+    offsets = np.zeros_like(given)
+    moved = list(fits)
+    factor = 0.0
+    try:
+        for _ in range(_STEPS):
+            sights = [sight_of(p, a, own) for (p, a), own in zip(moved, labels, strict=True)]
+            info = information_of(sights, len(given)).around_given(offsets)
+            if _spare(info) < 1 or not info.cost > 0:
+                return None
+            factor = factor or _factor(info, prior)
+            found = known_sizes(info, prior, {"stated": factor}, noise_variance(info, prior, factor))
+            moves, offsets = found.offsets - offsets, found.offsets
+            std = np.sqrt(found.variance * np.diagonal(found.camera))
+            moved = [
+                at_world(*fit, in_pixels(fit[0], fit[1].state), (given + offsets)[own])
+                for fit, own in zip(moved, labels, strict=True)
+            ]
+            near = (np.abs(moves) < _SETTLED * factor * prior.stated).all()
+            if near and (np.abs(found.camera_step) < _SETTLED * std).all():
+                break
+    except np.linalg.LinAlgError:
+        return None
+    target = Target(
+        given, given + offsets, found.std, np.zeros(len(given), dtype=np.intp), {"stated": factor}, False,
+        found.evidence - evidence_of_given(info), ids, stated,
+    )  # fmt: skip
+    return Found(target, tuple(moved), found.evidence)
+
+
+def noise_variance(info: Information, prior: Prior, factor: float) -> float:
+    """Variance of the pixels [px^2] beside surveyed points.
+
+    Parameters
+    ----------
+    info : Information
+        Around the given points.
+    prior : Prior
+        Of surveyed points.
+    factor : float
+        On the stated standard deviations.
+    """
+    return _noise(info, prior, factor)[0]
+
+
+def _noise(info: Information, prior: Prior, factor: float) -> tuple[float, float]:
+    """The most likely variance of the pixels, and -2 log L."""
+    at, spare = quadratic_at(info, prior), _spare(info)
+
+    def likelihood(log_variance: float) -> float:
+        cost, logdet = at(factor / np.exp(0.5 * log_variance))
+        return spare * log_variance + logdet + cost / np.exp(log_variance)
+
+    usual = np.log(info.cost / spare)
+    log_variance, least = _lowest(
+        likelihood, usual + 2 * np.log(_LEAST_NOISE), usual + 2 * np.log(_LARGEST_NOISE)
+    )
+    return float(np.exp(log_variance)), least
+
+
+def _factor(info: Information, prior: Prior) -> float:
+    """Factor on the stated standard deviations: 1 where the residuals do not contradict them."""
+    at, spare = quadratic_at(info, prior), _spare(info)
+    assert prior.stated is not None
+
+    def likelihood(log_ratio: float) -> float:
+        cost, logdet = at(np.exp(log_ratio))
+        return spare * (np.log(cost / spare) + 1.0) + logdet
+
+    # How much the points' standard deviations add to the pixels', for a ratio of 1.
+    blur = np.sqrt(np.maximum(np.einsum("nii,ni->n", info.point, prior.stated**2).mean(), 1e-300))
+    log_ratio, least = _lowest(likelihood, np.log(_LEAST_RATIO / blur), -np.log(_LEAST_RATIO * blur))
+    cost, _ = at(np.exp(log_ratio))
+    factor = float(np.exp(log_ratio) * np.sqrt(cost / spare))
+    gain = 0.5 * (_noise(info, prior, 1.0)[1] - least)
+    return factor if gain > _CONTRADICTED and abs(np.log(factor)) > np.log(_OFF) else 1.0
+
+
+def _spare(info: Information) -> float:
+    return info.equations - len(info.camera) - 6 * len(info.pose)
+
+
+def _lowest(function: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
+    """Where a function of one variable is lowest, and its value: the best of a grid, then golden section."""
+    grid = np.linspace(low, high, _GRID)
+    k = int(np.argmin([function(x) for x in grid]))
+    a, b = grid[max(k - 1, 0)], grid[min(k + 1, _GRID - 1)]
+    share = 0.5 * (np.sqrt(5.0) - 1.0)
+    for _ in range(_GOLDEN_STEPS):
+        left, right = b - share * (b - a), a + share * (b - a)
+        a, b = (a, right) if function(left) < function(right) else (left, b)
+    x = float(0.5 * (a + b))
+    return x, function(x)
+
+
+def _stated(all_points: Sequence[Correspondences], n: int, label: NDArray[np.intp]) -> Array:
+    """(n, 3) standard deviations of the different points."""
+    blocks = [
+        np.zeros_like(points.world) if points.world_std is None else points.world_std for points in all_points
+    ]
+    std = np.concatenate(blocks)
+    stated = np.zeros((n, 3))
+    stated[label] = std
+    differs = (stated[label] != std).any(axis=1)
+    if differs.any():
+        row = int(np.argmax(differs))
+        for points in all_points:
+            if row < len(points):
+                raise InputError(
+                    f"{points.place(row)}: this world point has another standard deviation sX,sY,sZ in "
+                    "another row; give one to each point"
+                )
+            row -= len(points)
+    return stated
