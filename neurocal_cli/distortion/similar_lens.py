@@ -27,11 +27,13 @@ _LEAST_ANGLE, _SPARE = 0.05, 1e-3  # [rad]
 # Values of xi, and where its range is divided: each part may hold a minimum.
 _XI = {"omnidir": np.linspace(0.1, 3.0, 30), "double_sphere": np.linspace(-0.6, 0.6, 25)}
 _PARTS = {"omnidir": (0.7, 1.1, 1.4, 1.8), "double_sphere": (-0.1, 0.15)}
-_ALPHA = np.linspace(0.2, 0.9, 29)
+_ALPHA = np.linspace(0.05, 0.95, 37)
 _BETA = np.geomspace(0.3, 3.0, 21)
 
 
-def similar_states(state: CameraState, model: str, farthest: float) -> list[CameraState]:
+def similar_states(
+    state: CameraState, model: str, farthest: float, xi: Array | None = None
+) -> list[CameraState]:
     """States whose image is nearly that of another one, the most similar first; same poses, same centre.
 
     Parameters
@@ -42,6 +44,9 @@ def similar_states(state: CameraState, model: str, farthest: float) -> list[Came
         A model with coefficients.
     farthest : float
         Largest angle from the axis that counts [rad].
+    xi : array, optional
+        Of a model with xi: one state for each of these values, in their order, instead; those for which no
+        lens is similar are left out.
     """
     theta = np.linspace(_LEAST_ANGLE, max(farthest, 2 * _LEAST_ANGLE), _ANGLES)
     radius = _radius(state.model, state.k, theta)
@@ -49,7 +54,7 @@ def similar_states(state: CameraState, model: str, farthest: float) -> list[Came
     theta, radius = theta[good], radius[good]
     if len(theta) < 10:
         return []
-    grid = _grid(model)
+    grid = _grid(model, _XI.get(model, _ALPHA) if xi is None else xi)
     columns = _columns(model, grid, theta)  # (G, m, c)
     with np.errstate(invalid="ignore", divide="ignore"):
         usable = np.asarray(np.isfinite(columns).all(axis=(1, 2)))
@@ -60,7 +65,7 @@ def similar_states(state: CameraState, model: str, farthest: float) -> list[Came
     scale = solution[:, 0, 0]
     error = np.where(usable & (scale > 0), error, np.inf)
     found = []
-    for g in _lowest(model, error, grid):
+    for g in _lowest(model, error, grid) if xi is None else _of_each(error, grid, xi):
         linear = solution[g, 1:, 0] / scale[g]
         found.append(_with(state, model, float(scale[g]), grid[g], linear))
     return found
@@ -79,12 +84,12 @@ def _radius(model: str, k: Array, theta: Array) -> Array:
     return np.where(np.logical_and.accumulate(grows), x, np.nan)
 
 
-def _grid(model: str) -> Array:
+def _grid(model: str, xi: Array) -> Array:
     """(G, n) values of the coefficients in which the radius is not linear."""
     if model == "omnidir":
-        return _XI[model][:, None]
+        return xi[:, None]
     if model in ("double_sphere", "eucm"):
-        first, second = (_XI[model], _ALPHA) if model == "double_sphere" else (_ALPHA, _BETA)
+        first, second = (xi, _ALPHA) if model == "double_sphere" else (_ALPHA, _BETA)
         return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
     return np.zeros((1, 0))
 
@@ -118,6 +123,12 @@ def _lowest(model: str, error: Array, grid: Array) -> list[int]:
     part = np.digitize(grid[:, 0], _PARTS[model]) if model in WITH_XI else np.zeros(len(grid), dtype=np.intp)
     best = [int(np.argmin(np.where(part == n, error, np.inf))) for n in np.unique(part)]
     return sorted((g for g in best if np.isfinite(error[g])), key=lambda g: float(error[g]))
+
+
+def _of_each(error: Array, grid: Array, xi: Array) -> list[int]:
+    """Places of the lowest error for each xi."""
+    best = [int(np.argmin(np.where(grid[:, 0] == value, error, np.inf))) for value in xi]
+    return [g for g in best if np.isfinite(error[g])]
 
 
 def _with(state: CameraState, model: str, scale: float, nonlinear: Array, linear: Array) -> CameraState:

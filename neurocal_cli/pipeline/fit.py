@@ -21,6 +21,7 @@ from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
 from neurocal_cli.distortion.rich_fit import with_displacement
 from neurocal_cli.distortion.similar_lens import similar_states
+from neurocal_cli.distortion.xi_profile import with_xi_held_if_flat
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
 from neurocal_cli.initialisation.neuro import solve
@@ -33,7 +34,6 @@ __all__ = ["fit", "fit_again"]
 # Joins the pinhole's networks where a radial model leads to nothing, as with a centre of distortion far off.
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
 _FIRST_MODEL = "k1k2"
-_NO_XI = 1e-3  # its square is rounding in any image
 # Starts that lead to a pole of the distortion, or into the camera's plane, are told so by what they cost.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
@@ -133,11 +133,7 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
 
 
 def _from_fisheye(problem: Problem, fisheye: Solution) -> Solution:
-    """The best that the most similar lenses of the wanted model lead to.
-
-    Around xi = 0 a double sphere's image depends on the square of xi only: where the points tell no xi, it
-    is held at 0.
-    """
+    """The best that the most similar lenses of the wanted model lead to."""
     state, views = fisheye.state, problem.views
     starts = similar_states(state, problem.distortion.model, farthest_angle(views, state))
     found = [problem.adjust(replace(fisheye.adjusted, state=start)) for start in starts]
@@ -147,9 +143,7 @@ def _from_fisheye(problem: Problem, fisheye: Solution) -> Solution:
             "another --distortion"
         )
     best = min(found, key=lambda a: float(a.cost.sum()))
-    if problem.distortion.model == "double_sphere" and abs(best.state.k[0]) < _NO_XI:
-        problem = replace(problem, fixed=problem.fixed | {"xi"})
-        best = problem.adjust(replace(best, state=replace(best.state, k=best.state.k * [0.0, 1.0])))
+    problem, best = with_xi_held_if_flat(problem, best)
     return replace(fisheye, problem=problem, adjusted=best)
 
 
