@@ -198,7 +198,7 @@ def _distorted(state: CameraState, last: float) -> float:
     if state.model == "fisheye":
         return float(last * (1 + state.k @ last ** np.array([2.0, 4.0, 6.0, 8.0])))
     k = state.k.copy()
-    k[2:4] = 0.0
+    k[2:4] = k[8:] = 0.0
     return float(distort(state.model, k, np.array([last]), np.zeros(1))[0][0])
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.directions import WIDE, WITH_XI
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names
 from neurocal_cli.camera.projection import project_points
 from neurocal_cli.geometry import Array
 
@@ -48,6 +48,8 @@ def similar_states(
         Of a model with xi: one state for each of these values, in their order, instead; those for which no
         lens is similar are left out.
     """
+    if (same := _with_more_coefficients(state, model)) is not None:
+        return [same]
     theta = np.linspace(_LEAST_ANGLE, max(farthest, 2 * _LEAST_ANGLE), _ANGLES)
     radius = _radius(state.model, state.k, theta)
     good: NDArray[np.bool_] = np.isfinite(radius)
@@ -71,10 +73,18 @@ def similar_states(
     return found
 
 
+def _with_more_coefficients(state: CameraState, model: str) -> CameraState | None:
+    """The same lens, where the model has all its coefficients in the same order."""
+    own, names = coefficient_names(state.model), coefficient_names(model)
+    if model in WIDE or state.model == model or names[: len(own)] != own:
+        return None
+    return replace(state, model=model, k=np.concatenate([state.k, np.zeros(len(names) - len(own))]))
+
+
 def _radius(model: str, k: Array, theta: Array) -> Array:
     """Distorted radii, without tangential terms; nan where the lens shows nothing."""
     names = coefficient_names(model)
-    radial = [0.0 if name in ("p1", "p2") else value for name, value in zip(names, k, strict=True)]
+    radial = [0.0 if name in NOT_RADIAL else value for name, value in zip(names, k, strict=True)]
     with np.errstate(all="ignore"):
         x, _, seen = project_points(
             (1.0, 0.0, 1.0, 0.0, 0.0), model, radial, np.sin(theta), np.zeros_like(theta), np.cos(theta)

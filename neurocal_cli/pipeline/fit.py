@@ -14,8 +14,9 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_an
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import WIDE, WITH_PRISM
 from neurocal_cli.distortion.candidate_models import fit_candidates, supported
+from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_told
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
@@ -118,11 +119,16 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
     """A pinhole, or where points seem mirrored to it, as through a strong distortion, a camera with one.
 
     Where a distortion is no remedy, the pinhole's reason stands. Wide lenses begin as fisheyes, whose
-    coefficients are linear.
+    coefficients are linear, and lenses with a prism or a tilt without these.
     """
     model = problem.distortion.model
     if problem.free_distortion and model in WIDE and model != "fisheye":
-        return _from_fisheye(problem, _first_solution(problem.with_model("fisheye"), options))
+        return _from_simpler(problem, _first_solution(problem.with_model("fisheye"), options))
+    if problem.free_distortion and model in WITH_PRISM:
+        plain = _first_solution(problem.with_model("plumb_bob"), options)
+        return with_denominator_if_told(
+            _from_simpler(replace(problem, fixed=problem.fixed | DENOMINATOR), plain)
+        )
     try:
         return solve(problem, options)
     except OnlyMirroredError:
@@ -132,11 +138,11 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
         return found
 
 
-def _from_fisheye(problem: Problem, fisheye: Solution) -> Solution:
+def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
     """The best that the most similar lenses of the wanted model lead to."""
-    state, views = fisheye.state, problem.views
+    state, views = simpler.state, problem.views
     starts = similar_states(state, problem.distortion.model, farthest_angle(views, state))
-    found = [problem.adjust(replace(fisheye.adjusted, state=start)) for start in starts]
+    found = [problem.adjust(replace(simpler.adjusted, state=start)) for start in starts]
     if not found:
         raise DegenerateGeometryError(
             f"no lens of the model {problem.distortion.model} is similar to what the points show; choose "
@@ -144,7 +150,7 @@ def _from_fisheye(problem: Problem, fisheye: Solution) -> Solution:
         )
     best = min(found, key=lambda a: float(a.cost.sum()))
     problem, best = with_xi_held_if_flat(problem, best)
-    return replace(fisheye, problem=problem, adjusted=best)
+    return replace(simpler, problem=problem, adjusted=best)
 
 
 def _distorted_starts(problem: Problem, options: Options) -> Iterator[CameraState]:
