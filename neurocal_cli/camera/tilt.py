@@ -15,10 +15,16 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["tilted", "tilted_with_jacobian", "untilted"]
+__all__ = ["sensor_rotation", "tilted", "tilted_with_jacobian", "untilted"]
 
 # Derivatives of x' by x and y, of y' by x and y.
 _ByPoint = tuple[Array, Array, Array, Array]
+
+
+def sensor_rotation(tau_x: float, tau_y: float) -> Array:
+    """(3, 3) R."""
+    cX, sX, cY, sY = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
+    return np.array([[cY, sX * sY, -cX * sY], [0.0, cX, sX], [sY, -sX * cY, cX * cY]])
 
 
 def tilted(tau_x: Any, tau_y: Any, x: Array, y: Array) -> tuple[Array, Array]:

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.directions import WIDE, WITH_XI
 from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names
-from neurocal_cli.camera.projection import project_points
+from neurocal_cli.camera.projection import ENTRIES, project_points
+from neurocal_cli.camera.tilt import sensor_rotation
 from neurocal_cli.geometry import Array
 
-__all__ = ["similar_states"]
+__all__ = ["similar_states", "tilted_states"]
 
 # Repeated by tests/test_wide_lenses.py (slow): random lenses of all models arrive at the minimum from here.
 _ANGLES = 60
@@ -27,6 +28,7 @@ _LEAST_ANGLE, _SPARE = 0.05, 1e-3  # [rad]
 # Values of xi, and where its range is divided: each part may hold a minimum.
 _XI = {"omnidir": np.linspace(0.1, 3.0, 30), "double_sphere": np.linspace(-0.6, 0.6, 25)}
 _PARTS = {"omnidir": (0.7, 1.1, 1.4, 1.8), "double_sphere": (-0.1, 0.15)}
+_TILTS = 0.06 * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])  # rad
 _ALPHA = np.linspace(0.05, 0.95, 37)
 _BETA = np.geomspace(0.3, 3.0, 21)
 
@@ -79,6 +81,26 @@ def _with_more_coefficients(state: CameraState, model: str) -> CameraState | Non
     if model in WIDE or state.model == model or names[: len(own)] != own:
         return None
     return replace(state, model=model, k=np.concatenate([state.k, np.zeros(len(names) - len(own))]))
+
+
+def tilted_states(state: CameraState) -> list[CameraState]:
+    """States of a camera whose sensor is tilted otherwise, and whose image is the same but for the lens.
+
+    A pinhole's image through a sensor tilted by R is that of one turned by R, with another centre: but for
+    the lens, whose axis turns along, nothing tells the tilt, and it has several minima. One lies opposite.
+    """
+    k = state.k.copy()
+    k[[2, 3, 8, 9, 10, 11]] = 0.0  # what made up for the tilt
+    found = []
+    for tau in (-k[12:], *_TILTS):
+        turn = sensor_rotation(*tau.tolist()) @ sensor_rotation(*k[12:].tolist()).T
+        A, back = np.eye(3), np.eye(3)
+        A[ENTRIES] = state.entries[0]
+        back[:2] = [[turn[2, 2], 0.0, -turn[0, 2]], [0.0, turn[2, 2], -turn[1, 2]]]
+        entries = (A @ np.linalg.inv(back))[ENTRIES][None]
+        more = np.concatenate([k[:12], tau])
+        found.append(replace(state, entries=entries, R=turn.T @ state.R, t=state.t @ turn, k=more))
+    return found
 
 
 def _radius(model: str, k: Array, theta: Array) -> Array:

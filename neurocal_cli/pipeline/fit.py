@@ -21,7 +21,7 @@ from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
 from neurocal_cli.distortion.rich_fit import with_displacement
-from neurocal_cli.distortion.similar_lens import similar_states
+from neurocal_cli.distortion.similar_lens import similar_states, tilted_states
 from neurocal_cli.distortion.xi_profile import with_xi_held_if_flat
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
@@ -35,6 +35,7 @@ __all__ = ["fit", "fit_again"]
 # Joins the pinhole's networks where a radial model leads to nothing, as with a centre of distortion far off.
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
 _FIRST_MODEL = "k1k2"
+_TILT_ROUNDS, _TILT_STEPS = 2, 60
 # Starts that lead to a pole of the distortion, or into the camera's plane, are told so by what they cost.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
@@ -148,6 +149,12 @@ def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
             f"no lens of the model {problem.distortion.model} is similar to what the points show; choose "
             "another --distortion"
         )
+    if problem.distortion.model == "tilted" and problem.free_poses and problem.free[3:].all():
+        for _ in range(_TILT_ROUNDS):
+            lowest = min(found, key=lambda a: float(a.cost.sum()))
+            found += [
+                problem.adjust(replace(lowest, state=s), _TILT_STEPS) for s in tilted_states(lowest.state)
+            ]
     best = min(found, key=lambda a: float(a.cost.sum()))
     problem, best = with_xi_held_if_flat(problem, best)
     return replace(simpler, problem=problem, adjusted=best)
