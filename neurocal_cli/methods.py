@@ -13,6 +13,7 @@ from neurocal_cli.calibration import Calibration, Rejected, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.distortion.xi_profile import with_all_minima
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Progress, options_for
@@ -157,6 +158,7 @@ def calibrate(
         solution, rejected = with_target(problem, solution, rejected, options, choice)
         if known_target is not None:
             solution = replace(solution, target=known_target)
+        solution = with_all_minima(solution)
         if solution.refusal:
             raise DegenerateGeometryError(solution.refusal)
         found = calibration_of(

@@ -76,7 +76,7 @@ def test_opencv_bends_the_same_way(model: str, points: tuple[np.ndarray, ...]) -
     if model == "fisheye":
         bent, _ = cv2.fisheye.projectPoints(world[:, None], zero, zero, np.eye(3), k)
     else:
-        padded = np.zeros(8)
+        padded = np.zeros(14)
         padded[: len(k)] = k
         bent, _ = cv2.projectPoints(world, zero, zero, np.eye(3), padded)
     assert np.column_stack(distort(model, k, x, y)) == pytest.approx(bent.reshape(-1, 2), abs=1e-9)

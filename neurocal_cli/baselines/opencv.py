@@ -16,6 +16,7 @@ from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
 __all__ = ["opencv", "without_skew"]
@@ -88,10 +89,15 @@ def _flags(cv2: object, model: str) -> int:
     """Flags that leave the coefficients of a model free, and no others."""
     free = {
         "none": 0, "k1": 1, "k1k2": 2, "k1k2p1p2": 2, "plumb_bob": 3, "rational": 6,
+        "thin_prism": 6, "tilted": 6,
     }[model]  # fmt: skip
     names = [f"CALIB_FIX_K{n}" for n in range(free + 1, 7)]
     if model in ("none", "k1", "k1k2"):
         names.append("CALIB_ZERO_TANGENT_DIST")
-    if model == "rational":
+    if free == 6:
         names.append("CALIB_RATIONAL_MODEL")
+    if model in WITH_PRISM:
+        names.append("CALIB_THIN_PRISM_MODEL")
+    if model == "tilted":
+        names.append("CALIB_TILTED_MODEL")
     return sum(getattr(cv2, name) for name in names)

@@ -14,12 +14,13 @@ from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.median import median
 
-__all__ = ["find_outlier_view", "free_networks", "seen_from_behind"]
+__all__ = ["conditions_on_views", "find_outlier_view", "free_networks", "seen_from_behind"]
 
 # Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones,
 # none blamed) and tests/test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
@@ -33,7 +34,6 @@ _STEPS = 60
 _FREE_STEPS = 1
 _UNSEEN = 1e-9  # added to a unit diagonal: directions that the points do not tell are not followed
 _SAME_PLANE = 1e-3
-_CONDITIONS = {True: 2, False: 5}  # that a common camera puts on a flat and on a solid view's network
 
 
 def find_outlier_view(solution: Solution) -> str | None:
@@ -53,7 +53,7 @@ def find_outlier_view(solution: Solution) -> str | None:
     spare = views.n_equations - problem.n_parameters
     if _largest_move(quadratics, float(adjusted.cost.sum()) / max(spare, 1)) < _MOVES:
         return None
-    conditions = np.where(views.nearly_flat, _CONDITIONS[True], _CONDITIONS[False])
+    conditions = conditions_on_views(views, adjusted.state)
     own = free_networks(views, adjusted.state, _STEPS)
     own_spare = views.equations - 6 - conditions
     if own_spare.min() <= 0:
@@ -90,6 +90,15 @@ def _contradictions(q: Quadratics, own: Array, conditions: NDArray[np.intp]) -> 
 
 def _of(state: CameraState, views: NDArray[np.intp]) -> CameraState:
     return CameraState(state.entries, state.R[views], state.t[views], state.model, state.k)
+
+
+def conditions_on_views(views: Views, state: CameraState) -> NDArray[np.intp]:
+    """(V,) conditions that a common camera puts on the network of each view.
+
+    Of its eleven parameters a flat target determines eight; seen through a wide lens, all.
+    """
+    flat = views.nearly_flat & (state.model not in WIDE)
+    return np.where(flat, 2, 5)
 
 
 def free_networks(views: Views, state: CameraState, steps: int = _FREE_STEPS) -> Array:

@@ -119,7 +119,7 @@ def _noise_coefficients(distortion: Distortion, std: Mapping[str, float]) -> tup
     noise = [
         f"{name} ({k:.2g} +- {std[name]:.2g})"
         for name, k in pairs
-        if name[0] in "kp" and 0 < abs(k) < _TOLD_APART * std[name]
+        if name[0] in "kpst" and 0 < abs(k) < _TOLD_APART * std[name]
     ]
     if not noise:
         return ()

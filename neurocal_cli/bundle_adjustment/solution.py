@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels
@@ -89,6 +90,8 @@ class Solution:
         Why this is no answer, if so.
     target : Target, optional
         The target, where it was found with the camera; the problem's points are where it has them.
+    ambiguity : Ambiguity, optional
+        Other cameras that explain the points as well.
     """
 
     problem: Problem
@@ -101,6 +104,7 @@ class Solution:
     straight_lines: StraightLines | None = None
     refusal: str = ""
     target: Target | None = None
+    ambiguity: Ambiguity | None = None
 
     @property
     def state(self) -> CameraState:

@@ -28,7 +28,7 @@ from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.polynomial import Coefficients, distorted_with_jacobian
 from neurocal_cli.geometry import Array
 
-__all__ = ["WIDE", "WITH_XI", "Direction", "project_directions"]
+__all__ = ["WIDE", "WITH_XI", "Direction", "project_directions", "xi_is_flat"]
 
 WIDE = {
     "fisheye": ("k1", "k2", "k3", "k4"),
@@ -40,6 +40,7 @@ WIDE = {
 # Their first coefficient is xi, and the scale in the middle of the image is alpha_u / (1 + xi).
 WITH_XI = ("omnidir", "double_sphere")
 
+_FLAT = 1e-3  # an xi whose square is rounding in any image
 _TINY = 1e-24  # squared sine below which a direction is on the axis
 
 
@@ -92,6 +93,11 @@ def project_directions(
         return _rich(k, X, Y, Z, q, by_coefficients)
     sphere = _double_sphere if model == "double_sphere" else _eucm
     return _by_divisor(X, Y, *sphere(k, q, Z))
+
+
+def xi_is_flat(model: str, k: Coefficients) -> bool:
+    """Whether, to first order, alpha and alpha_u make up for xi: a double sphere's near xi = 0."""
+    return model == "double_sphere" and bool(abs(k[0]) < _FLAT)
 
 
 def _fisheye(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array) -> Direction:

@@ -20,7 +20,9 @@ from neurocal_cli.geometry import Array
 
 __all__ = [
     "MODELS",
+    "NOT_RADIAL",
     "WIDE",
+    "WITH_PRISM",
     "Coefficients",
     "Distortion",
     "coefficient_names",
@@ -36,8 +38,14 @@ MODELS = {
     "k1k2p1p2": ("k1", "k2", "p1", "p2"),
     "plumb_bob": ("k1", "k2", "p1", "p2", "k3"),
     "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    "thin_prism": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4"),
+    "tilted": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY"),
     **WIDE,
 }
+# With a thin prism, and a sensor that may be tilted.
+WITH_PRISM = ("thin_prism", "tilted")
+# What is not the same all around the axis.
+NOT_RADIAL = frozenset({"p1", "p2", "s1", "s2", "s3", "s4", "tauX", "tauY"})
 
 # With these a wide lens is a pinhole; a fisheye to the ninth order, where tan(theta) = theta (1 + theta^2 / 3
 # + ...).

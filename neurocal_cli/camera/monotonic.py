@@ -10,7 +10,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort, distort_with_jacobian
+from neurocal_cli.camera.distortion import (
+    NOT_RADIAL,
+    Distortion,
+    coefficient_names,
+    distort,
+    distort_with_jacobian,
+)
+from neurocal_cli.camera.tilt import untilted
 from neurocal_cli.camera.unprojection import first_root, largest_angle, unproject_directions
 from neurocal_cli.geometry import Array
 
@@ -38,7 +45,7 @@ def monotonic_radius(distortion: Distortion) -> float:
         theta = largest_angle(distortion)
         return float(np.tan(theta)) if theta < np.pi / 2 else np.inf
     k = distortion.coefficients
-    k1, k2, _, _, k3, k4, k5, k6 = np.r_[k, np.zeros(8 - len(k))]
+    k1, k2, _, _, k3, k4, k5, k6 = _first_eight(k)
     top, bottom = np.array([1.0, k1, k2, k3]), np.array([1.0, k4, k5, k6])
     # With s = r^2: d/dr (r top / bottom) is 0 where (top + 2 s top') bottom = 2 s top bottom'.
     slope = np.convolve(top + _twice_s_slope(top), bottom) - np.convolve(top, _twice_s_slope(bottom))
@@ -66,7 +73,7 @@ def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
         n = np.arange(1, 5)
         by_k = (2 * n + 1) * s**n
         return 1.0 + by_k @ k, by_k
-    k1, k2, _, _, k3, k4, k5, k6 = np.r_[k, np.zeros(8 - len(k))]
+    k1, k2, _, _, k3, k4, k5, k6 = _first_eight(k)
     n = np.arange(1, 4)
     powers, growths = s**n, 2 * n * s**n  # and 2 s d/ds of them
     top, top_growth = 1.0 + powers @ [k1, k2, k3], growths @ [k1, k2, k3]
@@ -75,8 +82,12 @@ def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
     u, up, v, vp = (values[:, None] for values in (top, top_growth, bottom, bottom_growth))
     by_top = (powers + growths) / v - powers * vp / v**2
     by_bottom = -((u + up) * powers + u * growths) / v**2 + 2 * u * vp * powers / v**3
-    none = np.zeros((len(r), 2))
-    return slope, np.column_stack([by_top[:, :2], none, by_top[:, 2:], by_bottom])[:, : len(k)]
+    none = np.zeros((len(r), 6))
+    return slope, np.column_stack([by_top[:, :2], none[:, :2], by_top[:, 2:], by_bottom, none])[:, : len(k)]
+
+
+def _first_eight(k: Array) -> Array:
+    return np.r_[k[:8], np.zeros(max(8 - len(k), 0))]
 
 
 def _twice_s_slope(p: Array) -> Array:
@@ -138,6 +149,10 @@ def undistort(
         X, Y, Z = unproject_directions(distortion, x, y)
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(Z > 0, X / Z, np.nan), np.where(Z > 0, Y / Z, np.nan)
+    if distortion.model == "tilted":
+        k = distortion.coefficients
+        x, y = untilted(float(k[12]), float(k[13]), x, y)
+        distortion = Distortion("thin_prism", k[:12])
     radius = monotonic_radius(distortion)
     if near is None:
         sx, sy, good = _newton(distortion, radius, x, y, *_radially(distortion, radius, x, y))
@@ -171,7 +186,7 @@ def _radially(distortion: Distortion, radius: float, x: Array, y: Array) -> tupl
     """Undistorted points without the tangential terms, nearly: by a table of radii up to `radius`."""
     names = coefficient_names(distortion.model)
     k = distortion.coefficients
-    radial = [0.0 if name in ("p1", "p2") else k for name, k in zip(names, k, strict=True)]
+    radial = [0.0 if name in NOT_RADIAL else k for name, k in zip(names, k, strict=True)]
     # Even steps of the angle reach any radius.
     last = np.arctan(min(radius, _FARTHEST))
     r = np.tan(np.linspace(0, last, _TABLE, endpoint=False))  # at a pole there is no image

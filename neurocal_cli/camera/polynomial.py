@@ -4,6 +4,8 @@
     R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)       (Brown 1971; Heikkila 2000)
 
 with the coefficients k1, k2, p1, p2, k3, k4, k5, k6, of which simpler models have the first 1, 2, 4, 5 and 8.
+A thin prism (Weng, Cohen and Herniou 1992) adds s1 r^2 + s2 r^4 to x' and s3 r^2 + s4 r^4 to y', and behind
+all that the sensor may be tilted (`tilt`): OpenCV's 12 and 14 coefficients.
 """
 
 from __future__ import annotations
@@ -11,6 +13,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
+from neurocal_cli.camera.tilt import tilted, tilted_with_jacobian
 from neurocal_cli.geometry import Array
 
 __all__ = ["Coefficients", "Distorted", "distorted", "distorted_with_jacobian"]
@@ -26,7 +31,12 @@ def distorted(k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
     """Distorted points."""
     r2 = x * x + y * y
     R, _ = _radial(k, r2)
-    return (x * R, y * R) if len(k) <= 2 else _tangential(k, x, y, r2, R)[1]
+    if len(k) <= 2:
+        return x * R, y * R
+    _, point = _tangential(k, x, y, r2, R)
+    if len(k) > 8:
+        point = _behind_prism(k, point, r2)
+    return tilted(k[12], k[13], *point) if len(k) > 12 else point
 
 
 def _radial(k: Coefficients, r2: Array) -> tuple[Array, Any]:
@@ -46,6 +56,11 @@ def _tangential(
     p1, p2 = k[2], k[3]
     Q = R + (2 * p1) * y + (2 * p2) * x
     return Q, (x * Q + p2 * r2, y * Q + p1 * r2)
+
+
+def _behind_prism(k: Coefficients, point: tuple[Array, Array], r2: Array) -> tuple[Array, Array]:
+    s1, s2, s3, s4 = k[8:12]
+    return point[0] + r2 * (s1 + s2 * r2), point[1] + r2 * (s3 + s4 * r2)
 
 
 def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
@@ -74,9 +89,24 @@ def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
     by = [*by_radial[:2], (xy2, r2 + 2 * y2), (r2 + 2 * x2, xy2), *by_radial[2:]]
     if count > 5:
         by += [(-R * dx, -R * dy) for dx, dy in by_radial]
-    return distorted, (xx, cross, cross, yy), by
+    if count <= 8:
+        return distorted, (xx, cross, cross, yy), by
+    s1, s2, s3, s4 = k[8:12]
+    along, across = 2 * s1 + (4 * s2) * r2, 2 * s3 + (4 * s4) * r2
+    by_point = xx + along * x, cross + along * y, cross + across * x, yy + across * y
+    none = np.zeros_like(r2)
+    by += [(r2, none), (r4, none), (none, r2), (none, r4)]
+    found = _behind_prism(k, distorted, r2), by_point, by
+    return found if count == 12 else _on_tilted_sensor(k, found)
+
+
+def _on_tilted_sensor(k: Coefficients, before: Distorted) -> Distorted:
+    point, (xx, xy, yx, yy), by_k = before
+    point, (a, b, c, d), by_tau = tilted_with_jacobian(k[12], k[13], *point)
+    by_point = a * xx + b * yx, a * xy + b * yy, c * xx + d * yx, c * xy + d * yy
+    return point, by_point, [*((a * dx + b * dy, c * dx + d * dy) for dx, dy in by_k), *by_tau]
 
 
 def _all(k: Coefficients) -> list[Any]:
-    """All eight coefficients, 0 where a model has none."""
-    return [*k, *[0.0] * (8 - len(k))]
+    """The eight coefficients before a prism's, 0 where a model has none."""
+    return [*k[:8], *[0.0] * (8 - len(k))]

@@ -301,6 +301,8 @@ _OPTIONS = [
                 "k1k2p1p2",
                 "plumb_bob",
                 "rational",
+                "thin_prism",
+                "tilted",
                 "fisheye",
                 "omnidir",
                 "double_sphere",
@@ -310,9 +312,10 @@ _OPTIONS = [
             ]
         ),
         default="auto",
-        help="Distortion model, with coefficients as in OpenCV; none is a pinhole camera. fisheye, omnidir, "
-        "double_sphere and eucm are for wide lenses, also beyond 180 degrees. auto compares the "
-        "models by cross-validation and chooses the simplest one whose error is as low as any. rich is a "
+        help="Distortion model, with coefficients as in OpenCV; none is a pinhole camera. thin_prism and "
+        "tilted are OpenCV's models of 12 and 14 coefficients. fisheye, omnidir, double_sphere and eucm are "
+        "for wide lenses, also beyond 180 degrees. auto compares the models by cross-validation and chooses "
+        "the simplest one whose error is as low as any; it tries neither of these nor rich, which is a "
         "fisheye with a smooth displacement of the image, for lenses that no other model describes. "
         "plumb-line estimates k1, k2, p1 and p2 from the straight lines of the target alone.",
     ),

@@ -27,7 +27,8 @@ __all__ = ["convert"]
 
 _FORMATS = ("neurocal", "opencv", "ros", "kalibr", "colmap", "mrcal", "matlab", "json", "npz")
 _MODELS = (
-    "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye", "omnidir", "double_sphere", "eucm"
+    "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir",
+    "double_sphere", "eucm",
 )  # fmt: skip
 _SIZE = click.IntRange(1, 1_000_000)
 

@@ -20,7 +20,7 @@ from neurocal_cli.bundle_adjustment.residual_correlation import correlation, eff
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
-from neurocal_cli.camera.distortion import coefficient_names, distort, pinhole_coefficients
+from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names, distort, pinhole_coefficients
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
@@ -348,8 +348,7 @@ def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -
     # As far out as the points reach, by least squares: q (1 + k1 q^2 + k2 q^4 + ...) is the distorted
     # radius of the undistorted one r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
-    tangential = ("p1", "p2")
-    radial = [0.0 if name in tangential else k for name, k in old.items()]
+    radial = [0.0 if name in NOT_RADIAL else k for name, k in old.items()]
     distorted = distort(state.model, radial, r, np.zeros_like(r))[0]
     q = np.arctan(r) if fisheye else r
     of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][: most if fisheye else 3]
@@ -357,7 +356,7 @@ def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -
     if not np.isfinite(distorted).all():  # beyond a pole
         return pinhole_coefficients(model)
     found = np.linalg.lstsq(powers, distorted - q, rcond=1e-6)[0]
-    new = {name: k for name, k in old.items() if name in tangential} | dict(
+    new = {name: k for name, k in old.items() if name in NOT_RADIAL} | dict(
         zip(of_radius, found, strict=True)
     )
     return np.array([new.get(name, 0.0) for name in names])

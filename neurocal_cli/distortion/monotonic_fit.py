@@ -29,6 +29,7 @@ from neurocal_cli.bundle_adjustment.residual_correlation import correlation, eff
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, distort
 from neurocal_cli.camera.monotonic import monotonic_radius, radial_slope, reaches
 from neurocal_cli.camera.projection import ENTRIES, normalised_points, undistorted_pixels
+from neurocal_cli.camera.tilt import untilted
 from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
@@ -198,7 +199,7 @@ def _distorted(state: CameraState, last: float) -> float:
     if state.model == "fisheye":
         return float(last * (1 + state.k @ last ** np.array([2.0, 4.0, 6.0, 8.0])))
     k = state.k.copy()
-    k[2:4] = 0.0
+    k[2:4] = k[8:] = 0.0
     return float(distort(state.model, k, np.array([last]), np.zeros(1))[0][0])
 
 
@@ -208,4 +209,6 @@ def _farthest(problem: Problem, state: CameraState) -> float:
     width, height = problem.points.image_size or (0, 0)
     corners = np.array([[u, v, 1.0] for u in (0, width - 1) for v in (0, height - 1)])
     x, y, _ = np.linalg.solve(A, corners.T)
+    if state.model == "tilted":
+        x, y = untilted(float(state.k[12]), float(state.k[13]), x, y)
     return float(np.hypot(x, y).max())

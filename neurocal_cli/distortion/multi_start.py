@@ -3,7 +3,8 @@
 The minimum of a strong distortion is found only from a start that is near it. Where the residuals of
 neighbours are correlated, as a wrong distortion leaves them (and a board that is not flat), or where the
 points tell a focal length badly, every model is fitted, each from the one before it, from this start and
-from others; the best fit of the wanted model is the result. Wide lenses are reached through the fisheye.
+from others; the best fit of the wanted model is the result. Wide lenses are reached through the fisheye, and
+a thin prism or a tilted sensor through the rational model.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_an
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import WIDE, WITH_PRISM
 from neurocal_cli.distortion.candidate_models import fit_candidates, is_weak
+from neurocal_cli.distortion.denominator import DENOMINATOR
 from neurocal_cli.distortion.similar_lens import similar_states
 
 __all__ = ["with_more_starts"]
@@ -39,14 +41,15 @@ def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[Came
         Other states to begin with.
     """
     problem, best = solution.problem, solution.adjusted
-    if not problem.free_distortion or "xi" in problem.fixed:  # an xi that is held belongs to this lens
+    # An xi that is held, and k4 to k6 that are left out, belong to this lens.
+    if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR}:
         return solution
     views, wanted = problem.views, problem.distortion.model
     cov = covariance(best.normal, problem.free_camera, problem.free_poses, views.n_equations)
     weak = is_weak(problem, best.state, cov)
     if best.converged and not weak and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
         return solution
-    fitted = "fisheye" if wanted in WIDE else wanted
+    fitted = "fisheye" if wanted in WIDE else "rational" if wanted in WITH_PRISM else wanted
     for start in (best.state, *more_starts()):
         found = fit_candidates(problem, start, by_views=False, wanted=fitted).get(fitted)
         if found is None or (fitted == wanted and not found.adjusted.cost.sum() < best.cost.sum()):

@@ -15,11 +15,12 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.directions import WIDE, WITH_XI
-from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.camera.projection import project_points
+from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names
+from neurocal_cli.camera.projection import ENTRIES, project_points
+from neurocal_cli.camera.tilt import sensor_rotation
 from neurocal_cli.geometry import Array
 
-__all__ = ["similar_states"]
+__all__ = ["similar_states", "tilted_states"]
 
 # Repeated by tests/test_wide_lenses.py (slow): random lenses of all models arrive at the minimum from here.
 _ANGLES = 60
@@ -27,11 +28,14 @@ _LEAST_ANGLE, _SPARE = 0.05, 1e-3  # [rad]
 # Values of xi, and where its range is divided: each part may hold a minimum.
 _XI = {"omnidir": np.linspace(0.1, 3.0, 30), "double_sphere": np.linspace(-0.6, 0.6, 25)}
 _PARTS = {"omnidir": (0.7, 1.1, 1.4, 1.8), "double_sphere": (-0.1, 0.15)}
-_ALPHA = np.linspace(0.2, 0.9, 29)
+_TILTS = 0.06 * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])  # rad
+_ALPHA = np.linspace(0.05, 0.95, 37)
 _BETA = np.geomspace(0.3, 3.0, 21)
 
 
-def similar_states(state: CameraState, model: str, farthest: float) -> list[CameraState]:
+def similar_states(
+    state: CameraState, model: str, farthest: float, xi: Array | None = None
+) -> list[CameraState]:
     """States whose image is nearly that of another one, the most similar first; same poses, same centre.
 
     Parameters
@@ -42,14 +46,19 @@ def similar_states(state: CameraState, model: str, farthest: float) -> list[Came
         A model with coefficients.
     farthest : float
         Largest angle from the axis that counts [rad].
+    xi : array, optional
+        Of a model with xi: one state for each of these values, in their order, instead; those for which no
+        lens is similar are left out.
     """
+    if (same := _with_more_coefficients(state, model)) is not None:
+        return [same]
     theta = np.linspace(_LEAST_ANGLE, max(farthest, 2 * _LEAST_ANGLE), _ANGLES)
     radius = _radius(state.model, state.k, theta)
     good: NDArray[np.bool_] = np.isfinite(radius)
     theta, radius = theta[good], radius[good]
     if len(theta) < 10:
         return []
-    grid = _grid(model)
+    grid = _grid(model, _XI.get(model, _ALPHA) if xi is None else xi)
     columns = _columns(model, grid, theta)  # (G, m, c)
     with np.errstate(invalid="ignore", divide="ignore"):
         usable = np.asarray(np.isfinite(columns).all(axis=(1, 2)))
@@ -60,16 +69,44 @@ def similar_states(state: CameraState, model: str, farthest: float) -> list[Came
     scale = solution[:, 0, 0]
     error = np.where(usable & (scale > 0), error, np.inf)
     found = []
-    for g in _lowest(model, error, grid):
+    for g in _lowest(model, error, grid) if xi is None else _of_each(error, grid, xi):
         linear = solution[g, 1:, 0] / scale[g]
         found.append(_with(state, model, float(scale[g]), grid[g], linear))
+    return found
+
+
+def _with_more_coefficients(state: CameraState, model: str) -> CameraState | None:
+    """The same lens, where the model has all its coefficients in the same order."""
+    own, names = coefficient_names(state.model), coefficient_names(model)
+    if model in WIDE or state.model == model or names[: len(own)] != own:
+        return None
+    return replace(state, model=model, k=np.concatenate([state.k, np.zeros(len(names) - len(own))]))
+
+
+def tilted_states(state: CameraState) -> list[CameraState]:
+    """States of a camera whose sensor is tilted otherwise, and whose image is the same but for the lens.
+
+    A pinhole's image through a sensor tilted by R is that of one turned by R, with another centre: but for
+    the lens, whose axis turns along, nothing tells the tilt, and it has several minima. One lies opposite.
+    """
+    k = state.k.copy()
+    k[[2, 3, 8, 9, 10, 11]] = 0.0  # what made up for the tilt
+    found = []
+    for tau in (-k[12:], *_TILTS):
+        turn = sensor_rotation(*tau.tolist()) @ sensor_rotation(*k[12:].tolist()).T
+        A, back = np.eye(3), np.eye(3)
+        A[ENTRIES] = state.entries[0]
+        back[:2] = [[turn[2, 2], 0.0, -turn[0, 2]], [0.0, turn[2, 2], -turn[1, 2]]]
+        entries = (A @ np.linalg.inv(back))[ENTRIES][None]
+        more = np.concatenate([k[:12], tau])
+        found.append(replace(state, entries=entries, R=turn.T @ state.R, t=state.t @ turn, k=more))
     return found
 
 
 def _radius(model: str, k: Array, theta: Array) -> Array:
     """Distorted radii, without tangential terms; nan where the lens shows nothing."""
     names = coefficient_names(model)
-    radial = [0.0 if name in ("p1", "p2") else value for name, value in zip(names, k, strict=True)]
+    radial = [0.0 if name in NOT_RADIAL else value for name, value in zip(names, k, strict=True)]
     with np.errstate(all="ignore"):
         x, _, seen = project_points(
             (1.0, 0.0, 1.0, 0.0, 0.0), model, radial, np.sin(theta), np.zeros_like(theta), np.cos(theta)
@@ -79,12 +116,12 @@ def _radius(model: str, k: Array, theta: Array) -> Array:
     return np.where(np.logical_and.accumulate(grows), x, np.nan)
 
 
-def _grid(model: str) -> Array:
+def _grid(model: str, xi: Array) -> Array:
     """(G, n) values of the coefficients in which the radius is not linear."""
     if model == "omnidir":
-        return _XI[model][:, None]
+        return xi[:, None]
     if model in ("double_sphere", "eucm"):
-        first, second = (_XI[model], _ALPHA) if model == "double_sphere" else (_ALPHA, _BETA)
+        first, second = (xi, _ALPHA) if model == "double_sphere" else (_ALPHA, _BETA)
         return np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1).reshape(-1, 2)
     return np.zeros((1, 0))
 
@@ -118,6 +155,12 @@ def _lowest(model: str, error: Array, grid: Array) -> list[int]:
     part = np.digitize(grid[:, 0], _PARTS[model]) if model in WITH_XI else np.zeros(len(grid), dtype=np.intp)
     best = [int(np.argmin(np.where(part == n, error, np.inf))) for n in np.unique(part)]
     return sorted((g for g in best if np.isfinite(error[g])), key=lambda g: float(error[g]))
+
+
+def _of_each(error: Array, grid: Array, xi: Array) -> list[int]:
+    """Places of the lowest error for each xi."""
+    best = [int(np.argmin(np.where(grid[:, 0] == value, error, np.inf))) for value in xi]
+    return [g for g in best if np.isfinite(error[g])]
 
 
 def _with(state: CameraState, model: str, scale: float, nonlinear: Array, linear: Array) -> CameraState:

@@ -1,13 +1,14 @@
 """Names of distortion models: ours, and ROS's with the number of coefficients it expects.
 
-ROS has no name for wide lenses other than the fisheye; these have their own.
+ROS has no name for wide lenses other than the fisheye, nor for a thin prism and a tilted sensor; these have
+their own.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.camera.distortion import WIDE, coefficient_names
+from neurocal_cli.camera.distortion import WIDE, WITH_PRISM, coefficient_names
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
@@ -27,7 +28,7 @@ def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
         An unknown model, or coefficients that it doesn't have.
     """
     own = own_length(model)
-    name = _ROS.get(model, model if model in WIDE else "plumb_bob")
+    name = _ROS.get(model, model if model in (*WIDE, *WITH_PRISM) else "plumb_bob")
     length = _LENGTHS.get(name, own)
     values = np.asarray(coefficients, dtype=float).ravel()
     if np.any(values[own:] != 0) or not np.isfinite(values).all():
@@ -60,15 +61,21 @@ def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
         if len(values) != own_length(name):
             raise InputError(f"the model {name} has {own_length(name)} coefficients, found {len(values)}")
         return name, values
-    if name not in ("plumb_bob", "rational_polynomial"):
+    if name not in ("plumb_bob", "rational_polynomial", *WITH_PRISM):
         raise InputError(
-            f"distortion model {name[:40]!r} is unknown; use plumb_bob, rational_polynomial, "
-            "equidistant, omnidir, double_sphere, eucm, rich"
+            f"distortion model {name[:40]!r} is unknown; use plumb_bob, rational_polynomial, thin_prism, "
+            "tilted, equidistant, omnidir, double_sphere, eucm, rich"
         )
-    if values[8:].any() or len(values) not in (4, 5, 8, 12, 14):
-        raise InputError(f"distortion has 4, 5 or 8 coefficients k1,k2,p1,p2,k3,..,k6, found {len(values)}")
-    padded = np.zeros(8)
-    padded[: len(values)] = values[:8]
+    if len(values) not in (4, 5, 8, 12, 14):
+        raise InputError(
+            "distortion has 4, 5, 8, 12 or 14 coefficients k1,k2,p1,p2,k3,..,k6,s1,..,s4,tauX,tauY, found "
+            f"{len(values)}"
+        )
+    padded = np.zeros(14)
+    padded[: len(values)] = values
+    if padded[8:].any():
+        return ("tilted", padded) if padded[12:].any() else ("thin_prism", padded[:12])
+    padded = padded[:8]
     return ("rational", padded) if padded[5:].any() else ("plumb_bob", padded[:5])
 
 

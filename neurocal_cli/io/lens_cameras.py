@@ -126,6 +126,11 @@ def _common_model(parts: Sequence[_Rows], source: str) -> tuple[str, Array]:
                 f"{source}: some cameras are fisheyes and some are not; give cameras of one lens"
             )
         return "fisheye", np.array(rows)
+    if other := sorted(set(models) - set(_NESTED)):
+        raise InputError(
+            f"{source}: cameras of the model {other[0]} are none of a zoom lens's; convert them with "
+            "neurocal convert --model rational, or fisheye"
+        )
     padded = np.zeros((len(rows), len(MODELS[_NESTED[-1]])))
     for k, row in enumerate(rows):
         padded[k, : len(row)] = row

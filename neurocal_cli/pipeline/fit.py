@@ -14,13 +14,15 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_an
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import WIDE, WITH_PRISM
 from neurocal_cli.distortion.candidate_models import fit_candidates, supported
+from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_told
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
 from neurocal_cli.distortion.rich_fit import with_displacement
-from neurocal_cli.distortion.similar_lens import similar_states
+from neurocal_cli.distortion.similar_lens import similar_states, tilted_states
+from neurocal_cli.distortion.xi_profile import with_xi_held_if_flat
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
 from neurocal_cli.initialisation.neuro import solve
@@ -33,7 +35,7 @@ __all__ = ["fit", "fit_again"]
 # Joins the pinhole's networks where a radial model leads to nothing, as with a centre of distortion far off.
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
 _FIRST_MODEL = "k1k2"
-_NO_XI = 1e-3  # its square is rounding in any image
+_TILT_ROUNDS, _TILT_STEPS = 2, 60
 # Starts that lead to a pole of the distortion, or into the camera's plane, are told so by what they cost.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
@@ -122,11 +124,16 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
     """A pinhole, or where points seem mirrored to it, as through a strong distortion, a camera with one.
 
     Where a distortion is no remedy, the pinhole's reason stands. Wide lenses begin as fisheyes, whose
-    coefficients are linear.
+    coefficients are linear, and lenses with a prism or a tilt without these.
     """
     model = problem.distortion.model
     if problem.free_distortion and model in WIDE and model != "fisheye":
-        return _from_fisheye(problem, _first_solution(problem.with_model("fisheye"), options))
+        return _from_simpler(problem, _first_solution(problem.with_model("fisheye"), options))
+    if problem.free_distortion and model in WITH_PRISM:
+        plain = _first_solution(problem.with_model("plumb_bob"), options)
+        return with_denominator_if_told(
+            _from_simpler(replace(problem, fixed=problem.fixed | DENOMINATOR), plain)
+        )
     try:
         return solve(problem, options)
     except OnlyMirroredError:
@@ -136,25 +143,25 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
         return found
 
 
-def _from_fisheye(problem: Problem, fisheye: Solution) -> Solution:
-    """The best that the most similar lenses of the wanted model lead to.
-
-    Around xi = 0 a double sphere's image depends on the square of xi only: where the points tell no xi, it
-    is held at 0.
-    """
-    state, views = fisheye.state, problem.views
+def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
+    """The best that the most similar lenses of the wanted model lead to."""
+    state, views = simpler.state, problem.views
     starts = similar_states(state, problem.distortion.model, farthest_angle(views, state))
-    found = [problem.adjust(replace(fisheye.adjusted, state=start)) for start in starts]
+    found = [problem.adjust(replace(simpler.adjusted, state=start)) for start in starts]
     if not found:
         raise DegenerateGeometryError(
             f"no lens of the model {problem.distortion.model} is similar to what the points show; choose "
             "another --distortion"
         )
+    if problem.distortion.model == "tilted" and problem.free_poses and problem.free[3:].all():
+        for _ in range(_TILT_ROUNDS):
+            lowest = min(found, key=lambda a: float(a.cost.sum()))
+            found += [
+                problem.adjust(replace(lowest, state=s), _TILT_STEPS) for s in tilted_states(lowest.state)
+            ]
     best = min(found, key=lambda a: float(a.cost.sum()))
-    if problem.distortion.model == "double_sphere" and abs(best.state.k[0]) < _NO_XI:
-        problem = replace(problem, fixed=problem.fixed | {"xi"})
-        best = problem.adjust(replace(best, state=replace(best.state, k=best.state.k * [0.0, 1.0])))
-    return _turned(replace(fisheye, problem=problem, adjusted=best))
+    problem, best = with_xi_held_if_flat(problem, best)
+    return _turned(replace(simpler, problem=problem, adjusted=best))
 
 
 def _distorted_starts(problem: Problem, options: Options) -> Iterator[CameraState]:

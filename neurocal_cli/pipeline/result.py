@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 from neurocal_cli.bundle_adjustment.covariance import Covariance
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
 from neurocal_cli.bundle_adjustment.outlier_views import seen_from_behind
@@ -22,10 +23,12 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, Rejected, StopR
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import scale_of
-from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covariance
+from neurocal_cli.target_shape.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
 
 __all__ = ["calibration_of"]
 
+_XI = 5  # place of xi behind A's entries
+_TOLD = 0.1  # range of xi that is worth a warning
 _NAMED = 5  # wrong points that the warning names
 
 
@@ -56,10 +59,12 @@ def calibration_of(
     intrinsics = problem.intrinsics or Intrinsics.from_matrix(A)
     if problem.type != 3 and not problem.free[1]:
         intrinsics = Intrinsics(A[0, 0], A[1, 1], A[0, 2], A[1, 2])
-    block, std = _camera_covariance(problem, intrinsics, cov)
+    entries = _entries(problem, known, solution.ambiguity)
+    fixed = problem.fixed if solution.ambiguity is None else problem.fixed - {"xi"}
+    block, std = parameter_covariance(intrinsics, problem.distortion.model, entries, views.pixel_scale, fixed)
     squared = (errors**2).sum(axis=1) * views.pixel_scale**2
     rmse = float(np.sqrt(squared.mean()))
-    free = [n for n, parameter in enumerate(std) if parameter not in problem.fixed]
+    free = [n for n, parameter in enumerate(std) if parameter not in fixed]
     reason = StopReason.CONVERGED
     if not adjusted.converged:
         reason = StopReason.MAX_ITERATIONS
@@ -69,7 +74,7 @@ def calibration_of(
     return Calibration(
         intrinsics=intrinsics,
         std=std,
-        fixed=problem.fixed,
+        fixed=fixed,
         views=_view_results(solution, cov, squared),
         points=problem.points,
         type=problem.type,
@@ -91,7 +96,8 @@ def calibration_of(
         target=solution.target,
         lens_choice=solution.model_errors or {},
         warnings=(
-            *parameter_warnings(intrinsics, state.distortion, std, chosen),
+            *parameter_warnings(intrinsics, state.distortion, std, chosen or solution.ambiguity is not None),
+            *_xi_warning(solution.ambiguity, problem.distortion.model),
             *_corner_warning(problem),
             *_repeated_warning(repeated),
             *filter(None, [scale_of(problem.points).contradiction]),
@@ -101,16 +107,20 @@ def calibration_of(
     )
 
 
-def _camera_covariance(
-    problem: Problem, intrinsics: Intrinsics, cov: Covariance
-) -> tuple[Array, dict[str, float]]:
-    """Covariance of the intrinsic parameters and the distortion coefficients, and their std; 0 if given."""
-    free = np.flatnonzero(problem.free_camera)
-    entries = np.zeros((len(problem.free_camera),) * 2)
-    entries[np.ix_(free, free)] = cov.entries
-    return parameter_covariance(
-        intrinsics, problem.distortion.model, entries, problem.views.pixel_scale, problem.fixed
-    )
+def _entries(problem: Problem, known: CameraCovariance, ambiguity: Ambiguity | None) -> Array:
+    """(5 + K, 5 + K) covariance of A's entries and the distortion coefficients, normalised; 0 if given.
+
+    With what other cameras that explain the points as well add to it.
+    """
+    free = problem.free_camera
+    entries = np.zeros((len(free), len(free)))
+    entries[np.ix_(free, free)] = known.found.entries
+    if ambiguity is None:
+        return entries
+    free[_XI] = True
+    inflation = known.found.entries[0, 0] / known.plain.entries[0, 0]  # for views that are not independent
+    entries[np.ix_(free, free)] = ambiguity.widened(entries[np.ix_(free, free)], free, max(inflation, 1.0))
+    return entries
 
 
 def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[str, ViewResult]:
@@ -153,6 +163,19 @@ def _network_record(solution: Solution, rmse: float) -> NetworkRecord:
         rmse_before=float(np.sqrt(record.before / n)) * px,
         rmse_after=rmse,
         curve=tuple((record.curve * px).tolist()),
+    )
+
+
+def _xi_warning(ambiguity: Ambiguity | None, model: str) -> tuple[str, ...]:
+    """Many values of xi explain the points, each with its own alpha."""
+    if ambiguity is None or np.diff(ambiguity.range)[0] < _TOLD:
+        return ()
+    first, last = ambiguity.range
+    with_it = "alpha_u, alpha_v and alpha" if model == "double_sphere" else "alpha_u, alpha_v, k1 and k2"
+    return (
+        f"the points hardly tell xi, nor what goes with it ({with_it}): values of xi from {first:.2f} to "
+        f"{last:.2f} explain them as well; what is projected is nearly the same for all, and its std is "
+        "that of the verdict",
     )
 
 

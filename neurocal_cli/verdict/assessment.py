@@ -28,7 +28,11 @@ from neurocal_cli.bundle_adjustment.cross_validation import (
     held_out,
     reduced,
 )
-from neurocal_cli.bundle_adjustment.outlier_views import free_networks, seen_from_behind
+from neurocal_cli.bundle_adjustment.outlier_views import (
+    conditions_on_views,
+    free_networks,
+    seen_from_behind,
+)
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle, predicted_pixels
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
@@ -37,6 +41,7 @@ from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.calibration import Calibration
+from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.camera.rich_lens import NODES
@@ -233,7 +238,7 @@ class _AtMinimum:
         return q.at(np.asarray(steps[fold], dtype=float))
 
     def _precision(self) -> tuple[float, float]:
-        freedom = np.where(self.views.nearly_flat, 8, 11)
+        freedom = 6 + conditions_on_views(self.views, self.state)
         own_spare = self.views.n_equations - int(freedom.sum())
         if own_spare <= 0 or freedom.sum() <= self.unknowns:
             return np.nan, np.nan
@@ -314,6 +319,8 @@ def _free(calibration: Calibration) -> NDArray[np.bool_]:
     coefficients = coefficient_names(calibration.distortion_model)
     if calibration.straight_lines is not None:
         fixed |= set(coefficients)
+    if xi_is_flat(calibration.distortion_model, calibration.distortion):
+        fixed.add("xi")  # alpha and alpha_u determine what is projected
     return np.array([name not in fixed for name in (*_ORDER, *coefficients)])
 
 

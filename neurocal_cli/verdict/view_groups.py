@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
-from neurocal_cli.bundle_adjustment.outlier_views import free_networks
+from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
@@ -27,7 +27,6 @@ __all__ = ["ViewGroups", "view_groups"]
 # tests/test_view_groups.py repeats it.
 _CONTRADICTS = 5.0
 _NOISE = 4.0
-_CONDITIONS = (5, 2)  # on the network of a solid and of a flat view
 _FEWEST = 2  # views of a group
 _SPARE = 4  # more conditions than what explains them has parameters
 _DIFFERENT = 0.01  # of the focal length
@@ -81,7 +80,7 @@ def view_groups(
     normal : (V, 12 + K, 12 + K) array
     free : (5 + K,) bool array
     """
-    conditions = np.where(views.nearly_flat, _CONDITIONS[1], _CONDITIONS[0])
+    conditions = conditions_on_views(views, state)
     n_free = int(free[:5].sum())
     spare = int(conditions.sum()) - n_free
     freedom = views.n_equations - float((6 + conditions).sum())

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.camera.distortion import MODELS, WIDE
+from neurocal_cli.camera.distortion import MODELS, WIDE, WITH_PRISM
 from neurocal_cli.errors import UsageError
 from neurocal_cli.target import TARGETS
 from neurocal_cli.zoom_lens.committee import Budget
@@ -36,7 +36,8 @@ TRAININGS = ("joint", "alternating")
 OUTLIERS = ("reject", "keep")
 CAMERAS = ("auto", "still", "moving")
 # A network follows each coefficient; of the wide models a fisheye alone has coefficients that are linear.
-DISTORTIONS = ("auto", *(model for model in MODELS if model not in WIDE or model == "fisheye"))
+_TOO_MANY = {*WIDE, *WITH_PRISM} - {"fisheye"}
+DISTORTIONS = ("auto", *(model for model in MODELS if model not in _TOO_MANY))
 
 
 def fit_lens(

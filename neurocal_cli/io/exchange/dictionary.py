@@ -217,7 +217,7 @@ def npz_bytes(tree: Mapping[str, Any]) -> bytes:
     return buffer.getvalue()
 
 
-_ALL = ("none", "plumb_bob", "rational", "fisheye", "omnidir")
+_ALL = ("none", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir")
 OPENCV = Format("OpenCV", _ALL, False, True, 2, False, False, _opencv)
 JSON = Format("JSON", _ALL, True, True, 2, False, False, _json)
 NPZ = Format("NumPy", _ALL, True, True, 2, False, False, _npz)

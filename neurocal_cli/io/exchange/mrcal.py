@@ -26,7 +26,10 @@ __all__ = ["FORMAT", "REFERENCE", "is_text", "parse"]
 
 REFERENCE = "reference"  # the name of the world as a view
 _LENGTHS = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
-_NAMES = {"none": "PINHOLE", "k1k2p1p2": "OPENCV4", "plumb_bob": "OPENCV5", "rational": "OPENCV8"}
+_NAMES = {
+    "none": "PINHOLE", "k1k2p1p2": "OPENCV4", "plumb_bob": "OPENCV5", "rational": "OPENCV8",
+    "thin_prism": "OPENCV12",
+}  # fmt: skip
 _START = re.compile(r"\A(?:\s*#[^\n]*\n)*\s*\{\s*(?:#[^\n]*\n\s*)*'[a-z_]+'\s*:")
 
 
@@ -70,14 +73,11 @@ def _numbers(field: Field, count: int) -> Array:
 
 
 def _distortion(k: Array) -> Distortion:
-    if k[8:].any():
-        raise InputError(
-            "the thin prism coefficients of LENSMODEL_OPENCV12 are not known; convert it to OPENCV8"
-        )
-    k = k[:8]
+    if len(k) == 12 and not k[8:].any():
+        k = k[:8]
     if not k.any():
         return Distortion()
-    names = {4: "k1k2p1p2", 5: "plumb_bob", 8: "rational"}
+    names = {4: "k1k2p1p2", 5: "plumb_bob", 8: "rational", 12: "thin_prism"}
     return Distortion(names[len(k)], k)
 
 

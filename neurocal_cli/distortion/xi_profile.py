@@ -1,0 +1,182 @@
+"""All minima of a lens with xi, and how well every xi explains the points.
+
+The image of a unified or double-sphere lens depends on xi and on the other parameters together, so that
+several values of xi may explain the points about as well: around xi = 0 a double sphere's image depends on
+the square of xi only. So every xi of a grid is tried, from the most similar lens that has it, everything else
+being adjusted; the lowest minimum is the answer, and where others are nearly as low, more values of xi are
+looked at until the weight of each is known (`Ambiguity`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
+from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
+from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.camera.directions import WITH_XI, xi_is_flat
+from neurocal_cli.distortion.similar_lens import similar_states
+from neurocal_cli.geometry import Array
+
+__all__ = ["with_all_minima", "with_xi_held_if_flat"]
+
+# Repeated by tests/test_wide_lenses.py (slow: a thousand cameras): all at the lowest minimum, their errors
+# as large as their standard deviations.
+_GRID = {"omnidir": np.linspace(0.0, 3.0, 31), "double_sphere": np.linspace(-0.6, 1.0, 33)}
+_SAME = 1e-6
+_STEPS = 30
+_NEAR = 1e4  # chi^2 above the best: what may lead to a lower minimum, between two values of the grid
+_POSSIBLE = 25.0  # chi^2 above the best: what may be true
+_AS_A_PARABOLA = 0.6  # standard deviations
+_LARGEST_MASS = 0.08  # of one interval
+_MOST = 60  # values of xi
+_VIEWS_THAT_TELL = 40  # of what is possible; 1000 views take as long as these
+
+
+def with_xi_held_if_flat(problem: Problem, adjusted: Adjusted) -> tuple[Problem, Adjusted]:
+    """A double sphere's xi is held at 0 where it is nearly that: to first order nothing depends on it."""
+    state = adjusted.state
+    if not xi_is_flat(state.model, state.k):
+        return problem, adjusted
+    problem = replace(problem, fixed=problem.fixed | {"xi"})
+    return problem, problem.adjust(replace(adjusted, state=replace(state, k=state.k * [0.0, 1.0])))
+
+
+def with_all_minima(solution: Solution) -> Solution:
+    """The lowest minimum of a lens with xi, and what others are as good; other lenses as they are."""
+    problem = solution.problem
+    if problem.distortion.model not in WITH_XI or not problem.free_distortion:
+        return solution
+    problem = replace(problem, fixed=problem.fixed - {"xi"})
+    profile = _Profile(problem, solution.adjusted)
+    best, ambiguity = profile.best, profile.ambiguity()
+    if best is solution.adjusted:
+        return replace(solution, ambiguity=ambiguity)
+    if any(best is one for one in profile.at_the_end):
+        problem = profile.held
+    else:
+        problem, best = with_xi_held_if_flat(problem, best)
+    return replace(solution, problem=problem, adjusted=best, ambiguity=ambiguity)
+
+
+class _Profile:
+    """Cameras with given xi, everything else being adjusted, and the minima among them."""
+
+    def __init__(self, problem: Problem, adjusted: Adjusted) -> None:
+        self.problem, self.best = problem, adjusted
+        self.held = replace(problem, fixed=problem.fixed | {"xi"})
+        freedom = problem.views.n_equations - problem.n_parameters
+        self.variance = max(float(adjusted.cost.sum()), 1e-300) / max(freedom, 1)
+        tried = (self.held.adjust(start, _STEPS) for start in self._starts(adjusted.state))
+        self.tried = [a for a in tried if a.converged and _is_lens(a)]
+        self._descend()
+
+    def _starts(self, state: CameraState) -> list[CameraState]:
+        """The most similar lens for each xi of the grid, of many views only where some of them allow it."""
+        views, model = self.problem.views, self.problem.distortion.model
+        starts = similar_states(state, model, farthest_angle(views, state), _GRID[model])
+        if views.n_views <= _VIEWS_THAT_TELL:
+            return starts
+        some = np.unique(np.linspace(0, views.n_views - 1, _VIEWS_THAT_TELL).round().astype(np.intp))
+        few = replace(self.held, views=views.subset(some))
+        found = [few.adjust(replace(s, R=s.R[some], t=s.t[some]), _STEPS) for s in starts]
+        least = float(self.best.cost[some].sum())
+        share = views.n_equations / few.views.n_equations / self.variance
+        return [
+            replace(start, entries=a.state.entries, k=a.state.k)
+            for start, a in zip(starts, found, strict=True)
+            if share * (float(a.cost.sum()) - least) < _NEAR
+        ]
+
+    def _excess(self, adjusted: Adjusted) -> float:
+        return float(adjusted.cost.sum() - self.best.cost.sum()) / self.variance
+
+    def _descend(self) -> None:
+        """From the lowest places of the grid to the minima."""
+        tried = list(self.tried)
+        costs = [np.inf, *(float(a.cost.sum()) for a in tried), np.inf]
+        minima = []
+        for n, start in enumerate(tried):
+            if costs[n + 1] > min(costs[n], costs[n + 2]) or self._excess(start) > _NEAR:
+                continue
+            found = self.problem.adjust(start)
+            if found.converged and _is_lens(found):
+                minima.append(found)
+        if _is_lens(self.best):
+            minima.append(self.best)
+        # Where the valley leads out of the model's range, the last camera within it.
+        self.at_the_end = [] if minima else tried
+        minima = minima or tried or [self.best]
+        self.best = min(minima, key=lambda a: float(a.cost.sum()))
+        self._add(minima)
+
+    def _add(self, more: list[Adjusted]) -> None:
+        known = sorted([*self.tried, *more], key=_xi)
+        self.tried = known[:1] + [b for a, b in pairwise(known) if _xi(b) - _xi(a) > _SAME]
+
+    def ambiguity(self) -> Ambiguity | None:
+        """None where the best minimum tells everything."""
+        if self._is_parabola():
+            return None
+        while len(self.tried) < _MOST:
+            weights = np.exp(-0.5 * np.array([self._excess(a) for a in self.tried]))
+            xi = np.array([_xi(a) for a in self.tried])
+            mass = np.diff(xi) * np.maximum(weights[1:], weights[:-1])
+            n = int(np.argmax(mass))
+            if mass[n] <= _LARGEST_MASS * mass.sum():
+                break
+            side = self.tried[n + int(weights[n + 1] > weights[n])]
+            self._add([self.held.adjust(_moved(side.state, 0.5 * (xi[n] + xi[n + 1])), _STEPS)])
+        centre = _camera(self.best.state)
+        return Ambiguity(
+            np.array([_xi(a) for a in self.tried]),
+            np.array([_camera(a.state) - centre for a in self.tried]),
+            np.array([self._excess(a) for a in self.tried]),
+        )
+
+    def _is_parabola(self) -> bool:
+        """Whether all that is possible is as the covariance of the best minimum has it."""
+        problem, best = self.problem, self.best
+        free = problem.free_camera
+        cov = covariance(best.normal, free, problem.free_poses, problem.views.n_equations)
+        variance = float(cov.entries[int(free[:5].sum()), int(free[:5].sum())])
+        if not variance > 0 or not cov.smallest > 1e-12:
+            return False
+        for one in self.tried:
+            expected, found = (
+                abs(_xi(one) - _xi(best)) / np.sqrt(variance),
+                np.sqrt(max(self._excess(one), 0)),
+            )
+            possible = min(expected, found) < np.sqrt(_POSSIBLE)
+            if possible and abs(expected - found) > _AS_A_PARABOLA * max(1.0, 0.3 * expected):
+                return False
+        return True
+
+
+def _is_lens(adjusted: Adjusted) -> bool:
+    """Whether coefficients are of the model's range: a double sphere beyond alpha = 0 is none."""
+    state = adjusted.state
+    low, high = _GRID[state.model][[0, -1]]
+    return bool(low <= state.k[0] <= high and (state.model != "double_sphere" or 0 <= state.k[1] <= 1))
+
+
+def _xi(adjusted: Adjusted) -> float:
+    return float(adjusted.state.k[0])
+
+
+def _camera(state: CameraState) -> Array:
+    return np.concatenate([state.entries[0], state.k])
+
+
+def _moved(state: CameraState, xi: float) -> CameraState:
+    """With another xi, and the same scale in the middle of the image."""
+    entries, k = state.entries.copy(), state.k.copy()
+    entries[:, :3] *= (1 + xi) / (1 + k[0])
+    k[0] = xi
+    return replace(state, entries=entries, k=k)
