@@ -48,7 +48,8 @@ dialog::backdrop{background:#000a}dl{display:grid;grid-template-columns:auto 1fr
 dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}code{font-size:.9em}
 @media (max-width:480px){dl{grid-template-columns:1fr}dd{margin-bottom:.5rem}}
 @media print{:root{--ink:#000;--paper:#fff;--card:#f4f6f9;--edge:#bbb;--soft:#444;--accent:#2b5fb3}
-body{max-width:none;padding:0;font-size:10pt}.views{grid-template-columns:repeat(4,1fr)}dialog{display:none}}
+body{max-width:none;padding:0;font-size:10pt}h2,h2+p{break-after:avoid}tr{break-inside:avoid}
+.wide{overflow:visible}.views{grid-template-columns:repeat(4,1fr)}dialog{display:none}}
 """
 
 _SCRIPT = """
