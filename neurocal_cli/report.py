@@ -101,14 +101,14 @@ def target_lines(target: Target | None, unit: str) -> list[str]:
     """The target that was found, in a line; none where it was taken as given."""
     if target is None:
         return []
+    unit = "units" if unit == "unknown" else printable(unit)
     if target.stated is not None:
         return [_surveyed_line(target, unit)]
-    parts = [f"bent by {target.bend():.2g} {printable(unit)}"] if not target.flat else []
+    parts = [f"bent by {target.bend():.2g} {unit}"] if not target.flat else []
     parts.append(f"stretched by {100 * target.stretch():.2g} %")
     found = np.sqrt((target.offsets**2).sum(axis=1).mean())
     return [
-        f"target: {' and '.join(parts)}; its points lie {found:.2g} {printable(unit)} rms from where they "
-        "were given"
+        f"target: {' and '.join(parts)}; its points lie {found:.2g} {unit} rms from where they were given"
     ]
 
 

@@ -12,7 +12,7 @@ from support.command_line import run
 from support.made_calibration import made_points
 from support.rigs import random_rig, sides
 
-from neurocal_cli import read_calibration, read_rig, write_points
+from neurocal_cli import read_calibration, read_points, read_rig, write_points
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"
 BOARD = ("--cols", 9, "--rows", 6, "--square", 25)
@@ -127,17 +127,17 @@ def summary(*words: Any) -> dict[str, Any]:
     return told
 
 
+FISHEYE = """
+image_width: 640
+image_height: 480
+camera_matrix: {rows: 3, cols: 3, data: [260, 0, 322, 0, 260, 238, 0, 0, 1]}
+distortion_model: equidistant
+distortion_coefficients: {rows: 1, cols: 4, data: [0.05, -0.01, 0.002, 0.0]}
+"""
+
+
 def test_what_undistorts_converts_and_prints_sums_up_as_json(tmp_path: Path) -> None:
-    run(
-        "calibrate",
-        SAMPLES / "fisheye.csv",
-        "--distortion",
-        "fisheye",
-        "--no-skew",
-        "-o",
-        tmp_path / "f.yaml",
-    )
-    camera = read_calibration(tmp_path / "f.yaml")
+    (tmp_path / "f.yaml").write_text(FISHEYE)
     (tmp_path / "bad.png").write_bytes(b"no picture")
     files = (SAMPLES / "fisheye.csv", tmp_path / "bad.png")
     told = summary("undistort", tmp_path / "f.yaml", *files, "--fov", 100, "-o", tmp_path / "plane")
@@ -145,8 +145,8 @@ def test_what_undistorts_converts_and_prints_sums_up_as_json(tmp_path: Path) -> 
     assert "bad.png" in told["failed"][str(files[1])]
     assert told["shown_deg"][0] == pytest.approx(100, abs=0.2)
     assert told["shown_deg"][0] < told["spanned_deg"][0]
-    assert told["camera"]["K"][0][2] == pytest.approx(camera.K[0, 2])
-    told = summary("undistort", tmp_path / "f.yaml", "--to", "cylinder", "--maps", tmp_path / "maps.npz")
+    assert told["camera"]["K"][0][2] == 322
+    told = summary("undistort", tmp_path / "f.yaml", "--to", "cylinder", "--camera", tmp_path / "c.yaml")
     assert told["camera"]["projection"] == "cylinder"
 
     told = summary(
@@ -158,7 +158,7 @@ def test_what_undistorts_converts_and_prints_sums_up_as_json(tmp_path: Path) -> 
     told = summary("convert", tmp_path / "f.yaml", "--to", "kalibr", "-o", tmp_path / "k.yaml")
     assert told["cameras"][0]["moved"] is None
     told = summary("convert", SAMPLES / "fisheye.csv", "--to", "json", "-o", tmp_path / "points.json")
-    assert (told["n_points"], told["n_views"]) == (len(camera.points) + camera.n_rejected, 9)
+    assert (told["n_points"], told["n_views"]) == (len(read_points(SAMPLES / "fisheye.csv")), 9)
 
     told = summary("board", *BOARD, "--paper", "A3", "-o", tmp_path / "board.svg")
     assert told["planes"] == [{"name": "", "cols": 9, "rows": 6, "square": 25.0}]

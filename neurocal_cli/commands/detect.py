@@ -10,6 +10,7 @@ import click
 
 from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.frames import videos_as_frames
+from neurocal_cli.commands.one_size import of_one_size
 from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
@@ -158,7 +159,7 @@ def detect(
         outcomes = _examined(images, wanted, board, output, overlay, jobs, frames)
     else:
         outcomes = _watched(images, wanted, board, output, watch)
-    outcomes = _of_one_size(outcomes)
+    outcomes = of_one_size(outcomes)
     _report(outcomes, target, as_json)
     _write(outcomes, target, overlay, output)
 
@@ -245,26 +246,6 @@ def _mixed_sizes(paths: Sequence[str]) -> list[str]:
         return []
     counts = ", ".join(f"{count} of {w} x {h} px" for (w, h), count in sizes.most_common(4))
     return [f"the images have {len(sizes)} sizes ({counts}); those of one camera have one"]
-
-
-def _of_one_size(outcomes: list[tuple[str, Outcome]]) -> list[tuple[str, Outcome]]:
-    """Leave out boards in images of another size than most have; of two sizes alike, none."""
-    from collections import Counter
-
-    sizes = Counter(outcome.detection.image_size for _, outcome in outcomes if outcome.detection is not None)
-    counts = [count for _, count in sizes.most_common(2)]
-    if len(counts) < 2 or counts[0] == counts[1]:
-        return outcomes
-    most = sizes.most_common(1)[0][0]
-    kept = []
-    for name, outcome in outcomes:
-        found = outcome.detection
-        if found is not None and found.image_size != most:
-            found_most = "{} x {} px and most have {} x {}".format(*found.image_size, *most)
-            problem = f"{name}: the image has {found_most}; run detect for each camera separately"
-            outcome = replace(outcome, detection=None, overlay=None, problem=problem)
-        kept.append((name, outcome))
-    return kept
 
 
 def _check_folder(option: str, folder: str) -> None:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+from neurocal_cli.commands.one_size import of_one_size
 from neurocal_cli.commands.streams import complain, one_line, say
 from neurocal_cli.errors import FormatError, NeurocalError
 
@@ -77,11 +78,12 @@ def _whole(
 
 
 def _tell(path: str, outcomes: dict[str, Outcome], options: DetectionOptions) -> None:
-    outcome = outcomes[path]
+    alike = dict(of_one_size(list(outcomes.items())))
+    outcome = alike[path]
     if outcome.detection is None:
         complain(outcome.problem)
         return
-    found = {name: one.detection for name, one in outcomes.items() if one.detection is not None}
+    found = {name: one.detection for name, one in alike.items() if one.detection is not None}
     name = os.path.basename(path)
     from neurocal_cli.detection.detect import gather
     from neurocal_cli.methods import calibrate

@@ -29,7 +29,7 @@ p,li{max-width:75ch}.soft{color:var(--soft)}
 .poor{border-color:var(--poor)}.poor b{color:var(--poor)}
 .wide{overflow-x:auto}table{border-collapse:collapse;font-variant-numeric:tabular-nums}
 th,td{padding:.25rem .8rem .25rem 0;text-align:right;vertical-align:top;white-space:nowrap;
-border-bottom:1px solid var(--edge)}td.text{text-align:left;white-space:normal;min-width:12rem}
+border-bottom:1px solid var(--edge)}.text{text-align:left}td.text{white-space:normal;min-width:12rem}
 th:first-child,td:first-child{text-align:left}
 th button{all:unset;cursor:pointer;text-decoration:underline dotted}th button:focus-visible{outline:2px solid}
 .figures{display:grid;gap:1rem;grid-template-columns:repeat(auto-fill,minmax(min(100%,380px),1fr))}
@@ -48,7 +48,8 @@ dialog::backdrop{background:#000a}dl{display:grid;grid-template-columns:auto 1fr
 dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}code{font-size:.9em}
 @media (max-width:480px){dl{grid-template-columns:1fr}dd{margin-bottom:.5rem}}
 @media print{:root{--ink:#000;--paper:#fff;--card:#f4f6f9;--edge:#bbb;--soft:#444;--accent:#2b5fb3}
-body{max-width:none;padding:0;font-size:10pt}.views{grid-template-columns:repeat(4,1fr)}dialog{display:none}}
+body{max-width:none;padding:0;font-size:10pt}h2,h2+p{break-after:avoid}tr{break-inside:avoid}
+.wide{overflow:visible}.views{grid-template-columns:repeat(4,1fr)}dialog{display:none}}
 """
 
 _SCRIPT = """
@@ -100,7 +101,10 @@ def table(rows: Sequence[Sequence[str]], sortable: bool = False) -> str:
     """Rows as a table, the first one its headings."""
     head, *body = rows
     sort = ' class="sort"' if sortable else ""
-    cells = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    texts = [any(len(row[k]) > _LONG for row in body) for k in range(len(head))]
+    cells = "".join(
+        f"<th{' class=text' * text}>{escape(cell)}</th>" for cell, text in zip(head, texts, strict=True)
+    )
     lines = "\n".join("<tr>" + "".join(_cell(cell) for cell in row) + "</tr>" for row in body)
     content = f"<thead><tr>{cells}</tr></thead>\n<tbody>{lines}</tbody>"
     return f'<div class="wide"><table{sort}>{content}</table></div>'
