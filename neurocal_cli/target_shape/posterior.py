@@ -26,7 +26,15 @@ from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
 from neurocal_cli.target_shape.system import Solved, System
 
-__all__ = ["Posterior", "cost_at", "evidence_of_given", "known_sizes", "posterior", "quadratic_at"]
+__all__ = [
+    "Posterior",
+    "cost_at",
+    "evidence_of_given",
+    "known_sizes",
+    "posterior",
+    "prior_covariance",
+    "quadratic_at",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,6 +200,19 @@ def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[flo
         return max(cost, _NO_COST), logdet - float(np.log(single).sum())
 
     return at
+
+
+def prior_covariance(prior: Prior, sizes: Mapping[str, float]) -> Array:
+    """(3 n, 3 n) of the offsets along each point's axes, for sizes of the parts [world unit]."""
+    n, m = len(prior.axes), prior.basis.shape[2]
+    if prior.stated is not None:
+        return np.diag((sizes[_STATED] * prior.stated.ravel()) ** 2)
+    weight = np.empty(m)
+    for name, places in prior.groups.items():
+        weight[places] = (sizes[name] / prior.size) ** 2
+    basis = prior.basis.reshape(3 * n, m)
+    own = np.tile([sizes["place"], sizes["place"], sizes["height"]], n) ** 2
+    return np.asarray((basis * weight) @ basis.T + np.diag(own))
 
 
 @dataclass(frozen=True, eq=False)
