@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -118,7 +119,9 @@ def fit_lens(
     start, joints = _train(start, options, reject, report)
     if found is None:
         return assemble(start, joints, options)
-    coupling = target_coupling(start.data, start.tables, found, start.variance)
+    coupling = None
+    with suppress(np.linalg.LinAlgError):  # a pose that nothing determines
+        coupling = target_coupling(start.data, start.tables, found, start.variance)
     return replace(assemble(start, joints, options), target=found, target_coupling=coupling)
 
 
