@@ -150,7 +150,11 @@ def calibrate(
 
             found = calibrate_by(method, problem, camera_name)
             _refuse_misfit(found)
-            return replace(found, warnings=(*found.warnings, *_unused(points, choice)), judgement=assess)
+            return replace(
+                found,
+                warnings=(*found.warnings, *_unused(points, f"the method is {method}")),
+                judgement=assess,
+            )
         if outliers == "reject":
             solution, rejected = fit_robustly(problem, options)
         else:
@@ -173,7 +177,12 @@ def calibrate(
         elif choice in ("flat", "free") and found.target is None:
             found = replace(found, warnings=(*found.warnings, _NOT_FOUND))
         elif found.target is None:
-            found = replace(found, warnings=(*found.warnings, *_unused(points, choice)))
+            why = (
+                "the target is given"
+                if choice == "given"
+                else "the points and views are too many, or too few"
+            )
+            found = replace(found, warnings=(*found.warnings, *_unused(points, why)))
         return replace(found, judgement=assess)
     except DegenerateGeometryError as error:
         text, copies = str(error), repeated_views(points)
@@ -210,15 +219,10 @@ def _distortion_of(method: str, distortion: str) -> str:
     return distortion
 
 
-def _unused(points: Correspondences, target: str) -> tuple[str, ...]:
+def _unused(points: Correspondences, why: str) -> tuple[str, ...]:
     """Note that the survey's standard deviations play no part."""
     if points.world_std is None:
         return ()
-    why = (
-        "the target is given"
-        if target == "given"
-        else "the method or the number of points has no use for them"
-    )
     return (f"the points' standard deviations sX,sY,sZ are not used, because {why}",)
 
 

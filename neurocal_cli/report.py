@@ -129,7 +129,7 @@ def _surveyed_line(target: Target, unit: str) -> str:
     factor = target.sizes["stated"]
     taken = "" if factor == 1 else f" taken {factor:.2g} times as large, as the residuals ask for"
     return (
-        f"surveyed points: found {found:.2g} {printable(unit)} rms from where they were stated, by their "
+        f"surveyed points: found {found:.2g} {unit} rms from where they were stated, by their "
         f"standard deviations{taken}{exact}"
     )
 

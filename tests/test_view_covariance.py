@@ -148,3 +148,26 @@ def test_the_jackknife_is_that_of_calibrations_without_each_view() -> None:
     jackknife = np.sqrt(0.9 * ((alphas - alphas.mean()) ** 2).sum())
     assert np.sqrt(told[0, 0]) * m.views.pixel_scale == pytest.approx(jackknife, rel=0.05)
     assert whole.std["alpha_u"] > 0.95 * jackknife
+
+
+def test_coefficients_that_only_tell_together_do_not_hide_that_views_contradict_each_other() -> None:
+    """As those of a rational model do: with one of them the views say the same of the camera as with both."""
+    rng = np.random.default_rng(4)
+    V, rows = 8, 60
+    J = rng.standard_normal((V, rows, 12))  # five of A, six of the pose, a coefficient
+    moved = 0.3 * rng.standard_normal((V, 12, 1))
+    residual = 0.1 * rng.standard_normal((V, rows, 1)) + J @ moved
+    again = J[:, :, 11:] + 1e-6 * rng.standard_normal((V, rows, 1))
+
+    def std(*blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        whole = np.concatenate(blocks, axis=2)
+        normal = np.swapaxes(whole, 1, 2) @ whole
+        given = normal, np.ones(normal.shape[1] - 7, dtype=bool), True, V * rows
+        plain = covariance(*given)
+        entries = counting_views(plain, *given, own_poses(V)).entries
+        return np.sqrt(np.diagonal(plain.entries)[:5]), np.sqrt(np.diagonal(entries)[:5])
+
+    plain, one = std(J, residual)
+    _, both = std(J, again, residual)
+    assert (one > 1.3 * plain).all()
+    np.testing.assert_allclose(both, one, rtol=0.05)

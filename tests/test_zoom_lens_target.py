@@ -15,6 +15,7 @@ from neurocal_cli.zoom_lens.evaluation import evaluate_lens
 from neurocal_cli.zoom_lens.fit_points import fit_lens
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.target import lens_target, on_target
+from neurocal_cli.zoom_lens.target_coupling import with_target_uncertain
 
 SIGMA = 0.1
 ZOOMS = np.linspace(0, 1000, 6)
@@ -70,6 +71,41 @@ def test_settings_with_few_views_find_it_together() -> None:
     assert found(LensPoints.grouped(points, {"zoom": settings})) is not None
 
 
+def test_the_covariance_is_that_of_lens_and_target_together() -> None:
+    """Against the inverse of the whole normal matrix, of lens and offsets with their prior."""
+    rng = np.random.default_rng(3)
+    S, L, Q, P, d, variance = 5, 4, 1, 6, 7, 0.04
+    J = rng.standard_normal((S, L, P))
+    rows = rng.standard_normal((S, 40, L + Q + d))
+    C, D = rows[:, :, : L + Q], rows[:, :, L + Q :]
+    spread = np.cov(rng.standard_normal((d, 3 * d))) * 0.01  # a priori
+    whole = [np.concatenate([c[:, :L] @ j, c[:, L:], e], axis=1) for c, j, e in zip(C, J, D, strict=True)]
+    H = sum(one.T @ one for one in whole) / variance
+    H[P + Q :, P + Q :] += np.linalg.inv(spread)
+    E = np.linalg.inv(sum(e.T @ e for e in D) / variance + np.linalg.inv(spread))
+    coupling = np.swapaxes(C, 1, 2) @ D @ np.linalg.cholesky(E)
+    known = np.linalg.inv(H[: P + Q, : P + Q])
+    found = with_target_uncertain(known, J, coupling, variance)
+    np.testing.assert_allclose(found, np.linalg.inv(H)[: P + Q, : P + Q], rtol=1e-8)
+    assert (np.diagonal(found) > np.diagonal(known)).all()
+
+
+@pytest.mark.slow
+def test_standard_deviations_count_that_the_board_is_uncertain() -> None:
+    z = []
+    at = np.linspace(100, 900, 5)
+    for seed in range(4):
+        rng = np.random.default_rng([seed, 5])
+        points = scene(rng, ZOOMS, 5, offsets("both", 0.1, rng))
+        lens = fit_lens(points, distortion="none", skew=False, topologies=((1, 0), (2, 0)))
+        assert lens.target is not None
+        found = lens.predict(at[:, None])
+        true = np.column_stack([alpha(at), np.full(5, 320.0), np.full(5, 240.0)])
+        z.append((found.local[:, [0, 2, 3]] - true) / found.std[:, [0, 2, 3]])
+    # The errors of one lens are nearly the same at all of its settings: twelve numbers.
+    assert 0.4 < np.sqrt(np.square(z).mean()) < 1.5
+
+
 @pytest.mark.slow
 def test_a_lens_is_better_with_its_board_found(tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
@@ -85,3 +121,4 @@ def test_a_lens_is_better_with_its_board_found(tmp_path: Path) -> None:
     assert evaluate_lens(given, others).rmse_px > 1.5 * SIGMA * np.sqrt(2)
     assert evaluate_lens(stored, others).rmse_px < 1.05 * SIGMA * np.sqrt(2)
     assert evaluate_lens(stored, others).rmse_px == evaluate_lens(free, others).rmse_px
+    np.testing.assert_array_equal(stored.predict(at[:, None]).std, free.predict(at[:, None]).std)

@@ -68,6 +68,13 @@ class CameraState:
         """The distortion that all views share."""
         return Distortion(self.model, self.k)
 
+    def of_view(self, view: int) -> CameraState:
+        """Of one view alone."""
+        own = slice(view, view + 1)
+        entries = self.entries if len(self.entries) == 1 else self.entries[own]
+        k = self.k if self.k.ndim == 1 else self.k[view]
+        return replace(self, entries=entries, R=self.R[own], t=self.t[own], k=k)
+
     def moved(self, by_camera: Array, by_pose: Array) -> CameraState:
         """The state after a step; by_camera (1 or V, 5 + K), by_pose (V, 6) with omega and tau."""
         by_entries, by_k = by_camera[:, :5], by_camera[:, 5:]

@@ -15,7 +15,7 @@ allows, and nowhere below the normal matrix's. Views that repeat a pose (`repeat
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diago
 __all__ = ["counting_views", "scores_of_poses"]
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty
+_TOLD = 1e-10  # least eigenvalue of a normal matrix with a unit diagonal that rounding leaves alone
 _FEWEST = 3  # poses, of which one can be left out and two still differ
 
 
@@ -68,16 +69,49 @@ def counting_views(
         return found
     unknowns = int(free.sum()) + (6 * len(normal) if free_poses else 0)
     variance = float(normal[:, -1, -1].sum()) / max(n_residuals - unknowns, 1)
-    q = _by_pose(reduced(normal, free, free_poses), repeated)
-    entries = found.entries
+    whole = reduced(normal, free, free_poses)
+    told = _determined(whole.S.sum(axis=0))
+    if told is not None:
+        whole = Quadratics(told.into.T @ whole.S @ told.into, whole.g @ told.into, whole.cost)
+    q = _by_pose(whole, repeated)
+    entries = before = found.entries if told is None else told.back @ found.entries @ told.back.T
     if not repeated.none:
         entries = _of_copies(q, repeated.variance, variance)
     if len(q.cost) >= _FEWEST and _contradict(q, repeated.variance, variance):
         moves = None if moves_without is None else moves_without(repeated.group)
+        if moves is not None and told is not None:
+            moves = moves @ told.back.T
         entries = _at_least(_jackknife(q.moves_without_each() if moves is None else moves), entries)
-    if entries is found.entries or not np.isfinite(entries).all():
+    if entries is before or not np.isfinite(entries).all():
         return found
+    if told is not None:
+        entries = found.entries + told.into @ (entries - before) @ told.into.T
     return replace(found, entries=entries, poses=_followed(found, normal, free, free_poses, entries))
+
+
+@dataclass(frozen=True, eq=False)
+class _Determined:
+    """Directions of the unknowns that the points tell: p = into z, z = back p."""
+
+    into: Array
+    back: Array
+
+
+def _determined(S: Array) -> _Determined | None:
+    """Without the directions in which rounding has the say; None where there are none.
+
+    The coefficients of a rational model hardly tell themselves apart, though what they project is certain.
+    """
+    scaled, scale = unit_diagonal(S)
+    try:
+        values, vectors = np.linalg.eigh(scaled)
+    except np.linalg.LinAlgError:
+        return None
+    kept = values > _TOLD
+    if kept.all() or not kept.any():
+        return None
+    vectors = vectors[:, kept]
+    return _Determined(scale[:, None] * vectors, vectors.T / scale)
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")

@@ -41,7 +41,7 @@ def format_lens(lens: ZoomLens) -> str:
     """
     lines = [f"{_BLOCK}:"]
     parts = _record_lines(lens), _setting_lines(lens), _member_lines(lens), _tables_lines(lens)
-    for part in (*parts, target_lines(lens.target, long=False)):
+    for part in (*parts, target_lines(lens.target, long=False), _coupling_lines(lens)):
         lines += [f"  {line}" for line in part]
     return "\n".join([*lines, ""])
 
@@ -111,6 +111,20 @@ def _record_lines(lens: ZoomLens) -> Iterator[str]:
     yield "warnings:" if lens.warnings else "warnings: []"
     for warning in lens.warnings:
         yield f"  - {quoted(warning)}"
+
+
+def _coupling_lines(lens: ZoomLens) -> Iterator[str]:
+    if lens.target_coupling is not None:
+        yield f"target_coupling: {flow(lens.target_coupling.reshape(len(lens.settings), -1))}"
+
+
+def _coupling(field: Field | None, S: int, size: int) -> Array | None:
+    if field is None:
+        return None
+    flat = field.array(S, -1)
+    if flat.shape[1] % size:
+        field.fail(f"rows of a multiple of {size} numbers")
+    return flat.reshape(S, size, -1)
 
 
 def _setting_lines(lens: ZoomLens) -> Iterator[str]:
@@ -199,6 +213,7 @@ def _lens(block: Field) -> ZoomLens:
         unit=block["unit"].text(),
         warnings=tuple(field.text() for field in block["warnings"].items()),
         target=read_target(block.get("target")),
+        target_coupling=_coupling(block.get("target_coupling"), S, L + Q),
     )
 
 

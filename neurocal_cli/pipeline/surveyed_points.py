@@ -53,8 +53,20 @@ def with_survey(
     InputError
         A point with two standard deviations.
     """
+    again, outliers = _judged(problem, solution, rejected, options, 1.0)
+    factor = 1.0 if again.target is None else again.target.sizes["stated"]
+    if factor > 1.0 and len(outliers):  # a survey that is worse than it says has fewer outliers
+        again, outliers = _judged(problem, again, outliers, options, factor)
+    return again, outliers
+
+
+def _judged(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options, factor: float
+) -> tuple[Solution, Rejected]:
+    """Find camera and points, with outliers judged by so many times the stated standard deviations."""
     points = problem.points
-    judged = replace(points, covariance=_with_places(solution, points), lines=np.arange(len(points)))
+    covariance = _with_places(solution, points, factor)
+    judged = replace(points, covariance=covariance, lines=np.arange(len(points)))
     if len(rejected) or rejected.views:
         weighed, rejected = fit_robustly(problem.with_points(judged), options)
         if rejected.points is not None:
@@ -77,7 +89,7 @@ def with_survey(
     return reweighted(replace(weighed, problem=own, adjusted=adjusted, target=found.target)), rejected
 
 
-def _with_places(solution: Solution, points: Correspondences) -> Array:
+def _with_places(solution: Solution, points: Correspondences, factor: float) -> Array:
     """(N, 3) covariance of the pixels together with the places of their points [px^2].
 
     The noise of the pixels alone is as large as the median residual leaves it.
@@ -92,7 +104,7 @@ def _with_places(solution: Solution, points: Correspondences) -> Array:
     camera = Camera(Intrinsics.from_matrix(matrix), state.distortion)
     J = camera.project_jacobian(in_camera)[1] @ state.R[view]
     assert points.world_std is not None
-    J = J * points.world_std[:, None]
+    J = J * factor * points.world_std[:, None]
     place = np.stack(
         [(J[:, 0] ** 2).sum(axis=1), (J[:, 0] * J[:, 1]).sum(axis=1), (J[:, 1] ** 2).sum(axis=1)]
     )

@@ -26,7 +26,15 @@ from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
 from neurocal_cli.target_shape.system import Solved, System
 
-__all__ = ["Posterior", "cost_at", "evidence_of_given", "known_sizes", "posterior", "quadratic_at"]
+__all__ = [
+    "Posterior",
+    "cost_at",
+    "evidence_of_given",
+    "known_sizes",
+    "posterior",
+    "prior_covariance",
+    "quadratic_at",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,10 +195,24 @@ def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[flo
     parts = _Parts(info, prior, flat=False)
 
     def at(ratio: float) -> tuple[float, float]:
-        now = parts.at({_STATED: ratio})
-        return max(now.solved.cost, _NO_COST), now.solved.logdet - now.logprior
+        single = parts.of_points({_STATED: ratio})
+        cost, logdet = parts.system.least(np.zeros(0), single)
+        return max(cost, _NO_COST), logdet - float(np.log(single).sum())
 
     return at
+
+
+def prior_covariance(prior: Prior, sizes: Mapping[str, float]) -> Array:
+    """(3 n, 3 n) of the offsets along each point's axes, for sizes of the parts [world unit]."""
+    n, m = len(prior.axes), prior.basis.shape[2]
+    if prior.stated is not None:
+        return np.diag((sizes[_STATED] * prior.stated.ravel()) ** 2)
+    weight = np.empty(m)
+    for name, places in prior.groups.items():
+        weight[places] = (sizes[name] / prior.size) ** 2
+    basis = prior.basis.reshape(3 * n, m)
+    own = np.tile([sizes["place"], sizes["place"], sizes["height"]], n) ** 2
+    return np.asarray((basis * weight) @ basis.T + np.diag(own))
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +223,6 @@ class _Solution:
     solved: Solved
     variance: float
     evidence: float
-    logprior: float
 
 
 class _Parts:
@@ -224,13 +245,13 @@ class _Parts:
         smooth = np.empty(self.system.m)
         for name, places in self.prior.groups.items():
             smooth[places] = (self.prior.size / ratios[name]) ** 2
-        single = self._of_points(ratios)
+        single = self.of_points(ratios)
         solved = self.system.solve(smooth, single)
         logprior = float(np.log(smooth).sum()) + float(np.log(single).sum())
         evidence = _log_evidence(self.spare, solved.cost, solved.logdet - logprior)
-        return _Solution(ratios, solved, solved.cost / self.spare, evidence, logprior)
+        return _Solution(ratios, solved, solved.cost / self.spare, evidence)
 
-    def _of_points(self, ratios: Mapping[str, float]) -> Array:
+    def of_points(self, ratios: Mapping[str, float]) -> Array:
         """(n, 3) precisions of the points by themselves, in units of the noise's."""
         if self.prior.stated is not None:
             return np.asarray((ratios[_STATED] * self.prior.stated) ** -2)

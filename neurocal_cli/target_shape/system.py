@@ -76,16 +76,40 @@ class System:
         """At given precisions (m,) of the smooth parts and (n, 3) of each point by itself."""
         return self._points_first(smooth, single) if self.points_first else self._poses_first(smooth, single)
 
+    def least(self, smooth: Array, single: Array) -> tuple[float, float]:
+        """Cost at the minimum and the logarithm of the determinant, without the rest of `Solved`."""
+        if self.points_first:
+            M, root, _ = self._without_points(smooth, single)
+            logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        else:
+            M, logdet = self._without_poses(smooth, single), self.logdet_poses
+        scale = 1.0 / np.sqrt(np.diagonal(M)[:-1])
+        scaled = M[:-1, :-1] * scale[:, None] * scale
+        try:
+            factor = np.linalg.cholesky(scaled)
+        except np.linalg.LinAlgError:
+            factor = np.linalg.cholesky(scaled + _RIDGE * np.eye(len(scaled)))
+        part = np.linalg.solve(factor, scale * M[:-1, -1])
+        return float(M[-1, -1] - part @ part), logdet + 2 * float(
+            np.log(np.diagonal(factor)).sum() - np.log(scale).sum()
+        )
+
+    def _without_poses(self, smooth: Array, single: Array) -> Array:
+        """The bordered matrix of cameras, smooth parts and points."""
+        s, f = self.s, self.f
+        M = self.dense.copy()
+        at = np.arange(len(M) - 1)
+        M[at[f:s], at[f:s]] += smooth
+        M[at[s:], at[s:]] += single.ravel()
+        return M
+
     def _poses_first(self, smooth: Array, single: Array) -> Solved:
         s, f = self.s, self.f
         dim = s + 3 * self.n
-        M = self.dense[:dim, :dim].copy()
-        at = np.arange(dim)
-        M[at[f:s], at[f:s]] += smooth
-        M[at[s:], at[s:]] += single.ravel()
-        inverse, logdet = _inverse(M)
-        x = inverse @ self.dense[:dim, -1]
-        cost = float(self.dense[-1, -1] - self.dense[:dim, -1] @ x)
+        M = self._without_poses(smooth, single)
+        inverse, logdet = _inverse(M[:dim, :dim])
+        x = inverse @ M[:dim, -1]
+        cost = float(M[-1, -1] - M[:dim, -1] @ x)
         var_single = np.diagonal(inverse)[s:].reshape(self.n, 3)
         with_offsets = self._with_offsets(inverse[:f, f:s], inverse[:f, s:].reshape(f, self.n, 3))
         cross = inverse[f:s, s:].reshape(self.m, self.n, 3)
@@ -107,7 +131,8 @@ class System:
         gain = own @ np.concatenate([self.pose_shared, self.info.pose_point.reshape(self.P, 6, -1)], axis=2)
         return np.asarray(own + gain @ inverse @ np.swapaxes(gain, 1, 2))
 
-    def _points_first(self, smooth: Array, single: Array) -> Solved:
+    def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
+        """The bordered matrix of cameras, smooth parts and poses; roots and rows of the points."""
         info, s, f, n, P = self.info, self.s, self.f, self.n, self.P
         root = np.linalg.inv(np.linalg.cholesky(info.point + single[:, :, None] * np.eye(3)))  # (n, 3, 3)
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, 6 * P, 3).swapaxes(1, 2)
@@ -127,6 +152,12 @@ class System:
         M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.pose_right.reshape(-1), info.cost
         M[-1, :dim] = M[:dim, -1]
         M -= flat.T @ flat
+        return M, root, rows
+
+    def _points_first(self, smooth: Array, single: Array) -> Solved:
+        s, f, n, P = self.s, self.f, self.n, self.P
+        dim = s + 6 * P
+        M, root, rows = self._without_points(smooth, single)
         inverse, logdet = _inverse(M[:dim, :dim])
         x = inverse @ M[:dim, -1]
         cost = float(M[-1, -1] - M[:dim, -1] @ x)

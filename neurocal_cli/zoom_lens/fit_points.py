@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from neurocal_cli.zoom_lens.result import assemble, provisional
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.static_calibration import common_tables, first_constants
 from neurocal_cli.zoom_lens.target import lens_target, on_target
+from neurocal_cli.zoom_lens.target_coupling import target_coupling
 from neurocal_cli.zoom_lens.training import train_all
 from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting, ZoomLens
 
@@ -116,7 +118,12 @@ def fit_lens(
     else:
         start = calibrate_settings(lens, distortion, options, reject, report)
     start, joints = _train(start, options, reject, report)
-    return replace(assemble(start, joints, options), target=found)
+    if found is None:
+        return assemble(start, joints, options)
+    coupling = None
+    with suppress(np.linalg.LinAlgError):  # a pose that nothing determines
+        coupling = target_coupling(start.data, start.tables, found, start.variance)
+    return replace(assemble(start, joints, options), target=found, target_coupling=coupling)
 
 
 def _train(

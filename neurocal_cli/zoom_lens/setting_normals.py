@@ -157,7 +157,7 @@ class PixelData:
         constants : Constants
             The same, with the best poses where each view has its own.
         """
-        state = self._state(local, constants)
+        state = self.state_of(local, constants)
         if not self.still:
             free = np.zeros(5 + state.k.shape[1], dtype=bool)
             state = adjust(self.views.batches, state, free, True, _POSE_STEPS).state
@@ -177,7 +177,7 @@ class PixelData:
         good = bool(sensible.all() and (local[:, :2] > 0).all() and np.isfinite(summed).all())
         return Normal(summed[:, :L, :L], summed[:, :L, -1], summed[:, -1, -1], good), constants
 
-    def _state(self, local: Array, constants: Constants) -> CameraState:
+    def state_of(self, local: Array, constants: Constants) -> CameraState:
         """Normalised cameras of all views."""
         views, (a, b, u0, v0) = self.views, local[self.setting, :4].T
         sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
@@ -196,7 +196,7 @@ class PixelData:
         t = state.t * self.views.scale[:, None] - (state.R @ self.views.centre[..., None])[..., 0]
         return replace(constants, R=state.R, t=t)
 
-    def _entries_by_parameters(self, local: Array, constants: Constants) -> tuple[Array, Array]:
+    def entries_by_parameters(self, local: Array, constants: Constants) -> tuple[Array, Array]:
         """Derivatives of A's normalised entries by alpha_u, alpha_v, u0, v0 (V, 5, 4) and by theta (V, 5)."""
         a, b = local[self.setting, :2].T
         sine, cosine = np.sin(constants.theta), np.cos(constants.theta)
@@ -209,7 +209,7 @@ class PixelData:
     def _chain(self, N: Array, local: Array, constants: Constants) -> Array:
         """Normal matrices over local and shared parameters and the residual, for a still camera."""
         views, V, K = self.views, len(N), N.shape[1] - 12
-        by_local, by_theta = self._entries_by_parameters(local, constants)
+        by_local, by_theta = self.entries_by_parameters(local, constants)
         C = np.zeros((V, 12 + K, 12 + K))
         scale = views.scale[:, None, None]
         C[:, :5, :4] = by_local
@@ -229,7 +229,7 @@ class PixelData:
         V, K = len(N), N.shape[1] - 12
         keep = np.concatenate([camera_columns(K), [11 + K]])
         U, _ = eliminate(N, keep, np.arange(POSE.start, POSE.stop))
-        by_local, by_theta = self._entries_by_parameters(local, constants)
+        by_local, by_theta = self.entries_by_parameters(local, constants)
         C = np.zeros((V, 6 + K, 6 + K))
         C[:, :5, :4], C[:, 5 : 5 + K, 4 : 4 + K], C[:, :5, 4 + K] = by_local, np.eye(K), by_theta
         C[:, -1, -1] = 1.0

@@ -15,6 +15,7 @@ from neurocal_cli.zoom_lens.joint_training import posterior
 from neurocal_cli.zoom_lens.parameter_networks import LensNets
 from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.settings import describe, scaled_controls
+from neurocal_cli.zoom_lens.target_coupling import with_target_uncertain
 
 __all__ = ["Member", "Prediction", "RejectedSetting", "ZoomLens"]
 
@@ -99,6 +100,8 @@ class ZoomLens:
     warnings : tuple of str
     target : Target or None
         The one that was found from all settings together; the lens rests on it.
+    target_coupling : (S, L + Q, r) array or None
+        What the target's uncertainty does to each setting; see `zoom_lens.target_coupling`.
     """
 
     controls: tuple[str, ...]
@@ -124,6 +127,7 @@ class ZoomLens:
     unit: str = "mm"
     warnings: tuple[str, ...] = ()
     target: Target | None = None
+    target_coupling: Array | None = None
 
     @property
     def low(self) -> Array:
@@ -148,9 +152,21 @@ class ZoomLens:
     def posteriors(self) -> tuple[Array, ...]:
         """Covariance of each member's weights and constants."""
         x = self.scaled(self.settings)
-        return tuple(
+        found = tuple(
             posterior(x, member.nets, self.tables.normal, self.variance, self.scatter)
             for member in self.members
+        )
+        coupling = self.target_coupling
+        if coupling is None:
+            return found
+        return tuple(
+            with_target_uncertain(
+                covariance,
+                np.concatenate(member.nets.local_with_jacobians(x)[1], axis=2),
+                coupling,
+                self.variance,
+            )
+            for covariance, member in zip(found, self.members, strict=True)
         )
 
     def setting_of(

@@ -1,0 +1,108 @@
+"""What the uncertainty of a target that was found does to the lens that was fitted to it.
+
+The offsets d of the target's points are common to all settings. With B_s = J_c^T J_d of a setting's local
+and shared parameters, poses eliminated, the weights w of the networks have the covariance
+
+    N^-1 + N^-1 K S^-1 K^T N^-1,    K = sum_s J_s^T B_s / sigma^2,    S = E^-1 - K^T N^-1 K,
+
+where N is their information with the target as found, and E the covariance of the offsets for a lens that is
+known: of the pixels and of the prior that the target was found with.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.geometry import Array
+from neurocal_cli.target import Target
+from neurocal_cli.target_shape.information import labelled, point_terms
+from neurocal_cli.target_shape.posterior import prior_covariance
+from neurocal_cli.target_shape.prior import prior_of_target
+from neurocal_cli.zoom_lens.setting_normals import PixelData, Tables
+
+__all__ = ["target_coupling", "with_target_uncertain"]
+
+_MOST = 60  # directions of the offsets that are kept
+_NOTHING = 1e-6  # of the strongest direction
+_LEAST = 0.02  # of a direction's information, that cannot be lost
+
+
+def target_coupling(data: PixelData, tables: Tables, target: Target, variance: float) -> Array:
+    """B_s times a root of E, in its strongest directions; (S, L + Q, r).
+
+    Parameters
+    ----------
+    data : PixelData
+        With the points where they were found.
+    tables : Tables
+        With the poses of all views.
+    target : Target
+    variance : float [px^2]
+    """
+    views, K = data.views, len(data.names) - 4
+    world = views.local * views.scale[views.index][:, None] + views.centre[views.index]
+    label = target.rows_of(world)
+    prior = prior_of_target(target)
+    n = len(target.given)
+    state = data.state_of(tables.local, tables.constants)
+    by_local, by_theta = data.entries_by_parameters(tables.local, tables.constants)
+    columns = camera_columns(K)
+    information = np.zeros((3 * n, 3 * n))
+    coupling = np.zeros((data.n_settings, len(data.names) + data.n_shared, 3 * n))
+    for v in range(views.n_views):
+        one = views.subset(np.array([v]))
+        camera = state.of_view(v)
+        own = labelled(one, label[views.first[v] : views.first[v] + views.counts[v]])
+        terms = point_terms(one.batches, camera, one.scale, own, columns, n)
+        N = terms.normal[0]
+        by_pose = terms.pose_point[0].reshape(6, 3 * n)
+        gain = np.linalg.solve(N[POSE, POSE], by_pose)
+        information += _block_diagonal(terms.point) - by_pose.T @ gain
+        entries = (
+            terms.point_camera.reshape(3 * n, -1).T
+            - N[columns[:, None], np.arange(POSE.start, POSE.stop)] @ gain
+        )
+        into = np.zeros((len(data.names) + 1, 5 + K))
+        into[:4, :5], into[4 : 4 + K, 5:], into[4 + K, :5] = by_local[v].T, np.eye(K), by_theta[v]
+        coupling[data.setting[v]] += into @ entries
+    if not data.free_theta:
+        coupling[:, -1] = 0.0
+    px2 = views.pixel_scale**2
+    turn = _block_diagonal(prior.axes)
+    spread = turn @ prior_covariance(prior, target.sizes) @ turn.T
+    root = np.linalg.cholesky(spread)
+    inner = np.eye(3 * n) + root.T @ (px2 / variance * information) @ root
+    root = root @ np.linalg.inv(np.linalg.cholesky(inner)).T
+    flat = px2 * coupling.reshape(-1, 3 * n) @ root
+    U, values, _ = np.linalg.svd(flat, full_matrices=False)
+    kept = (values > _NOTHING * values[0])[:_MOST]
+    return np.asarray((U * values)[:, : int(kept.sum())].reshape(*coupling.shape[:2], -1))
+
+
+def _block_diagonal(blocks: Array) -> Array:
+    """(3 n, 3 n) from (n, 3, 3)."""
+    n = len(blocks)
+    whole = np.zeros((n, 3, n, 3))
+    whole[np.arange(n), :, np.arange(n)] = blocks
+    return whole.reshape(3 * n, 3 * n)
+
+
+def with_target_uncertain(covariance: Array, J: Array, coupling: Array, variance: float) -> Array:
+    """Covariance of weights and constants, with that of the target.
+
+    Parameters
+    ----------
+    covariance : (P + Q, P + Q) array
+        With the target as found.
+    J : (S, L, P) array
+        Derivatives of the local parameters.
+    coupling : (S, L + Q, r) array
+    variance : float [px^2]
+    """
+    L = J.shape[1]
+    K = np.concatenate([np.einsum("slp,slr->pr", J, coupling[:, :L]), coupling[:, L:].sum(axis=0)]) / variance
+    follow = covariance @ K
+    values, vectors = np.linalg.eigh(np.eye(K.shape[1]) - K.T @ follow)
+    follow = follow @ (vectors / np.sqrt(np.maximum(values, _LEAST)))
+    return covariance + follow @ follow.T
