@@ -16,6 +16,7 @@ __all__ = ["Fitted", "fitted_in"]
 
 _NO_SKEW = 1e-3  # a loss below this [px] is nobody's concern
 _NO_LOSS = 5e-3  # nor is this share of the image
+_AS_NEAR = 1.1  # times the loss of the nearest model
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,9 +122,12 @@ def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -
             f"programs of {target.program} ignore skew, so the nearest camera without it is written; "
             f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
         )
-    near = min(
-        (nearest_camera(camera, m, target.skew, points) for m in target.models),
-        key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px),
+    nearest = [nearest_camera(camera, m, target.skew, points) for m in target.models]
+    best = min(nearest, key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px))
+    # More coefficients are not worth having for next to nothing.
+    most = _AS_NEAR * best.over_image.max_px
+    near = next(
+        n for n in nearest if n.over_image.max_px <= most and (n.lost <= _NO_LOSS or best.lost > _NO_LOSS)
     )
     what = (
         f"{target.program} has no distortion model {camera.distortion.model}; the nearest of its models, "
