@@ -187,7 +187,7 @@ FAULTS = {
     "K: {rows: 3, cols: 3, data: [1, 2]}\n": ": K has 3 rows, 3 cols and 2 numbers",
     "K: {rows: 3, cols: 3}\n": ": the key K.data is missing",
     "K: {rows: x, cols: 3, data: [1]}\n": ": K.rows must be a whole number",
-    f"K: {FLAT}\nD: [1, 2]\n": ": distortion has 4, 5 or 8 coefficients",
+    f"K: {FLAT}\nD: [1, 2]\n": ": distortion has 4, 5, 8, 12 or 14 coefficients",
     f"K: {FLAT}\ndistortion_model: odd\nD: [1, 2, 3, 4]\n": ": distortion model 'odd' is unknown",
     f"K: {FLAT}\ndistortion_model: equidistant\nD: [1, 2, 3, 4, 5]\n": ": an equidistant",
     f"K: {FLAT}\nimage_width: wide\nimage_height: 2\n": ": image_width must be a whole number",

@@ -212,7 +212,14 @@ def _verbatim(text: list[str]) -> list[str]:
 
 
 def _terms(rows: tuple[tuple[str, str], ...] | list[tuple[str, str]]) -> list[str]:
-    return [line for term, text in rows for line in (".TP", rf"\fB{_escape(term)}\fR", *_fill(text))]
+    return [
+        line for term, text in rows for line in (".TP", rf"\fB{_breakable(_escape(term))}\fR", *_fill(text))
+    ]
+
+
+def _breakable(term: str) -> str:
+    """Lines may break behind each value of a long list."""
+    return term.replace("|", r"|\:")
 
 
 def _fill(text: str) -> list[str]:

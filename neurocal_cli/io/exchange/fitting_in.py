@@ -16,6 +16,7 @@ __all__ = ["Fitted", "fitted_in"]
 
 _NO_SKEW = 1e-3  # a loss below this [px] is nobody's concern
 _NO_LOSS = 5e-3  # nor is this share of the image
+_AS_NEAR, _NEARER = 1.1, 0.01  # times the loss of the nearest model, and px
 
 _Fitting = tuple[Camera, NearestCamera | None, str]  # None, "": nothing that matters is lost
 
@@ -133,9 +134,12 @@ def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -
                 f"{_pixels(near)}. Calibrate with --no-skew for one that fits the points better"
             ),
         )
-    near = min(
-        (nearest_camera(camera, m, target.skew, points) for m in target.models),
-        key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px),
+    nearest = [nearest_camera(camera, m, target.skew, points) for m in target.models]
+    best = min(nearest, key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px))
+    # More coefficients are not worth having for next to nothing.
+    most = max(_AS_NEAR * best.over_image.max_px, best.over_image.max_px + _NEARER)
+    near = next(
+        n for n in nearest if n.over_image.max_px <= most and (n.lost <= _NO_LOSS or best.lost > _NO_LOSS)
     )
     what = (
         f"{target.program} has no distortion model {camera.distortion.model}; the nearest of its models, "
