@@ -121,7 +121,9 @@ def test_the_covariance_of_triangulated_points_is_that_of_slopes_where_both_can_
     np.testing.assert_allclose(rays.covariance[:-1], slopes.covariance, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("seed", "model"), [(57, "double_sphere"), (4, "omnidir")])
+@pytest.mark.parametrize(
+    ("seed", "model"), [(57, "double_sphere"), pytest.param(4, "omnidir", marks=pytest.mark.slow)]
+)
 def test_many_values_of_xi_are_in_its_std_where_they_explain_the_points_as_well(
     seed: int, model: str
 ) -> None:
