@@ -44,7 +44,7 @@ def by_opencv(seen: Array, cam: Camera, new: Array) -> Array:
             seen[:, None], cam.A, cam.distortion.coefficients, P=new, criteria=criteria
         )
     else:
-        k = np.zeros(8)
+        k = np.zeros(14)
         k[: len(cam.distortion.coefficients)] = cam.distortion.coefficients
         precise = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4, OpenCV 5
         out = precise(seen[:, None], cam.A, k, R=np.eye(3), P=new, criteria=criteria)
@@ -216,7 +216,7 @@ def smooth(dtype: type = np.uint8, channels: int = 0) -> np.ndarray:
 
 
 def full(cam: Camera) -> Array:
-    k = np.zeros(8)
+    k = np.zeros(14)
     k[: len(cam.distortion.coefficients)] = cam.distortion.coefficients
     return k
 
