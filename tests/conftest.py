@@ -9,6 +9,9 @@ from hypothesis import settings
 for variable in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 
+# Programs that tests start would compile the whole package each time.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 # Only now, for it loads NumPy.
 from support.real_data import real_files, zhang  # noqa: E402, F401
 

@@ -95,6 +95,7 @@ def test_known_cameras_are_given_one_by_one(files: tuple[Path, Path], tmp_path: 
     assert both.exit_code == 0, both.stderr
 
 
+@pytest.mark.slow
 def test_both_cameras_are_drawn(files: tuple[Path, Path], tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     result = run("stereo", *files, "--no-skew", "--plot", tmp_path / "rig.png", "-o", tmp_path / "rig.yaml")

@@ -46,6 +46,7 @@ SLOW_PAGES = {"docs/tutorial.md", "docs/concepts/target.md"} | {
         "fisheye",
         "images",
         "next-views",
+        "opencv",
         "other-programs",
         "pipelines",
         "rectify",

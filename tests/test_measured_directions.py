@@ -94,6 +94,7 @@ def test_standard_deviations_of_a_rig_hold(rigs: int) -> None:
     assert 0.7 < rms(both_ways) < 1.5  # 2.0 and more for those of the normal matrix
 
 
+@pytest.mark.slow
 def test_the_level_of_the_noise_is_that_of_the_measurement() -> None:
     levels = [gather_evidence(pinhole(edge_set(seed)[1], skew=False)).contradiction for seed in range(20)]
     assert np.mean(levels) == pytest.approx(1.0, abs=0.05)

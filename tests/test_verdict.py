@@ -59,6 +59,7 @@ def test_halves_of_good_data_agree_as_their_deviations_say() -> None:
     assert np.mean(values) == pytest.approx(1.0, abs=0.4)
 
 
+@pytest.mark.slow
 def test_the_error_on_data_left_out_is_that_on_new_data() -> None:
     """On views of the same camera that it does not know, poses fitted."""
     from neurocal_cli.evaluation import evaluate_camera
