@@ -109,6 +109,7 @@ def test_wrong_usage_is_refused() -> None:
         assert done.stdout == ""
 
 
+@pytest.mark.slow
 def test_simulate_takes_several_sigmas_and_gives_the_same_bytes_again(tmp_path: Path) -> None:
     words = [
         "simulate",

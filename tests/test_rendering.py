@@ -372,6 +372,7 @@ def test_least_squares_with_all_else_known_reaches_the_bound() -> None:
     assert np.abs(np.mean(estimates, axis=0)).max() < 4 * np.sqrt(expected.max() / 300)
 
 
+@pytest.mark.slow
 def test_the_bound_grows_with_noise_and_is_infinite_where_nothing_is_seen() -> None:
     quiet, loud = (scene_bound(replace(SCENE, sensor=Sensor(read_noise=noise)))[0] for noise in (1.0, 4.0))
     np.testing.assert_allclose(loud.edge / quiet.edge, np.sqrt((16 + 1 / 12) / (1 + 1 / 12)), rtol=1e-6)

@@ -188,6 +188,7 @@ def check_bound(scene: RigScene, sigma: float, trials: int, seed: int = 0) -> tu
     return float(np.sqrt(np.mean(np.square(errors)))), float(np.sqrt(np.mean(np.square(stds))))
 
 
+@pytest.mark.slow
 def test_errors_are_at_the_cramer_rao_bound() -> None:
     error, std = check_bound(flat("verging", 6, 11), 0.3, 60)
     # 15 correlated parameters: a few of them independent, 60 trials of each.

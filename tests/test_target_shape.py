@@ -223,6 +223,7 @@ def test_an_outlier_view_is_left_out_and_not_bent() -> None:
     assert len(found.rejected) >= 3
 
 
+@pytest.mark.slow
 def test_a_target_that_was_found_is_a_target_to_begin_with() -> None:
     points, truth = photographed("parabola", 12)
     others, _ = photographed("parabola", 12)

@@ -88,7 +88,9 @@ CHANGES = {
 
 
 @pytest.mark.parametrize("share", slow_but((0.01,), (0.01, 0.02)))
-@pytest.mark.parametrize("change", ["drift", "every other image scaled", "focus that follows"])
+@pytest.mark.parametrize(
+    "change", slow_but(("drift",), ("drift", "every other image scaled", "focus that follows"))
+)
 def test_a_camera_that_changes_is_told_with_the_cause(change: str, share: float) -> None:
     make, words = CHANGES[change]
     assert told(make(share), share, words, range(3)) >= 2

@@ -41,9 +41,8 @@ def test_a_zoom_that_moves_all_the_time_is_told() -> None:
     assert np.ptp(found.scale) == pytest.approx(140 / 600, rel=0.3)
 
 
-@pytest.mark.parametrize(
-    "trials", [pytest.param(range(6), id="6"), pytest.param(range(240), id="240", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("trials", [range(240)])
 def test_no_groups_are_seen_in_views_of_one_camera(trials: range) -> None:
     """All lens models, 5 to 20 views, 0.05 to 1 px of noise."""
     for trial in trials:

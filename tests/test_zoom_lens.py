@@ -86,6 +86,7 @@ def test_the_same_seed_gives_the_same_lens() -> None:
     np.testing.assert_array_equal(one.predict(one.settings).local, two.predict(two.settings).local)
 
 
+@pytest.mark.slow
 def test_a_lens_of_one_control() -> None:
     settings = grid(7, 2)[::2]
     points = seen("c", settings, seed=4)
@@ -127,6 +128,7 @@ def test_no_distortion_is_chosen_where_there_is_none() -> None:
     assert fit_lens(seen("c", grid(5, 3), seed=11), topologies=((0, 2),)).model == "none"
 
 
+@pytest.mark.slow
 def test_a_setting_with_wrong_pixels_is_left_out() -> None:
     points = seen("c", grid(5, 3), seed=12, side=5)
     pixels = points.points.pixels.copy()
