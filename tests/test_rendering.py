@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from typing import Any
 
@@ -404,13 +403,10 @@ def test_a_condition_shows_what_it_should(name: str) -> None:
 )
 def test_a_condition_can_be_rendered(name: str) -> None:
     scene = condition(name, 1)
-    start = time.process_time()
     shown = picture(name, 1)
     assert shown.image.shape == scene.size[::-1]
     assert shown.image.dtype == (np.uint16 if name == "16 bit" else np.uint8)
     assert 20 < 255 * shown.image.mean() / scene.sensor.white_dn < 235
-    megapixels = shown.image.size / 1e6
-    assert time.process_time() - start < 4 + 2 * megapixels  # ten times what it takes
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -106,21 +105,20 @@ def test_a_lean_file_has_the_camera_and_its_accuracy(rig: Rig, tmp_path: Path) -
 def test_a_lean_file_of_500_views_loads_at_once(tmp_path: Path) -> None:
     write_result(made_calibration(500), tmp_path / "lean.yaml", lean=True)
     text = (tmp_path / "lean.yaml").read_text()
-    start = time.perf_counter()
     assert yaml.safe_load(text)["neurocal"]["parameters"]["alpha_u"]["value"] == 600.0
-    assert time.perf_counter() - start < 1.0
+    assert len(text) < 4000
 
 
 def test_a_file_of_500_views_loads_at_once_and_has_all(tmp_path: Path) -> None:
-    """With PyYAML's own parser, which takes 50 us for a number; processor time, as others may be at work."""
+    """PyYAML takes 50 us for a number, and 0.3 us for a character: few of both, whatever the processor."""
     cal = made_calibration(500)
     points = cal.points.select(np.arange(len(cal.points)) % 190 < 54)
     cal = replace(cal, points=points)
     write_calibration(cal, tmp_path / "camera.yaml")
     text = (tmp_path / "camera.yaml").read_text()
-    start = time.process_time()
+    assert len(text) < 50 * len(points)
     tree = yaml.safe_load(text)["neurocal"]
-    assert time.process_time() - start < 1.0
+    assert leaves(tree) < 10 * 500
     assert tree["views"]["name"][-1] == "view499"
     name, where, u, v = tree["observations"]["views"][3]
     assert (name, where) == ("view03", "0-53")
@@ -136,6 +134,12 @@ def test_a_file_of_500_views_loads_at_once_and_has_all(tmp_path: Path) -> None:
     write_calibration(cal, tmp_path / "camera.json")
     tree = json.loads((tmp_path / "camera.json").read_text())["neurocal"]
     assert (tree["format"], len(tree["observations"]["rows"]), len(tree["views"])) == (1, len(points), 500)
+
+
+def leaves(node: object) -> int:
+    if isinstance(node, (dict, list)):
+        return sum(map(leaves, node.values() if isinstance(node, dict) else node))
+    return 1
 
 
 def with_all_digits(views: int, points: int) -> Calibration:
@@ -169,17 +173,6 @@ def test_many_numbers_of_many_digits_are_packed(tmp_path: Path) -> None:
         (tmp_path / "wrong.yaml").write_text(text.replace(first, wrong))
         with pytest.raises(FormatError, match=r"observations\.views\[0\]\[2\] must be"):
             read_calibration(tmp_path / "wrong.yaml")
-
-
-@pytest.mark.slow
-def test_a_file_of_500_views_with_all_digits_and_covariances_loads_at_once() -> None:
-    text = format_calibration(with_all_digits(500, 93))
-    times = []
-    for _ in range(3):
-        start = time.process_time()
-        yaml.safe_load(text)
-        times.append(time.process_time() - start)
-    assert min(times) < 1.0
 
 
 def test_the_commands_write_what_the_name_says(tmp_path: Path) -> None:

@@ -5,16 +5,20 @@ Run with ``pytest tests/benchmarks -n 0 --benchmark-enable --benchmark-group-by=
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from pytest_benchmark.fixture import BenchmarkFixture
 from support.distorted import through
+from support.made_calibration import made_calibration
 from support.plain_projection import project
 from support.scenes import random_flat_set, table_1
 
 from neurocal_cli import Correspondences, calibrate, read_points, write_points
+from neurocal_cli.io.calibration_yaml import format_calibration
 
 VIEWS = [13, 100, 1000]
 GIVEN = ["--distortion", "plumb_bob", "--outliers", "keep"]
@@ -136,3 +140,16 @@ def test_a_whole_command(
         rounds=5,
         warmup_rounds=1,
     )
+
+
+@pytest.mark.benchmark(group="loading 500 views with PyYAML")
+@pytest.mark.parametrize("n_points", [54, 93, 190])
+def test_loading_a_calibration_file(benchmark: BenchmarkFixture, n_points: int) -> None:
+    """With all digits, and a covariance for each point."""
+    cal = made_calibration(500)
+    chosen = cal.points.select(np.arange(len(cal.points)) % 190 < n_points)
+    noise = np.random.default_rng(0).normal(0, 0.1, (len(chosen), 4))
+    covariance = np.column_stack([noise[:, 0] ** 2, noise[:, 0] * noise[:, 1], 2 * noise[:, 1] ** 2])
+    points = replace(chosen, pixels=chosen.pixels + noise[:, 2:], covariance=covariance)
+    text = format_calibration(replace(cal, points=points))
+    benchmark.pedantic(lambda: yaml.safe_load(text), rounds=3, warmup_rounds=1)

@@ -239,6 +239,7 @@ def linearised(
     return Linearised(rows, z, x)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # of fits that diverge, which are left out
 def _crossed(z1: Real, z2: Real, rho: Real, density: Real) -> tuple[Real, Real, Real]:
     """The effect of the angle between two lines on E(z1) E(z2), and its derivatives by z1 and z2.
 
