@@ -305,6 +305,7 @@ def test_debugging_shows_where_an_unexpected_error_arose(
     assert isinstance(result.exception, ZeroDivisionError)
 
 
+@pytest.mark.slow
 def test_the_plot_is_drawn(points: Path, tmp_path: Path) -> None:
     picture = tmp_path / "picture.png"
     assert run("calibrate", points, "--plot", picture).exit_code == 0

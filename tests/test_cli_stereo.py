@@ -78,6 +78,7 @@ def test_the_same_input_gives_the_same_bytes(files: tuple[Path, Path]) -> None:
     assert one == two
 
 
+@pytest.mark.slow
 def test_known_cameras_are_given_one_by_one(files: tuple[Path, Path], tmp_path: Path) -> None:
     write_calibration(calibrate(points()[0], skew=False), tmp_path / "left.yaml")
     result = run(

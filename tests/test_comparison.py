@@ -153,6 +153,7 @@ def test_what_simulate_saves_can_be_calibrated_and_detected(tmp_path: Path) -> N
     assert json.loads(again.stdout)["truth"]["alpha_u"] == pytest.approx(556.0)
 
 
+@pytest.mark.slow
 def test_table_2_on_a_corner_of_three_boards(real_files: RealFiles, tmp_path: Path) -> None:
     """The paper's section 5.2 with photographs: one pair of a target that is not flat."""
     board = tmp_path / "board.yaml"

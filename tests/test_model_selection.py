@@ -82,6 +82,7 @@ def test_a_model_that_lost_its_way_is_fitted_from_a_better_one(seed: int) -> Non
     assert judged("k1k2p1p2", seed)[1]
 
 
+@pytest.mark.slow
 def test_what_a_fisheye_leaves_out_the_others_have_when_a_point_is_set_aside() -> None:
     scene, _ = bent_set("fisheye", 1)
     points = scene.points(SIGMA, np.random.default_rng([1, 1]))

@@ -111,6 +111,7 @@ def test_the_same_point_seen_often_is_no_line() -> None:
     assert len(find_lines(seen_once(np.ones((40, 3))))) == 0
 
 
+@pytest.mark.slow
 def test_of_very_many_lines_some_do() -> None:
     grid = np.stack(np.meshgrid(np.arange(300.0), np.arange(200.0)), -1).reshape(-1, 2)
     lines = find_lines(seen_once(np.column_stack([grid, np.zeros(len(grid))])))
@@ -248,6 +249,7 @@ def test_the_paper_s_own_rule_trains_on_the_corrected_points() -> None:
     assert by_rule.distortion == pytest.approx(by_lm.distortion, abs=1e-6)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 2**32 - 1))
 @settings(max_examples=4, deadline=None)
 def test_the_order_of_the_rows_does_not_matter(seed: int) -> None:

@@ -378,6 +378,7 @@ def test_any_junk_is_read_or_refused_in_one_line(data):
     assert message.isprintable()
 
 
+@pytest.mark.slow
 def test_a_million_columns_do_not_hang(tmp_path: Path) -> None:
     """Comparing each name with all others would take hours."""
     file = tmp_path / "wide.csv"

@@ -63,6 +63,7 @@ def test_a_model_never_ends_above_a_simpler_one(distortion: str, real_files: Rea
     assert more.rmse_px <= simple.rmse_px * (1 + 1e-6)
 
 
+@pytest.mark.slow
 def test_parallel_boards_are_refused_for_what_they_are() -> None:
     """However the distortion is chosen, the pinhole's reason stands."""
     rng = np.random.default_rng(5)

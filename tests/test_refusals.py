@@ -431,6 +431,7 @@ def anything_is_answered_or_refused(seed: int) -> None:
                 assert "\n" not in str(error)  # noqa: PT017
 
 
+@pytest.mark.slow
 def test_any_numbers_are_answered_or_refused() -> None:
     anything_is_answered_or_refused(2)  # others take up to a minute
 

@@ -247,6 +247,7 @@ def test_a_plane_behind_another_is_hidden_where_it_is_covered() -> None:
     assert 0 < (~back.vertices_visible).sum() < back.vertices_visible.size / 2
 
 
+@pytest.mark.slow
 def test_the_nearer_plane_is_seen_whatever_the_order_of_the_targets() -> None:
     scene = condition("two boards", 1)
     turned = replace(scene, targets=scene.targets[::-1])
@@ -326,6 +327,7 @@ def test_light_beyond_full_scale_is_clipped() -> None:
 # The bound
 
 
+@pytest.mark.slow
 def test_the_bound_agrees_with_its_closed_form() -> None:
     scene = condition("tilt 0", 0)
     noise, contrast = np.sqrt(4 + 1 / 12), 196.0

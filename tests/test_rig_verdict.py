@@ -95,6 +95,7 @@ def test_two_calibrations_without_one_rig_are_poor() -> None:
     assert "contradict" in verdict.reasons[0]
 
 
+@pytest.mark.slow
 def test_the_depth_is_as_uncertain_as_it_is_wrong() -> None:
     """The stated std of depth against the error of depth, over rigs of other noise."""
     some, errors, told = scene(6), [], []

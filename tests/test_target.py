@@ -167,6 +167,7 @@ def test_other_methods_take_the_target_as_given() -> None:
     assert rig.left.target is None
 
 
+@pytest.mark.slow
 def test_cameras_that_were_calibrated_apart_are_put_on_one_target() -> None:
     """By the points' given places, whether they have ids or not."""
     left, right = (calibrate(points, distortion="none", skew=False) for points in photographed_pair(4))

@@ -53,6 +53,7 @@ def noisy(scene: Scene, trial: int):
     return scene.points(0.2, np.random.default_rng([trial, 5]))
 
 
+@pytest.mark.slow
 def test_halves_of_good_data_agree_as_their_deviations_say() -> None:
     scene = random_flat_set(np.random.default_rng(4), 8, False)
     values = [gather_evidence(pinhole(noisy(scene, trial), skew=False)).disagreement for trial in range(40)]

@@ -202,6 +202,7 @@ def test_settings_outside_are_refused_unless_asked_for() -> None:
         lens.setting_of({"zoom": np.nan, "focus": 1.0})
 
 
+@pytest.mark.slow
 def test_a_lens_of_a_moving_board() -> None:
     """Boards in five poses at each of six zooms: no t_z, a pose for each view."""
     rng = np.random.default_rng(17)
