@@ -211,7 +211,8 @@ class Board:
         if doubled:
             raise InputError(f"two planes have the name {doubled[0]!r}; rename one")
         for one in self.distances:
-            self.place(one.start), self.place(one.end)
+            for label in (one.start, one.end):
+                self.place(label)
 
     @classmethod
     def single(cls, cols: int, rows: int, square: float, unit: str = "mm") -> Board:

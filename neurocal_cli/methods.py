@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Calibration, Rejected, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
@@ -169,21 +170,8 @@ def calibrate(
             solution, rejected, trainer=trainer, method=method, seed=seed, name=camera_name
         )
         _refuse_misfit(found)
-        bent = ""
-        if choice != "given" and solution.straight_lines is not None:
-            bent = lines_that_are_bent(solution, found.unit)
-        if bent:
-            found = replace(found, warnings=(*found.warnings, bent))
-        elif choice in ("flat", "free") and found.target is None:
-            found = replace(found, warnings=(*found.warnings, _NOT_FOUND))
-        elif found.target is None:
-            why = (
-                "the target is given"
-                if choice == "given"
-                else "the points and views are too many, or too few"
-            )
-            found = replace(found, warnings=(*found.warnings, *_unused(points, why)))
-        return replace(found, judgement=assess)
+        warnings = (*found.warnings, *_about_target(found, solution, choice))
+        return replace(found, warnings=warnings, judgement=assess)
     except DegenerateGeometryError as error:
         text, copies = str(error), repeated_views(points)
         if copies:
@@ -217,6 +205,21 @@ def _distortion_of(method: str, distortion: str) -> str:
     if distortion == "auto":
         return "k1" if method == "tsai" else "none"
     return distortion
+
+
+def _about_target(found: Calibration, solution: Solution, choice: str) -> tuple[str, ...]:
+    """What the user should know of a target that stays as given."""
+    if choice != "given" and solution.straight_lines is not None:
+        bent = lines_that_are_bent(solution, found.unit)
+        if bent:
+            return (bent,)
+    if found.target is not None:
+        return ()
+    if choice in ("flat", "free"):
+        return (_NOT_FOUND,)
+    given = choice == "given"
+    why = "the target is given" if given else "the points and views are too many, or too few"
+    return _unused(found.points, why)
 
 
 def _unused(points: Correspondences, why: str) -> tuple[str, ...]:

@@ -58,6 +58,18 @@ def test_advised_views_are_twice_as_good_as_random_ones_in_a_hundred_sets() -> N
     assert (ratios > 1).all()
 
 
+def test_coefficients_that_were_not_chosen_are_uncertain_as_in_the_verdict() -> None:
+    """A k3 that the points do not tell moves the corners, whichever model was chosen without it."""
+    scene, _ = bent_set("k1k2", 2)
+    points = scene.points(0.3, np.random.default_rng(2))
+    chosen = calibrate(points, skew=False, target="given")
+    assert chosen.distortion_model == "k1k2"
+    named = replace(chosen, lens_choice={})
+    before, after = (uncertainty_with(one, candidates(one)[:200:20]) for one in (chosen, named))
+    assert before[0] > 1.3 * after[0]
+    assert before[1] < before[0]
+
+
 def test_the_uncertainty_is_that_of_many_calibrations() -> None:
     """The worst std, with a motion of the frame taken out, is the scatter of repeated least squares."""
     camera = Camera(Intrinsics(600, 600, 320, 240), Distortion("k1", [-0.2]), (640, 480))

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.distorted import through
 from support.scenes import random_flat_set
 from support.wrong_inputs import flat
 
 from neurocal_cli import Correspondences, Intrinsics, calibrate
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.unprojection import largest_angle
 from neurocal_cli.geometry import rotation_step
 from neurocal_cli.verdict.assessment import gather_evidence
 
@@ -75,3 +79,23 @@ def test_given_poses_are_not_turned(seed: int) -> None:
     in_camera = np.einsum("nij,nj->ni", R[points.view_index], points.world) + t[points.view_index]
     errors = points.pixels - found.camera.project(in_camera)[0]
     assert found.rmse_px == pytest.approx(np.sqrt((errors**2).sum(axis=1).mean()))
+
+
+def test_noise_may_put_a_pixel_outside_what_a_given_lens_sees() -> None:
+    """The image of such a lens ends where its angle is largest; what it saw there is farther out by noise."""
+    lens = Camera(
+        Intrinsics(300.0, 300.0, 500.0, 400.0, np.pi / 2), Distortion("fisheye", [-0.1, -0.02, 0, 0])
+    )
+    end = largest_angle(lens.distortion)
+    rng = np.random.default_rng(3)
+    angle = np.repeat([*np.linspace(0.1, 0.9 * end, 8), 0.999 * end], 6)
+    way = np.arange(len(angle)) * np.pi / 3
+    rays = np.column_stack([np.sin(angle) * np.cos(way), np.sin(angle) * np.sin(way), np.cos(angle)])
+    world = rays * rng.uniform(500, 900, (len(angle), 1))
+    pixels = lens.project(world)[0]
+    outwards = pixels[-6:] - [500, 400]
+    pixels[-6:] += 0.3 * outwards / np.linalg.norm(outwards, axis=1, keepdims=True)
+    assert np.isnan(lens.unproject(pixels[-6:])).all()
+    found = calibrate(Correspondences(world, pixels), type=3, intrinsics=lens, outliers="keep")
+    (view,) = found.views.values()
+    assert np.degrees(np.linalg.norm(Rotation.from_matrix(view.pose.R).as_rotvec())) < 0.1

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import inverse_or_nan, solve_or_nan
@@ -34,6 +35,7 @@ __all__ = [
     "OpenPrior",
     "corner_radius",
     "open_coefficients",
+    "open_of_calibration",
     "radius",
     "spread_of_open",
     "wide_covariance",
@@ -96,7 +98,10 @@ class OpenCoefficients:
 
 def radius(views: Views, state: CameraState) -> float:
     """Undistorted radius of the farthest point, normalised; that of 89 degrees at most."""
-    seen = (state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]
+    return _farthest((state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index])
+
+
+def _farthest(seen: Array) -> float:
     return float(np.tan(np.arctan2(np.hypot(seen[:, 0], seen[:, 1]), seen[:, 2]).clip(max=_STEEPEST).max()))
 
 
@@ -163,6 +168,29 @@ def open_coefficients(
     everything = np.array(wanted)
     kept = np.array([value.get(name, 0.0) for name in names])
     return OpenCoefficients(richer, kept, everything, OpenPrior(is_open[everything], size, tuple(groups)))
+
+
+def open_of_calibration(
+    calibration: Calibration, free: NDArray[np.bool_], k: Array | None = None
+) -> OpenCoefficients | None:
+    """Coefficients that the model of a calibrated camera was chosen without; None where there are none.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        With its points and poses.
+    free : (5 + K,) bool array
+        What was estimated of A's entries and the coefficients.
+    k : (K,) array, optional
+        The coefficients of the same model, where they are no longer those of the calibration.
+    """
+    points, camera = calibration.points, calibration.camera
+    poses = [calibration.views[name].pose for name in points.view_names]
+    R, t = (np.stack(parts)[points.view_index] for parts in zip(*((p.R, p.t) for p in poses), strict=True))
+    reach = _farthest((R @ points.world[..., None])[..., 0] + t)
+    corner = corner_radius(np.array(camera.entries), np.zeros(2), 1.0, points.image_size)
+    k = camera.distortion.coefficients if k is None else k
+    return open_coefficients(camera.distortion.model, k, free, tuple(calibration.lens_choice), reach, corner)
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")

@@ -20,31 +20,27 @@ def check_distortion(solution: Solution) -> Solution:
     """Put a given distortion back, and check that the distortion is monotonic.
 
     One that is not, where no point is seen, is fitted so that it is, unless the points deny it. One that is
-    given stays, if the points are seen where it is monotonic.
+    given stays.
 
     Raises
     ------
     DegenerateGeometryError
-        A distortion that is not monotonic inside the points, or inside the image whatever one does.
+        An estimated distortion that is not monotonic inside the points, or inside the image whatever one
+        does.
     """
     problem = solution.problem
     distortion = problem.distortion
     if distortion.model == "none":
         return solution
     if not problem.free_distortion:
+        # It may fold the image's corners: `problem_for` took these points off it.
         problem, start = problem.as_seen(solution.state)
         adjusted = problem.adjust(replace(solution.adjusted, state=start))
-        solution = replace(solution, problem=problem, adjusted=adjusted)
+        return replace(solution, problem=problem, adjusted=adjusted)
     state = solution.state
     where = where_not_monotonic(state.distortion, problem.matrix(state.entries[0]), problem.points)
-    # A camera that is given may fold the image's corners; these points are seen beside them.
-    if where is None or (where == "image" and not problem.free_distortion):
+    if where is None:
         return solution
-    if not problem.free_distortion:
-        raise DegenerateGeometryError(
-            f"the given distortion ({distortion.model}) is not monotonic (maps two directions to one pixel) "
-            "inside the points; check that the camera belongs to these images"
-        )
     if where == "image" and solution.shared is None:
         found = fit_monotonic(problem, solution.adjusted)
         if found is not None:

@@ -94,7 +94,8 @@ def _distances(root: Field, board: Board) -> tuple[Distance, ...]:
         start, end = (field[key].text() for key in ("from", "to"))
         try:
             found.append(Distance(start, end, field["length"].number(), field["std"].number()))
-            board.place(start), board.place(end)
+            for label in (start, end):
+                board.place(label)
         except InputError as error:
             raise FormatError(f"{field.path}: {error}", field.source) from error
     return tuple(found)

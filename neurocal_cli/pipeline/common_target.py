@@ -1,4 +1,4 @@
-"""The target that both cameras of a rig saw, found with both of them."""
+"""The target that several cameras saw, of a rig or of a zoom lens's settings, found with all of them."""
 
 from __future__ import annotations
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bundle_adjustment.open_coefficients import open_of_calibration
 from neurocal_cli.calibration import Calibration
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import InputError
@@ -92,61 +94,97 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
     InputError
         No points, no image size, no free parameter, or no view that the camera could see whole.
     """
-    known, places, free, sigma = _state(calibration)
-    camera, world = calibration.camera, _target(calibration)
+    known, world = _Known.of(calibration), _target(calibration)
     options = candidates(calibration)
     if not options:
         raise InputError(
             "the camera can see the target whole in no view; check the image size and the target"
         )
-    told = [view_information(camera, free, option.pose, world) for option in options]
-    before = worst_std(known, places, sigma)
+    told = [view_information(known.camera, known.free, option.pose, world) for option in options]
+    before, more = known.worst(), np.zeros_like(known.information)
     chosen, after = [], []
     for _ in range(count):
-        values = [worst_std(known + view, places, sigma) for view in told]
+        values = [known.worst(more + view) for view in told]
         best = int(np.argmin(values))
-        known = known + told[best]
+        more = more + told[best]
         chosen.append(options[best])
         after.append(values[best])
-    assert camera.image_size is not None
-    return Advice(tuple(chosen), before, tuple(after), camera.image_size)
+    assert known.camera.image_size is not None
+    return Advice(tuple(chosen), before, tuple(after), known.camera.image_size)
 
 
 def uncertainty_with(calibration: Calibration, views: Sequence[Candidate]) -> tuple[float, float]:
     """Worst standard deviation of a projected pixel now, and with some more views [px]; see `advise`."""
-    known, places, free, sigma = _state(calibration)
-    camera, world = calibration.camera, _target(calibration)
-    before = worst_std(known, places, sigma)
-    for view in views:
-        known = known + view_information(camera, free, view.pose, world)
-    return before, worst_std(known, places, sigma)
+    known, world = _Known.of(calibration), _target(calibration)
+    told = [view_information(known.camera, known.free, view.pose, world) for view in views]
+    return known.worst(), known.worst(np.sum(told, axis=0))
 
 
-def _state(calibration: Calibration) -> tuple[Array, Array, NDArray[np.bool_], float]:
-    """What the views tell that were taken, where it is judged, what is free, and the noise [px]."""
-    points, camera = calibration.points, calibration.camera
-    if not len(points) or not calibration.views:
-        raise InputError("the calibration holds no points; give a file that was not written with --lean")
-    if camera.image_size is None:
-        raise InputError("the size of the images is unknown; calibrate with --image-size W H")
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is known of a camera, by the views that were taken.
+
+    Attributes
+    ----------
+    camera : Camera
+        With the coefficients, here 0, that its model was chosen without.
+    free : (5 + K,) bool array
+    information : (f, f) array
+        Normal matrix of what is free, and what is known of those coefficients beforehand.
+    places : (g, 2, f) array
+        See `pixel_changes`: where the camera is judged.
+    sigma : float [px]
+        Of the points.
+    """
+
+    camera: Camera
+    free: NDArray[np.bool_]
+    information: Array
+    places: Array
+    sigma: float
+
+    def worst(self, more: Array | float = 0.0) -> float:
+        """Largest standard deviation of a projected pixel [px], with what further views tell."""
+        return worst_std(self.information + more, self.places, self.sigma)
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> _Known:
+        points, camera = calibration.points, calibration.camera
+        size = camera.image_size
+        if not len(points) or not calibration.views:
+            raise InputError("the calibration holds no points; give a file that was not written with --lean")
+        if size is None:
+            raise InputError("the size of the images is unknown; calibrate with --image-size W H")
+        free = _free(calibration)
+        rms = calibration.rmse_px if np.isfinite(calibration.rmse_px) else 0.0
+        sigma = max(rms / np.sqrt(2.0), _LEAST_SIGMA)
+        beforehand = np.zeros(int(free.sum()))
+        if (opened := open_of_calibration(calibration, free)) is not None:
+            camera, free = replace(camera, distortion=Distortion(opened.model, opened.k)), opened.free
+            beforehand = np.zeros(int(free.sum()))
+            beforehand[opened.prior.is_open] = (sigma / opened.prior.size) ** 2
+        information, depths = np.diag(beforehand), []
+        for k, name in enumerate(points.view_names):
+            pose, own = calibration.views[name].pose, points.world[points.view_index == k]
+            information += view_information(camera, free, pose, own)
+            seen = pose.to_camera(own)
+            depth = np.linalg.norm(seen, axis=1) if camera.distortion.wide else seen[:, 2]
+            depths.append(float(np.median(depth)))
+        places = pixel_changes(camera, free, image_grid(size), _FROM_TO * np.median(depths))
+        return cls(camera, free, information, places, sigma)
+
+
+def _free(calibration: Calibration) -> NDArray[np.bool_]:
+    """(5 + K,) which of A's entries and of the coefficients were estimated."""
     names = (*_ORDER, *coefficient_names(calibration.distortion_model))
     free = np.array([name not in calibration.fixed and name not in NODES for name in names])
-    if not camera.intrinsics.skewed:
+    if not calibration.camera.intrinsics.skewed:
         free[1] = False
     if not free.any():
         raise InputError(
             "all parameters of the camera are given; there is nothing to be learnt from more views"
         )
-    known, depths = np.zeros((int(free.sum()), int(free.sum()))), []
-    for k, name in enumerate(points.view_names):
-        pose, own = calibration.views[name].pose, points.world[points.view_index == k]
-        known += view_information(camera, free, pose, own)
-        seen = pose.to_camera(own)
-        depth = np.linalg.norm(seen, axis=1) if camera.distortion.wide else seen[:, 2]
-        depths.append(float(np.median(depth)))
-    places = pixel_changes(camera, free, image_grid(camera.image_size), _FROM_TO * np.median(depths))
-    rms = calibration.rmse_px if np.isfinite(calibration.rmse_px) else 0.0
-    return known, places, free, max(rms / np.sqrt(2.0), _LEAST_SIGMA)
+    return free
 
 
 def _target(calibration: Calibration) -> Array:

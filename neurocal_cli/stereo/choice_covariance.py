@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.open_coefficients import (
     OpenCoefficients,
     OpenPrior,
-    corner_radius,
-    open_coefficients,
+    open_of_calibration,
     spread_of_open,
 )
 from neurocal_cli.calibration import Calibration
@@ -81,20 +80,7 @@ def _opened(
     """Of one camera; None too where the common bundle adjustment left it as it was."""
     if not free.any():
         return None
-    camera, reach = adjusted.state.cameras[side], _radius(calibration)
-    corner = corner_radius(
-        np.array(calibration.camera.entries), np.zeros(2), 1.0, calibration.points.image_size
-    )
-    return open_coefficients(camera.model, camera.k, free, tuple(calibration.lens_choice), reach, corner)
-
-
-def _radius(calibration: Calibration) -> float:
-    """Radius of the farthest point in normalised image coordinates, before distortion."""
-    points = calibration.points
-    poses = [calibration.views[name].pose for name in points.view_names]
-    R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-    X, Y, Z = ((R[points.view_index] @ points.world[..., None])[..., 0] + t[points.view_index]).T
-    return float((np.hypot(X, Y) / Z).max())
+    return open_of_calibration(calibration, free, adjusted.state.cameras[side].k)
 
 
 def _joined(is_open: NDArray[np.bool_], opened: list[OpenCoefficients | None]) -> OpenPrior:

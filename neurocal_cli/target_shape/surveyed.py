@@ -35,7 +35,8 @@ __all__ = ["find_surveyed", "noise_variance"]
 _STEPS = 10
 _SETTLED = 0.02  # of the standard deviations of cameras and points
 _MOST_DENSE = 3000  # unknowns
-_GRID, _GOLDEN_STEPS = 13, 14
+_GRID = 13
+_NEAR = 1e-3  # of a logarithm
 _LEAST_NOISE, _LARGEST_NOISE = 1e-3, 2.0  # of the residuals' level with the points as given
 _LEAST_RATIO = 1e-3  # of the noise, by points that are no worse than the pixels
 _CONTRADICTED = 5.0  # of the logarithm of the likelihood: one survey of 600 that is right
@@ -151,16 +152,14 @@ def _spare(info: Information) -> float:
 
 
 def _lowest(function: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """Where a function of one variable is lowest, and its value: the best of a grid, then golden section."""
+    """Where a function of one variable is lowest, and its value: near the lowest of a grid."""
+    from scipy.optimize import minimize_scalar
+
     grid = np.linspace(low, high, _GRID)
     k = int(np.argmin([function(x) for x in grid]))
-    a, b = grid[max(k - 1, 0)], grid[min(k + 1, _GRID - 1)]
-    share = 0.5 * (np.sqrt(5.0) - 1.0)
-    for _ in range(_GOLDEN_STEPS):
-        left, right = b - share * (b - a), a + share * (b - a)
-        a, b = (a, right) if function(left) < function(right) else (left, b)
-    x = float(0.5 * (a + b))
-    return x, function(x)
+    near = (grid[max(k - 1, 0)], grid[min(k + 1, _GRID - 1)])
+    lowest = minimize_scalar(function, bounds=near, method="bounded", options={"xatol": _NEAR})
+    return float(lowest.x), float(lowest.fun)
 
 
 def _stated(all_points: Sequence[Correspondences], n: int, label: NDArray[np.intp]) -> Array:
