@@ -14,6 +14,7 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.unprojection import largest_angle
+from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import rotation_step
 from neurocal_cli.verdict.assessment import gather_evidence
 
@@ -99,3 +100,14 @@ def test_noise_may_put_a_pixel_outside_what_a_given_lens_sees() -> None:
     found = calibrate(Correspondences(world, pixels), type=3, intrinsics=lens, outliers="keep")
     (view,) = found.views.values()
     assert np.degrees(np.linalg.norm(Rotation.from_matrix(view.pose.R).as_rotvec())) < 0.1
+
+
+def test_points_all_around_a_given_camera_are_named() -> None:
+    lens = Camera(Intrinsics(200.0, 200.0, 500.0, 400.0, np.pi / 2), Distortion("fisheye", [0.0, 0, 0, 0]))
+    angle = np.radians([*np.linspace(0, 60, 20), 120.0, 140.0])
+    rays = np.column_stack([np.sin(angle), np.zeros_like(angle), np.cos(angle)])
+    world = rays * np.linspace(500, 900, len(angle))[:, None]
+    world[:, 1] = np.linspace(0, 99, len(angle))
+    points = Correspondences(world, lens.project(world)[0])
+    with pytest.raises(InputError, match=r"row 22: .*more than 90 degrees from the middle"):
+        calibrate(points, type=3, intrinsics=lens, outliers="keep")

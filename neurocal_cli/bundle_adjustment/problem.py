@@ -267,17 +267,24 @@ def _undistorted_views(
         return arrange(points), None
     camera = Camera(Intrinsics.from_matrix(intrinsic_matrix(entries)), distortion)
     seen = _seen_nearby(camera, points.pixels)
-    if distortion.wide:
-        pixels, turned = _turned_pixels(points, camera.unproject(seen), camera)
-    else:
-        pixels, turned = undistorted_pixels(distortion, camera.A, seen), None
-    lost = ~np.isfinite(pixels[:, 0])
+    rays = camera.unproject(seen)
+    lost = ~np.isfinite(rays[:, 0])
     if lost.any():
         row = int(np.argmax(lost))
         u, v = points.pixels[row]
         raise InputError(
             f"{points.place(row)}: the given distortion maps nothing to the pixel ({u:g}, {v:g}); "
             "check that the camera belongs to these images"
+        )
+    if not distortion.wide:
+        return arrange(replace(points, pixels=undistorted_pixels(distortion, camera.A, seen))), None
+    pixels, turned = _turned_pixels(points, rays, camera)
+    behind = ~np.isfinite(pixels[:, 0])
+    if behind.any():
+        row = int(np.argmax(behind))
+        raise InputError(
+            f"{points.place(row)}: this point is seen more than 90 degrees from the middle of the points in "
+            "its view; leave such points out"
         )
     return arrange(replace(points, pixels=pixels)), turned
 
