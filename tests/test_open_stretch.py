@@ -130,3 +130,20 @@ def test_sides_are_along_the_worlds_axes_where_the_plane_is() -> None:
         expected[axes, axes] = 1.0, -1.0
         assert along == pytest.approx(expected, abs=1e-12)
         assert np.abs(leaning)[axes[0], axes[1]] == pytest.approx(1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_views", [5, 8, 15, 40])
+def test_clean_sets_are_as_certain_as_before(n_views: int) -> None:
+    more, z = [], []
+    for seed in range(1000, 1100):
+        points, truth = photographed("flat", seed, n_views, sigma=0.3)
+        found, by_name = calibrate(points), calibrate(points, target="given")
+        if found.target is None:
+            names = ("alpha_u", "alpha_v", "u0", "v0")
+            std = np.array([found.std[name] for name in names])
+            more.append(std / [by_name.std[name] for name in names])
+            z.append((found.K[[0, 1, 0, 1], [0, 1, 2, 2]] - truth.K[[0, 1, 0, 1], [0, 1, 2, 2]]) / std)
+    assert len(more) > 95
+    assert np.median(more, axis=0).max() < 1.02
+    assert 0.8 < np.sqrt(np.square(z).mean()) < 1.1
