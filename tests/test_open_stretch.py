@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.campaign import scene
 from support.rigs import random_rig
+from support.scenes import random_rotation
 from support.targets import photographed
 
 from neurocal_cli import calibrate
@@ -120,16 +121,15 @@ def test_what_is_negligible_or_no_print_leaves_standard_deviations_as_they_are()
     assert spread_of_stretch(S, np.array([0.0, 1e12 * 0.03, 0.0]), 1.0) is None
 
 
-def test_sides_are_along_the_worlds_axes_where_the_plane_is() -> None:
-    square = np.stack(np.meshgrid(np.arange(5.0), np.arange(5.0)), -1).reshape(-1, 2)
-    for axes in ([0, 1], [0, 2], [1, 2]):
-        world = np.zeros((25, 3))
-        world[:, axes] = square
-        along, leaning = stretches(world)
-        expected = np.zeros((3, 3))
-        expected[axes, axes] = 1.0, -1.0
-        assert along == pytest.approx(expected, abs=1e-12)
-        assert np.abs(leaning)[axes[0], axes[1]] == pytest.approx(1.0)
+@pytest.mark.parametrize("rows", [2, 3, 4, 5, 7])
+def test_stretches_are_along_the_sides_of_any_board_however_the_world_lies(rows: int) -> None:
+    x, y = np.meshgrid(np.arange(7.0), np.arange(float(rows)))
+    board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    turn = random_rotation(np.random.default_rng(rows))
+    along, leaning = turn.T @ stretches(board @ turn.T + [100.0, -200.0, 300.0]) @ turn
+    sign = np.sign(along[0, 0]), np.sign(leaning[0, 1])
+    assert sign[0] * along == pytest.approx(np.diag([1.0, -1.0, 0.0]), abs=1e-12)
+    assert sign[1] * leaning == pytest.approx(np.array([[0, 1, 0], [1, 0, 0], [0, 0, 0]]), abs=1e-12)
 
 
 @pytest.mark.slow

@@ -64,7 +64,7 @@ def test_the_share_of_clean_sets_is_one_in_twenty(n_views: int) -> None:
 def test_the_std_of_clean_views_is_the_normal_matrix_s() -> None:
     scene, _ = bent_set("k1k2", 12)
     points = scene.points(0.2, np.random.default_rng(3))
-    found = calibrate(points, distortion="k1k2", outliers="keep", skew=False)
+    found = calibrate(points, distortion="k1k2", outliers="keep", skew=False, target="given")
     views = arrange(points)
     A = scene.intrinsics
     ratio = found.std["alpha_u"] / noise_std(views, found)

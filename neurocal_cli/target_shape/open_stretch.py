@@ -37,11 +37,11 @@ __all__ = [
     "stretches",
 ]
 
-# Std of a stretch, half of the difference of two sides over their length: prints are off by a few thousandths.
-# Of the boards in tests/test_target.py that photographs tell, one is by 0.13 % and one by 1.5 to 2 %.
+# Std of a stretch, half of the relative difference of two sides: prints are off by a few thousandths. Of two
+# boards in photographs (tests/test_target.py), one is by 0.13 % and one by 1.5 to 2 %.
 _SIZE = 1.5e-3
-# That there is one, each. Larger ones make clean data less certain: so the std of few views grow by less than
-# 1 % in the median. Repeated by tests/test_open_stretch.py (slow) and tests/test_campaign.py (slow).
+# That there is one, each. Larger odds make clean data less certain; with these, the std of few views grow by
+# less than 1 % in the median. Repeated by tests/test_open_stretch.py and tests/test_campaign.py (slow).
 _ODDS = 0.2
 _NEGLIGIBLE = 1e-3  # a probability that leaves standard deviations as they are, to the last bit
 _NO_PRINT = 5.0  # standard deviations of prints and pixels together: the points ask for something else
@@ -112,15 +112,17 @@ def open_stretch(
 
 
 def stretches(world: Array) -> Array:
-    """(2, 3, 3) stretches of a plane along its sides: x longer and y shorter, and both leaning.
+    """(2, 3, 3) stretches of a plane along its sides: one longer and one shorter, and both leaning.
 
-    The sides are along the axes of the world, as far as the plane is.
+    With z = x + i y around the centre, 5 mean(z^2)^2 - mean(z^4) is positive for any rectangle whose sides are
+    along x and y, and turns by four times the angle of the sides.
     """
-    normal = np.linalg.svd(world - world.mean(axis=0), full_matrices=False)[2][2]
-    x = np.eye(3)[np.argmin(np.abs(normal).round(6))]
-    x = x - (x @ normal) * normal
-    x /= np.linalg.norm(x)
-    y = np.cross(normal, x)
+    centred = world - world.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    z = centred @ (axes[0] + 1j * axes[1])
+    angle = 0.25 * np.angle(5.0 * np.mean(z**2) ** 2 - np.mean(z**4))
+    x = np.cos(angle) * axes[0] + np.sin(angle) * axes[1]
+    y = np.cos(angle) * axes[1] - np.sin(angle) * axes[0]
     return np.stack([np.outer(x, x) - np.outer(y, y), np.outer(x, y) + np.outer(y, x)])
 
 
