@@ -112,9 +112,9 @@ def open_stretch(
 
 
 def stretches(world: Array) -> Array:
-    """(2, 3, 3) stretches of a plane along its sides: one longer and one shorter, and both leaning.
+    """(2, 3, 3) stretches of a plane along its sides: one longer, the other shorter; and both leaning.
 
-    With z = x + i y around the centre, 5 mean(z^2)^2 - mean(z^4) is positive for any rectangle whose sides are
+    With z = x + i y around the centre, 5 mean(z^2)^2 - mean(z^4) is positive for rectangles whose sides are
     along x and y, and turns by four times the angle of the sides.
     """
     centred = world - world.mean(axis=0)
