@@ -142,30 +142,32 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
         return CameraCovariance(basis, plain, plain)
     found = counting_views(plain, basis.normal, *asked, basis.n_equations, seen.repeated, basis.moves_without)
     known = CameraCovariance(basis, plain, found)
-    if not np.isfinite(found.entries).all():
+    kept = seen.target_kept and seen.free_poses and bool(seen.free.any())
+    if not np.isfinite(found.entries).all() or not (seen.choice or kept):
         return known
-    return _stretched(seen, _chosen(seen, known))
+    variance = _variance(seen, basis)
+    if not variance > 0:
+        return known
+    known = _chosen(seen, known, variance) if seen.choice else known
+    return _stretched(seen, known, variance) if kept else known
 
 
-def _chosen(seen: CameraSeen, known: CameraCovariance) -> CameraCovariance:
+def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """With what the choice of the model leaves open."""
-    if not seen.choice:
-        return known
     views, state = seen.views, seen.state
     reach = radius(views, state)
     corner = corner_radius(state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size)
     richer = open_coefficients(state.model, state.k, seen.free, seen.choice, reach, corner)
-    return known if richer is None else _opened(seen, known, richer)
+    return known if richer is None else _opened(seen, known, richer, variance)
 
 
-def _opened(seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients) -> CameraCovariance:
+def _opened(
+    seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients, variance: float
+) -> CameraCovariance:
     state = richer.state(seen.state)
     normal, _ = normal_blocks(seen.views.batches, state)
     normal = _basis(seen, state, richer.free, normal).normal
     q = reduced(normal, richer.free, seen.free_poses)
-    variance = _variance(seen, known.basis)
-    if not variance > 0:
-        return known
     is_open = richer.prior.is_open
     E, follow = spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
     entries = wide_covariance(known.found.entries, E, follow, is_open)
@@ -180,13 +182,8 @@ def _opened(seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients)
     return replace(known, found=found, wide=WideCovariance(richer, normal, entries))
 
 
-def _stretched(seen: CameraSeen, known: CameraCovariance) -> CameraCovariance:
+def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """With what the choice of the target leaves open."""
-    if not (seen.target_kept and seen.free.any() and seen.free_poses):
-        return known
-    variance = _variance(seen, known.basis)
-    if not variance > 0:
-        return known
     added = open_stretch(seen.views, seen.state, seen.free, seen.points.world, variance)
     if added is None:
         return known

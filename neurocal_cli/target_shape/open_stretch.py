@@ -119,8 +119,8 @@ def stretches(world: Array) -> Array:
     """
     centred = world - world.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
-    z = centred @ (axes[0] + 1j * axes[1])
-    angle = 0.25 * np.angle(5.0 * np.mean(z**2) ** 2 - np.mean(z**4))
+    z2 = (centred @ (axes[0] + 1j * axes[1])) ** 2
+    angle = 0.25 * np.angle(5.0 * z2.mean() ** 2 - (z2 * z2).mean())
     x = np.cos(angle) * axes[0] + np.sin(angle) * axes[1]
     y = np.cos(angle) * axes[1] - np.sin(angle) * axes[0]
     return np.stack([np.outer(x, x) - np.outer(y, y), np.outer(x, y) + np.outer(y, x)])
