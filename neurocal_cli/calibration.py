@@ -187,6 +187,9 @@ class Calibration:
     rejected : Rejected
     target : Target or None
         The target as it was found; None where it was taken as given.
+    target_stretched : float
+        Where the target was chosen as given: the probability that its print is stretched by a few thousandths
+        all the same, which standard deviations count. 0 where it is below 0.001.
     judgement : Verdict or callable, optional
         The verdict as a file has it, or what reaches it from this calibration; see `verdict`.
     lens_choice : dict of float by lens model [px]
@@ -222,6 +225,7 @@ class Calibration:
     rejected: Rejected = field(default_factory=Rejected)
     target: Target | None = None
     lens_choice: Mapping[str, float] = field(default_factory=dict)
+    target_stretched: float = 0.0
     judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None
 
     @cached_property

@@ -56,7 +56,7 @@ def test_nonlinear_ends_at_the_minimum_that_the_network_finds(seed: int, type: i
     rng = np.random.default_rng(seed)
     scene = random_flat_set(rng, 4, True) if flat else table_1()
     points = scene.points(0.3, rng)
-    ours = pinhole(points, **scene.given(type))
+    ours = pinhole(points, target="given", **scene.given(type))
     theirs = calibrate(points, method="nonlinear", **scene.given(type))
     assert theirs.rmse_px == pytest.approx(ours.rmse_px, rel=1e-9)
     assert theirs.intrinsics.values() == pytest.approx(ours.intrinsics.values(), rel=1e-4)

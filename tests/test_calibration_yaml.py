@@ -165,6 +165,7 @@ def calibrations(draw):
         max_px=0.3,
         rejected=draw(rejections(points)),
         lens_choice=draw(st.just({}) | st.just({"none": 1.25, "k1": float("nan")})),
+        target_stretched=draw(st.sampled_from([0.0, 0.1 + 0.2])),
         distortion_model=model,
         distortion=np.array([draw(st.floats(0.1, 1)) for _ in range(size)]),
         covariance=np.array([[1e-5, -0.0], [float("nan"), 0.1]]),

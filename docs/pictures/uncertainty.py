@@ -8,7 +8,7 @@ from style import BLUE, ORANGE, SAMPLES, ellipse, figure, save
 from neurocal_cli import Correspondences, calibrate, read_points
 
 REPEATS, SIGMA = 250, 0.1
-OPTIONS = {"distortion": "none", "skew": False, "outliers": "keep"}
+OPTIONS = {"distortion": "none", "skew": False, "outliers": "keep", "target": "given"}
 
 
 def main() -> None:

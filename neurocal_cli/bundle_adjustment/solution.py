@@ -90,6 +90,8 @@ class Solution:
         Why this is no answer, if so.
     target : Target, optional
         The target, where it was found with the camera; the problem's points are where it has them.
+    target_kept : bool
+        Whether the target was chosen as given, where it could have been found.
     ambiguity : Ambiguity, optional
         Other cameras that explain the points as well.
     """
@@ -104,6 +106,7 @@ class Solution:
     straight_lines: StraightLines | None = None
     refusal: str = ""
     target: Target | None = None
+    target_kept: bool = False
     ambiguity: Ambiguity | None = None
 
     @property

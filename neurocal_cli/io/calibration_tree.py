@@ -87,6 +87,7 @@ def calibration_from_field(root: Field) -> Calibration:
         target=read_target(block.get("target")),
         judgement=read_verdict(block.get("verdict")),
         lens_choice=_lens_choice(block.get("lens_choice")),
+        target_stretched=block["target_stretched"].number() if "target_stretched" in block else 0.0,
     )
 
 

@@ -145,6 +145,8 @@ def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
     yield f"distortion: {text(cal.distortion_model)}"
     if cal.lens_choice:  # rms error on data left out [px]
         yield f"lens_choice: {mapping(**{name: number(error) for name, error in cal.lens_choice.items()})}"
+    if cal.target_stretched:  # probability
+        yield f"target_stretched: {number(cal.target_stretched)}"
     if cal.points.image_center is not None:
         yield f"image_center: {flow(np.array(cal.points.image_center))}"
 

@@ -18,7 +18,7 @@ from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 from neurocal_cli.target_shape.surveyed import find_surveyed
 
-__all__ = ["common_target", "on_one_target"]
+__all__ = ["can_tell", "common_target", "on_one_target"]
 
 
 def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
@@ -39,16 +39,9 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
         camera.target is not None and camera.target.stated is not None for camera in cameras
     ):
         return _surveyed(cameras)
-    fixed = any(camera.straight_lines is not None or camera.method != "neuro" for camera in cameras)
-    if choice == "given" or fixed:
+    if not can_tell(cameras, choice):
         return None
-    if choice == "auto" and any(camera.type != 1 for camera in cameras):
-        return None  # what is given may be wrong, and a target would take the blame
     known = cameras[0].target
-    given, label, point = distinct_points([camera.points for camera in cameras])
-    plane = planes_of(given, point) if known is None else known.plane
-    if not enough_views(label, sum(len(camera.views) for camera in cameras), int(plane.max()) + 1):
-        return None
     try:
         fits = [_fit(camera) for camera in cameras]
     except NeurocalError:
@@ -58,6 +51,19 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
         fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf
     )
     return None if found is None else found.target
+
+
+def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:
+    """Whether the views of several cameras may tell of their target; see `common_target`."""
+    fixed = any(camera.straight_lines is not None or camera.method != "neuro" for camera in cameras)
+    if choice == "given" or fixed:
+        return False
+    if choice == "auto" and any(camera.type != 1 for camera in cameras):
+        return False  # what is given may be wrong, and a target would take the blame
+    known = cameras[0].target
+    given, label, point = distinct_points([camera.points for camera in cameras])
+    plane = planes_of(given, point) if known is None else known.plane
+    return enough_views(label, sum(len(camera.views) for camera in cameras), int(plane.max()) + 1)
 
 
 def _surveyed(cameras: Sequence[Calibration]) -> Target | None:

@@ -50,7 +50,7 @@ def calibration_of(
         CameraSeen(
             views, state, adjusted.normal, problem.free_camera, problem.free_poses, repeated,
             problem.points, solution.target, tuple(solution.model_errors or ()), solution.shared,
-            solution.by_prior,
+            solution.by_prior, solution.target_kept,
         )
     )  # fmt: skip
     refuse_undetermined(problem, state, known.plain)
@@ -94,6 +94,7 @@ def calibration_of(
         camera_name=name,
         rejected=rejected,
         target=solution.target,
+        target_stretched=known.stretched,
         lens_choice=solution.model_errors or {},
         warnings=(
             *parameter_warnings(intrinsics, state.distortion, std, chosen or solution.ambiguity is not None),

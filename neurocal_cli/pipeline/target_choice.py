@@ -61,8 +61,12 @@ def with_target(
     rich = solution.state.model == "rich"  # it bends as a target does
     if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected
+    if not _can_tell(solution, choice, None):
+        return solution, rejected
     found = _found(solution, choice, None)
-    if found is None or (choice == "auto" and _other_reason(solution, found)):
+    if found is None:
+        return replace(solution, target_kept=choice == "auto"), rejected
+    if choice == "auto" and _other_reason(solution, found):
         return solution, rejected
     best: tuple[Solution, Rejected] = solution, rejected
     for _ in range(_ROUNDS):
@@ -72,7 +76,8 @@ def with_target(
         if again is None:
             break
         lens = new.distortion.model
-        found = _found(again[0], choice, found.target)
+        known = found.target
+        found = _found(again[0], choice, known) if _can_tell(again[0], choice, known) else None
         if found is None:
             break
         (new, adjusted), *_ = found.fits
@@ -124,19 +129,23 @@ def _other_reason(solution: Solution, found: Found) -> bool:
     return bool(problem.free.any()) and groups is not None
 
 
-def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
+def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
+    """Whether there are enough different views of the target."""
     problem, views = solution.problem, solution.problem.views
     given, label, point = distinct_points([problem.points])
     repeated = repeated_poses(views, solution.state, point_residuals(views, solution.state))
     plane = planes_of(given, point) if known is None else known.plane
     if not enough_views(label, repeated.n_poses, int(plane.max()) + 1):
-        return None
-    if choice == "auto" and repeated.worth < _WORTH:
-        return None  # errors that copies of a view share look like the target's
+        return False
+    # Errors that copies of a view share look like the target's.
+    return choice != "auto" or not repeated.worth < _WORTH
+
+
+def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
     # Only a lens that nobody named may change.
     find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
     least = LEAST_GAIN if choice == "auto" else -np.inf
-    return find([(problem, solution.adjusted)], choice == "flat", known, least)
+    return find([(solution.problem, solution.adjusted)], choice == "flat", known, least)
 
 
 def _fitted_to(

@@ -10,7 +10,7 @@ from typing import Any
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import UsageError
 from neurocal_cli.methods import calibrate
-from neurocal_cli.pipeline.common_target import common_target
+from neurocal_cli.pipeline.common_target import can_tell, common_target
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.fit_rig import fit_rig
 from neurocal_cli.stereo.pairing import pair_points, pair_views
@@ -74,9 +74,10 @@ def calibrate_stereo(
         )
     # Errors of pairing are reported before the training.
     pair_points(left, right, pair_views(left.view_names, right.view_names))
-    cameras = _on_one_target(left, right, sides, progress)
+    cameras, kept = _on_one_target(left, right, sides, progress)
     best = all(camera.method in _OF_LEAST_SQUARES for camera in cameras)
-    rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, outliers=options.get("outliers", "reject"))
+    outliers = options.get("outliers", "reject")
+    rig = fit_rig(cameras[0], cameras[1], refine_cameras=best, outliers=outliers, target_kept=kept)
     warnings = [
         f"{name}: {text}"
         for name, camera in zip(_SIDES, (rig.left, rig.right), strict=True)
@@ -90,8 +91,11 @@ def _on_one_target(
     right: Correspondences,
     sides: Sequence[Mapping[str, Any]],
     progress: Progress | None,
-) -> list[Calibration]:
-    """Both cameras, and the target found with both of them where the points ask for it."""
+) -> tuple[list[Calibration], bool]:
+    """Both cameras on the target that was found with both of them where the points ask for it.
+
+    And whether it was kept as given, where it could have been found.
+    """
     choice = sides[0].get("target", "auto")
 
     def camera(side: int, target: str | Target, preferred: str = "") -> Calibration:
@@ -119,7 +123,8 @@ def _on_one_target(
         cameras = calibrated(target)
         if [camera.distortion_model for camera in cameras] == before:
             break
-    return cameras
+    kept = choice == "auto" and not surveyed and cameras[0].target is None and can_tell(cameras, choice)
+    return cameras, kept
 
 
 def _others_model(cameras: Sequence[Calibration]) -> list[int]:

@@ -23,6 +23,7 @@ from neurocal_cli.stereo.reprojection import Columns
 from neurocal_cli.stereo.result import assemble_rig, non_monotonic_sides
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import sound_pairs
+from neurocal_cli.stereo.stretch_covariance import stretched_rig
 from neurocal_cli.stereo.target_covariance import with_target_uncertainty
 
 __all__ = ["fit_rig", "poses_on_rig"]
@@ -34,7 +35,12 @@ _BASELINE_SIGMAS = 3.0  # a baseline below so many standard deviations is none
 
 
 def fit_rig(
-    left: Calibration, right: Calibration, *, refine_cameras: bool = False, outliers: str = "reject"
+    left: Calibration,
+    right: Calibration,
+    *,
+    refine_cameras: bool = False,
+    outliers: str = "reject",
+    target_kept: bool = False,
 ) -> Rig:
     """Find the pose of the right camera relative to the left one from the views of both.
 
@@ -46,6 +52,8 @@ def fit_rig(
         estimated. Otherwise it refines the rig and the poses alone.
     outliers : {"reject", "keep"}
         Whether pairs of views that contradict most others are left out of the rig with a warning, or raise.
+    target_kept : bool
+        Whether the target was chosen as given, where both cameras could have found it.
 
     Returns
     -------
@@ -80,7 +88,13 @@ def fit_rig(
     if left.target is not None and left.target is right.target:
         uncertain = with_target_uncertainty(left.target, problem, adjusted, free)
         least = uncertain if least is None or uncertain is None else not_smaller(least, uncertain)
-    rig = assemble_rig(problem, (left, right), adjusted, free, sound.left_out, least)
+    stretched = None
+    if target_kept or left.target_stretched or right.target_stretched:
+        stretched = stretched_rig(problem, (left, right), adjusted, free)
+    if target_kept and stretched is not None:
+        left, right = (replace(camera, target_stretched=stretched.probability) for camera in (left, right))
+    added = None if stretched is None else stretched.added
+    rig = assemble_rig(problem, (left, right), adjusted, free, sound.left_out, least, added)
     _refuse_one_place(rig)
     if sound.left_out:
         warnings.insert(0, sound.contradiction(len(views.both)))

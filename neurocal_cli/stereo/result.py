@@ -46,6 +46,7 @@ def assemble_rig(
     free: NDArray[np.bool_],
     left_out: Mapping[tuple[str, str], str],
     least: Array | None = None,
+    stretched: Array | None = None,
 ) -> Rig:
     """Convert an adjusted rig to the user's units.
 
@@ -56,13 +57,15 @@ def assemble_rig(
     left_out : dict of str by (left name, right name)
     least : (f, f) array, optional
         Covariance of the free shared parameters, normalised, below which the result's must not be.
+    stretched : (f, f) array, optional
+        What is added to it because the print may be stretched.
 
     Raises
     ------
     DegenerateGeometryError
         The points do not determine the parameters.
     """
-    return _RigAssembly(problem, calibrations, adjusted, free, least).rig(left_out)
+    return _RigAssembly(problem, calibrations, adjusted, free, least, stretched).rig(left_out)
 
 
 def non_monotonic_sides(
@@ -93,6 +96,7 @@ class _RigAssembly:
         adjusted: AdjustedRig,
         free: NDArray[np.bool_],
         least: Array | None,
+        stretched: Array | None,
     ) -> None:
         self.problem, self.calibrations, self.adjusted = problem, calibrations, adjusted
         self.columns = Columns.of(adjusted.state)
@@ -117,8 +121,9 @@ class _RigAssembly:
         if least is not None:
             self.covariance = _widened(self.covariance, not_smaller(self.covariance.shared, least))
         added = open_covariance(problem, calibrations, adjusted, free, variance)
-        if added is not None:
-            self.covariance = _widened(self.covariance, self.covariance.shared + added)
+        for more in (added, stretched):
+            if more is not None:
+                self.covariance = _widened(self.covariance, self.covariance.shared + more)
 
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
         state, frames = self.adjusted.state, self.problem.frames

@@ -1,8 +1,8 @@
 """Covariance of a calibrated camera and its poses: one place for all that reports or uses one.
 
 From the normal matrices, with the target's uncertainty where it was found (`uncertainty`), as far as views
-are independent (`view_covariance`), and with what the choice of the distortion model leaves open
-(`open_coefficients`).
+are independent (`view_covariance`), and with what the choices of the distortion model and of the target leave
+open (`open_coefficients`, `open_stretch`).
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
+from neurocal_cli.target_shape.open_stretch import open_stretch
 from neurocal_cli.target_shape.uncertainty import CovarianceBasis, covariance_basis
 
 __all__ = ["CameraCovariance", "CameraSeen", "WideCovariance", "camera_covariance"]
@@ -61,6 +62,8 @@ class CameraSeen:
         Covariance of what is free, where it comes from elsewhere.
     by_prior : float
         How many of the coefficients a prior determines, not the points.
+    target_kept : bool
+        Whether the target was chosen as given, where it could have been found.
     """
 
     views: Views
@@ -74,6 +77,7 @@ class CameraSeen:
     choice: Collection[str] = ()
     shared: Array | None = None
     by_prior: float = 0.0
+    target_kept: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,15 +111,18 @@ class CameraCovariance:
     plain : Covariance
         Of the normal matrices.
     found : Covariance
-        As far as views are independent, and with what the choice of the model leaves open.
+        As far as views are independent, and with what the choices of model and target leave open.
     wide : WideCovariance or None
-        Where the choice leaves anything open.
+        Where the choice of the model leaves anything open.
+    stretched : float
+        Probability that the print is stretched, where the target was kept as given; 0 where it is negligible.
     """
 
     basis: CovarianceBasis
     plain: Covariance
     found: Covariance
     wide: WideCovariance | None = None
+    stretched: float = 0.0
 
 
 def camera_covariance(seen: CameraSeen) -> CameraCovariance:
@@ -135,23 +142,32 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
         return CameraCovariance(basis, plain, plain)
     found = counting_views(plain, basis.normal, *asked, basis.n_equations, seen.repeated, basis.moves_without)
     known = CameraCovariance(basis, plain, found)
-    if not seen.choice or not np.isfinite(found.entries).all():
+    kept = seen.target_kept and seen.free_poses and bool(seen.free.any())
+    if not np.isfinite(found.entries).all() or not (seen.choice or kept):
         return known
+    variance = _variance(seen, basis)
+    if not variance > 0:
+        return known
+    known = _chosen(seen, known, variance) if seen.choice else known
+    return _stretched(seen, known, variance) if kept else known
+
+
+def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
+    """With what the choice of the model leaves open."""
     views, state = seen.views, seen.state
     reach = radius(views, state)
     corner = corner_radius(state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size)
     richer = open_coefficients(state.model, state.k, seen.free, seen.choice, reach, corner)
-    return known if richer is None else _opened(seen, known, richer)
+    return known if richer is None else _opened(seen, known, richer, variance)
 
 
-def _opened(seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients) -> CameraCovariance:
+def _opened(
+    seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients, variance: float
+) -> CameraCovariance:
     state = richer.state(seen.state)
     normal, _ = normal_blocks(seen.views.batches, state)
     normal = _basis(seen, state, richer.free, normal).normal
     q = reduced(normal, richer.free, seen.free_poses)
-    variance = _variance(seen, known.basis)
-    if not variance > 0:
-        return known
     is_open = richer.prior.is_open
     E, follow = spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
     entries = wide_covariance(known.found.entries, E, follow, is_open)
@@ -164,6 +180,20 @@ def _opened(seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients)
         poses = poses + gain @ E @ np.swapaxes(gain, 1, 2)
     found = replace(known.found, entries=entries[np.ix_(~is_open, ~is_open)], poses=poses)
     return replace(known, found=found, wide=WideCovariance(richer, normal, entries))
+
+
+def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
+    """With what the choice of the target leaves open."""
+    added = open_stretch(seen.views, seen.state, seen.free, seen.points.world, variance)
+    if added is None:
+        return known
+    entries, poses = known.found.entries + added.entries, known.found.poses + added.poses
+    found, wide = replace(known.found, entries=entries, poses=poses), known.wide
+    if wide is not None:
+        everything = wide.entries.copy()
+        everything[np.ix_(~wide.open.prior.is_open, ~wide.open.prior.is_open)] += added.entries
+        wide = replace(wide, entries=everything)
+    return replace(known, found=found, wide=wide, stretched=added.probability)
 
 
 def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:

@@ -160,6 +160,7 @@ class _AtMinimum:
             CameraSeen(
                 self.views, self.state, self.normal, self.free, self.free_poses, self.repeated,
                 self.points, calibration.target, tuple(calibration.lens_choice),
+                target_kept=calibration.target_stretched > 0,
             )
         )  # fmt: skip
         self.normal = known.basis.normal

@@ -1,0 +1,184 @@
+"""What a camera is uncertain by because its target was kept as given, though the print may be stretched.
+
+Noise can hide that a print is stretched, and a stretched print moves the focal length. So where the choice
+kept the target, two stretches are open unknowns o: one side longer than stated, and sides that are not at
+right angles. Each is absent, or Gaussian with the size that prints have. To second order around the minimum,
+all four models follow from one normal matrix. With w_m the posterior probability of model m, P_m and o_m its
+posterior covariance and mean of o, and T = dc/do how the parameters c follow,
+
+    cov(c) + T E T^T,    E = sum_m w_m (P_m + o_m o_m^T),
+
+which is the covariance that model averaging has (Hoeting et al. 1999), around the parameters for the given
+target, because those are reported. `bundle_adjustment.open_coefficients` does the same for the lens.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.point_batches import PointBatches
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
+from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.leave_out import inverse_or_nan, solve_or_nan
+from neurocal_cli.least_squares.normal_equations import solve_scaled
+from neurocal_cli.target import is_flat
+
+__all__ = [
+    "SpreadOfStretch",
+    "StretchedCovariance",
+    "open_stretch",
+    "spread_of_stretch",
+    "stretched_blocks",
+    "stretches",
+]
+
+# Std of a stretch, half of the relative difference of two sides: prints are off by a few thousandths. Of two
+# boards in photographs (tests/test_target.py), one is by 0.13 % and one by 1.5 to 2 %.
+_SIZE = 1.5e-3
+# That there is one, each. Larger odds make clean data less certain; with these, the std of few views grow by
+# less than 1 % in the median. Repeated by tests/test_open_stretch.py and tests/test_campaign.py (slow).
+_ODDS = 0.2
+_NEGLIGIBLE = 1e-3  # a probability that leaves standard deviations as they are, to the last bit
+_NO_PRINT = 5.0  # standard deviations of prints and pixels together: the points ask for something else
+
+
+@dataclass(frozen=True, eq=False)
+class SpreadOfStretch:
+    """What points leave open of a stretch.
+
+    Attributes
+    ----------
+    probability : float
+        That the print is stretched.
+    E : (2, 2) array
+        Mean of o o^T.
+    follow : (f + 2, 2) array
+        [T; 1]: how all that is free follows.
+    """
+
+    probability: float
+    E: Array
+    follow: Array
+
+
+@dataclass(frozen=True, eq=False)
+class StretchedCovariance:
+    """What an open stretch adds to the covariance of a camera.
+
+    Attributes
+    ----------
+    probability : float
+    entries : (f, f) array
+        For what is free of A's entries and the distortion coefficients.
+    poses : (V, 6, 6) array
+    """
+
+    probability: float
+    entries: Array
+    poses: Array
+
+
+def open_stretch(
+    views: Views, state: CameraState, free: NDArray[np.bool_], world: Array, variance: float
+) -> StretchedCovariance | None:
+    """What the stretch of a target adds; None where that is negligible, or the target is not flat.
+
+    Parameters
+    ----------
+    views, state, free
+        Of a camera at its minimum with free poses, for the target as given.
+    world : (N, 3) array
+        Points of the target.
+    variance : float
+        Of the residuals, larger where they are correlated.
+    """
+    if not is_flat(world):
+        return None
+    normal = stretched_blocks(views.batches, state, stretches(world))
+    both = np.append(free, [True, True])
+    q = reduced(normal, both, True)
+    found = spread_of_stretch(q.S.sum(axis=0), q.g.sum(axis=0), variance)
+    if found is None:
+        return None
+    columns = camera_columns(len(both) - 5)[np.flatnonzero(both)]
+    gain = solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, columns, POSE], 1, 2)) @ found.follow
+    T = found.follow[:-2]
+    return StretchedCovariance(found.probability, T @ found.E @ T.T, gain @ found.E @ np.swapaxes(gain, 1, 2))
+
+
+def stretches(world: Array) -> Array:
+    """(2, 3, 3) stretches of a plane along its sides: one longer, the other shorter; and both leaning.
+
+    With z = x + i y around the centre, 5 mean(z^2)^2 - mean(z^4) is positive for rectangles whose sides are
+    along x and y, and turns by four times the angle of the sides.
+    """
+    centred = world - world.mean(axis=0)
+    axes = np.linalg.svd(centred, full_matrices=False)[2]
+    z2 = (centred @ (axes[0] + 1j * axes[1])) ** 2
+    angle = 0.25 * np.angle(5.0 * z2.mean() ** 2 - (z2 * z2).mean())
+    x = np.cos(angle) * axes[0] + np.sin(angle) * axes[1]
+    y = np.cos(angle) * axes[1] - np.sin(angle) * axes[0]
+    return np.stack([np.outer(x, x) - np.outer(y, y), np.outer(x, y) + np.outer(y, x)])
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfStretch | None:
+    """What points tell of two stretches; None where that is negligible, or more than prints are stretched.
+
+    Parameters
+    ----------
+    S : (f + 2, f + 2) array
+        Normal matrix of all that is free and the stretches, poses eliminated.
+    g : (f + 2,) array
+        Right side, J^T r.
+    variance : float
+        Of the residuals.
+    """
+    T = -solve_scaled(S[:-2, :-2], S[:-2, -2:])
+    left = (S[-2:, -2:] + S[-2:, :-2] @ T) / variance
+    right = (g[-2:] + T.T @ g[:-2]) / variance
+    there = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
+    size = _SIZE * there
+    Q = np.eye(2) + size[:, :, None] * left * size[:, None, :]
+    mean = solve_or_nan(Q, size * right)
+    logarithm = 0.5 * (size * right * mean).sum(axis=1) - 0.5 * np.linalg.slogdet(Q)[1]
+    logarithm += there.sum(axis=1) * np.log(_ODDS)
+    weight = np.exp(logarithm - logarithm.max())
+    weight /= weight.sum()
+    moment = size[:, :, None] * (inverse_or_nan(Q) + mean[:, :, None] * mean[:, None, :]) * size[:, None, :]
+    E = (weight[:, None, None] * moment).sum(axis=0)
+    probability = float(weight[1:].sum())
+    beyond = float(right @ solve_or_nan(left + _SIZE**2 * left @ left, right))
+    if not probability > _NEGLIGIBLE or beyond > _NO_PRINT**2:
+        return None
+    return SpreadOfStretch(probability, E, np.concatenate([T, np.eye(2)]))
+
+
+def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Array:
+    """(V, 14 + K, 14 + K) normal matrices with columns of two stretches between coefficients and residual.
+
+    Parameters
+    ----------
+    batches, state
+        As for `reprojection.normal_blocks`.
+    by : (2, 3, 3) array
+        From `stretches`.
+    """
+    width, n = 12 + len(state.k), batches.local.shape[2]
+    by_batch = np.empty((len(batches.view), width + 2, width + 2))
+    buffer = batches.memory(width)
+    for chunk in batches.chunks():
+        view = batches.view[chunk]
+        part = buffer[: len(view)]
+        derivatives(batches, chunk, state, part)
+        by_tau = part[:, POSE.start + 3 : POSE.stop].reshape(len(view), 3, -1)
+        by_local = (np.swapaxes(state.R[view], 1, 2) @ by_tau).reshape(-1, 3, 2, n)
+        by_stretch = np.einsum("tipn,tsin->tspn", by_local, by @ batches.local[chunk][:, None])
+        J = np.concatenate([part[:, :-1], by_stretch, part[:, -1:]], axis=1).reshape(len(view), width + 2, -1)
+        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
+    return batches.sum_by_view(by_batch)

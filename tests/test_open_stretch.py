@@ -1,0 +1,149 @@
+"""Standard deviations on a target that was kept as given count that its print may be stretched."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.campaign import scene
+from support.rigs import random_rig
+from support.scenes import random_rotation
+from support.targets import photographed
+
+from neurocal_cli import calibrate
+from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.options import options_for
+from neurocal_cli.pipeline.fit import fit
+from neurocal_cli.stereo import stretch_covariance
+from neurocal_cli.stereo.adjust import adjust_rig
+from neurocal_cli.stereo.pairing import pair_views
+from neurocal_cli.stereo.problem import rig_problem
+from neurocal_cli.stereo.stretch_covariance import stretched_rig
+from neurocal_cli.target_shape import open_stretch as open_stretch_module
+from neurocal_cli.target_shape.open_stretch import SpreadOfStretch, open_stretch, spread_of_stretch, stretches
+
+EPS = 1e-6
+
+
+def test_a_stretch_that_noise_hides_is_in_the_standard_deviations() -> None:
+    points, truth = scene(8307)
+    chosen, by_name = calibrate(points), calibrate(points, target="given")
+    assert chosen.target is None
+    assert (chosen.K == by_name.K).all()
+    assert by_name.target_stretched == 0
+    assert 0.1 < chosen.target_stretched < 0.3
+    off = abs(chosen.K[0, 0] - truth.A[0, 0])
+    assert off > 5 * by_name.std["alpha_u"]
+    assert off < 5 * chosen.std["alpha_u"]
+    assert all(chosen.std[name] >= by_name.std[name] for name in chosen.std)
+    pairs = [(chosen.views[name].std, by_name.views[name].std) for name in chosen.views]
+    assert all(more[name] >= less[name] for more, less in pairs for name in more)
+    assert chosen.verdict is not None
+    assert by_name.verdict is not None
+    assert chosen.verdict.measures["projection_px"] > by_name.verdict.measures["projection_px"]
+
+
+def only(which: int, monkeypatch: pytest.MonkeyPatch, module: object) -> None:
+    """One of the stretches is there, with a std of 1; how all that is free follows is as it was found."""
+
+    def known(S: Array, g: Array, variance: float) -> SpreadOfStretch:
+        found = spread_of_stretch(S, g, 1e12)
+        assert found is not None
+        return SpreadOfStretch(1.0, np.diag(np.eye(2)[which]), found.follow)
+
+    monkeypatch.setattr(module, "spread_of_stretch", known)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+def test_the_camera_follows_a_stretch_as_a_fit_anew_does(which: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    points, _ = photographed("flat", 3, 5, sigma=1e-4)
+    problem = problem_for(points, 1, distortion=Distortion("k1k2"))
+    solution = fit(problem, options_for("lm", 20, 0))
+    views, free = solution.problem.views, solution.problem.free_camera
+    state = adjust(views.batches, solution.state, free, True, 20).state
+    only(which, monkeypatch, open_stretch_module)
+    found = open_stretch(views, state, free, points.world, 1.0)
+    assert found is not None
+    stretched = replace(views, local=views.local @ (np.eye(3) + EPS * stretches(points.world)[which]))
+    new = adjust(stretched.batches, state, free, True, 20).state
+    moved = np.concatenate([(new.entries - state.entries)[0], new.k - state.k])[free] / EPS
+    assert np.sqrt(np.diagonal(found.entries)) == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
+    tau = (new.t - state.t) / EPS
+    std = np.sqrt(np.diagonal(found.poses[:, 3:, 3:], axis1=1, axis2=2))
+    assert std == pytest.approx(np.abs(tau), rel=5e-3, abs=1e-3)
+
+
+def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    scene = random_rig(rng, "verging", 4)
+    left, right = (calibrate(scene.points(side, 1e-4, rng), skew=False, target="given") for side in (0, 1))
+    problem = rig_problem(left, right, pair_views(left.points.view_names, right.points.view_names))
+    free = np.concatenate([stretch_covariance.estimated_parameters(c) for c in (left, right)] + [[True] * 6])
+    adjusted = adjust_rig(problem.frames, problem.observations, problem.start(scene.rig), free)
+    only(0, monkeypatch, stretch_covariance)
+    found = stretched_rig(problem, (left, right), adjusted, free)
+    assert found is not None
+    stretch = np.eye(3) + EPS * stretches(left.points.world)[0]
+    observations = [
+        replace(seen, batches=replace(seen.batches, local=stretch @ seen.batches.local))
+        for seen in problem.observations
+    ]
+    new = adjust_rig(problem.frames, (observations[0], observations[1]), adjusted.state, free).state
+    moved = (new.t - adjusted.state.t) / EPS
+    assert np.sqrt(np.diagonal(found.added))[-3:] == pytest.approx(np.abs(moved), rel=5e-3, abs=1e-3)
+
+
+def test_the_spread_is_that_of_all_four_models() -> None:
+    """By quadrature, for a stretch that camera and pixels tell apart from the other."""
+    odds, size = open_stretch_module._ODDS, open_stretch_module._SIZE
+    variance, told, off = 0.25, np.array([1.2e-3, 0.8e-3]), np.array([2e-3, -0.3e-3])
+    S = np.diag([1.0, *(variance / told**2)])
+    found = spread_of_stretch(S, np.append(0.0, off * variance / told**2), variance)
+    assert found is not None
+    o = np.linspace(-0.02, 0.02, 20001)
+    absent = 1.0
+    for n in (0, 1):
+        likelihood = np.exp(-0.5 * ((o - off[n]) ** 2 - off[n] ** 2) / told[n] ** 2)
+        slab = odds * likelihood * np.exp(-0.5 * (o / size) ** 2) / np.sqrt(2 * np.pi) / size * (o[1] - o[0])
+        total = 1.0 + slab.sum()
+        assert found.E[n, n] == pytest.approx((o**2 * slab).sum() / total, rel=1e-6)
+        absent /= total
+    assert found.probability == pytest.approx(1.0 - absent, rel=1e-6)
+
+
+def test_what_is_negligible_or_no_print_leaves_standard_deviations_as_they_are() -> None:
+    S = np.diag([1.0, 1e12, 1e12])
+    assert spread_of_stretch(S, np.zeros(3), 1.0) is None
+    assert spread_of_stretch(S, np.array([0.0, 1e12 * 0.03, 0.0]), 1.0) is None
+
+
+@pytest.mark.parametrize("rows", [2, 3, 4, 5, 7])
+def test_stretches_are_along_the_sides_of_any_board_however_the_world_lies(rows: int) -> None:
+    x, y = np.meshgrid(np.arange(7.0), np.arange(float(rows)))
+    board = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
+    turn = random_rotation(np.random.default_rng(rows))
+    along, leaning = turn.T @ stretches(board @ turn.T + [100.0, -200.0, 300.0]) @ turn
+    sign = np.sign(along[0, 0]), np.sign(leaning[0, 1])
+    assert sign[0] * along == pytest.approx(np.diag([1.0, -1.0, 0.0]), abs=1e-12)
+    assert sign[1] * leaning == pytest.approx(np.array([[0, 1, 0], [1, 0, 0], [0, 0, 0]]), abs=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n_views", [5, 8, 15, 40])
+def test_clean_sets_are_as_certain_as_before(n_views: int) -> None:
+    more, z = [], []
+    for seed in range(1000, 1100):
+        points, truth = photographed("flat", seed, n_views, sigma=0.3)
+        found, by_name = calibrate(points), calibrate(points, target="given")
+        if found.target is None:
+            names = ("alpha_u", "alpha_v", "u0", "v0")
+            std = np.array([found.std[name] for name in names])
+            more.append(std / [by_name.std[name] for name in names])
+            z.append((found.K[[0, 1, 0, 1], [0, 1, 2, 2]] - truth.K[[0, 1, 0, 1], [0, 1, 2, 2]]) / std)
+    assert len(more) > 95
+    assert np.median(more, axis=0).max() < 1.02
+    assert 0.8 < np.sqrt(np.square(z).mean()) < 1.1
