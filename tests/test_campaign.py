@@ -65,6 +65,12 @@ def test_of_clean_midpoints_few_are_blamed() -> None:
 
 
 @pytest.mark.slow
+def test_of_stretched_prints_hardly_any_is_good_and_wrong() -> None:
+    seeds = [seed for seed in range(8000, 13000) if CONDITIONS[seed % len(CONDITIONS)] == "stretched"]
+    assert sum(judge(seed)[1] == "good" for seed in seeds) <= len(seeds) / 200
+
+
+@pytest.mark.slow
 def test_a_thousand_scenes() -> None:
     seeds = range(7000, 8000)
     wrong = Counter(judge(seed) for seed in seeds)

@@ -64,14 +64,16 @@ def with_target(
     if not _can_tell(solution, choice, None):
         return solution, rejected
     found = _found(solution, choice, None)
-    if found is None:
-        return replace(solution, target_kept=choice == "auto"), rejected
-    if choice == "auto" and _other_reason(solution, found):
+    if found is not None and choice == "auto" and _other_reason(solution, found):
         return solution, rejected
-    best: tuple[Solution, Rejected] = solution, rejected
+    kept = replace(solution, target_kept=choice == "auto")
+    best: tuple[Solution, Rejected] = kept, rejected
     for _ in range(_ROUNDS):
+        if found is None:
+            break
         (new, adjusted), *_ = found.fits
-        start = replace(solution, problem=new, adjusted=adjusted)
+        # A view that only contradicted the given target is back, with a record of its own.
+        start = replace(solution, problem=new, adjusted=adjusted, record=best[0].record)
         again = _fitted_to(problem, found.target, (start, best[1]), options)
         if again is None:
             break
