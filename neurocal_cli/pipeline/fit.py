@@ -100,7 +100,7 @@ def _finished(solution: Solution, options: Options, only_from_here: bool = False
     """With its distortion model, and weights that the residuals bear out."""
     chosen = options.distortion == "auto"
     if chosen and only_from_here:
-        solution = select_model(solution, preferred=options.preferred)
+        solution = select_model(solution, tuple, options.preferred, options.would_take)
     elif chosen:
         solution = _with_selected_model(solution, options)
     solution = reweighted(solution)
@@ -113,11 +113,12 @@ def _with_selected_model(solution: Solution, options: Options) -> Solution:
     def more_starts() -> Iterator[CameraState]:
         return _distorted_starts(solution.problem, options)
 
-    found = select_model(solution, more_starts, options.preferred)
+    found = select_model(solution, more_starts, options.preferred, options.would_take)
     turned = _turned(found)
     if turned is found:
         return found
-    return select_model(replace(solution, adjusted=turned.adjusted), more_starts, options.preferred)
+    again = replace(solution, adjusted=turned.adjusted)
+    return select_model(again, more_starts, options.preferred, options.would_take)
 
 
 def _first_solution(problem: Problem, options: Options) -> Solution:
