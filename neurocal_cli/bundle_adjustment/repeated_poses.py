@@ -17,7 +17,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.projection import project_points
-from neurocal_cli.geometry import Array
+from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.least_squares.leave_out import folds_of
 
 __all__ = ["RepeatedPoses", "repeated_poses"]
@@ -144,8 +144,8 @@ def _correlation(views: Views, errors: Array, group: NDArray[np.intp]) -> float:
     world = views.local[rows] * views.scale[view, None] + views.centre[view]
     place = np.round(world / (1e-6 * views.scale[0]))
     key = np.column_stack([group[view], place])
-    _, same, n = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    same = same.reshape(-1)
+    _, same = distinct_rows(key)
+    n = np.bincount(same)
     errors = errors[rows]
     together = np.stack([np.bincount(same, errors[:, k], len(n)) for k in (0, 1)], axis=1)
     power = np.bincount(same, (errors**2).sum(axis=1), len(n))

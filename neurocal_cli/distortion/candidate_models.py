@@ -274,7 +274,8 @@ def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
     Of many views, some that lie evenly among them tell.
     """
     best = min(fitted, key=lambda c: c.cost)
-    some = np.unique(np.linspace(0, views.n_views - 1, _VIEWS_THAT_TELL).round().astype(np.intp))
+    n = views.n_views
+    some = np.linspace(0, n - 1, min(n, _VIEWS_THAT_TELL)).round().astype(np.intp)
     state = best.adjusted.state
     own = free_networks(views.subset(some), replace(state, R=state.R[some], t=state.t[some]), _STEPS)
     return float(best.adjusted.normal[some, -1, -1].sum()) > _SHORT**2 * float(own.sum()) + 1e-20

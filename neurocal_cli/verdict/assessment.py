@@ -126,10 +126,11 @@ def _views_behind(calibration: Calibration) -> int:
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
         world, index = points.world, points.view_index
         seen = calibration.camera.sees((R[index] @ world[..., None])[..., 0] + t[index])
-        return len(np.unique(index[~seen]))
+        return int(np.count_nonzero(np.bincount(index[~seen])))
     axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
     depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
-    return len(np.unique(points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]))
+    behind = points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]
+    return int(np.count_nonzero(np.bincount(behind)))
 
 
 class _AtMinimum:
