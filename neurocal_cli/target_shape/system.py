@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information
@@ -275,11 +276,11 @@ def _inverse(M: Array) -> tuple[Array, float]:
     return (root.T @ root) * scale[:, None] * scale, logdet
 
 
-def _inverse_of_triangular(L: Array) -> Array:
+def _inverse_of_triangular(L: NDArray[np.floating]) -> Array:
     """Of a lower triangular matrix, by halves: in a third of NumPy's time, which has no use for zeros."""
     n, h = len(L), len(L) // 2
     if n <= _SMALL:
-        return np.linalg.inv(L)
+        return np.asarray(np.linalg.inv(L))
     inverse = np.zeros((n, n))
     inverse[:h, :h], inverse[h:, h:] = _inverse_of_triangular(L[:h, :h]), _inverse_of_triangular(L[h:, h:])
     inverse[h:, :h] = -inverse[h:, h:] @ (L[h:, :h] @ inverse[:h, :h])
