@@ -95,9 +95,9 @@ def products(J: Array, out: Array) -> None:
         A part of `PointBatches.memory`.
     out : (T, width, width) array
     """
-    rows = np.moveaxis(J, 2, 0)
-    both = (rows[:, :, :-1] @ np.swapaxes(rows, 2, 3))[..., :-1]
-    np.add(both[0], both[1], out=out)
+    rows = J.transpose(2, 0, 1, 3)
+    both = rows[:, :, :-1] @ rows.swapaxes(2, 3)
+    np.add(both[0, :, :, :-1], both[1, :, :, :-1], out=out)
 
 
 def batches_of(
