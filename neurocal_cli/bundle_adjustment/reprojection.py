@@ -203,7 +203,6 @@ def _whiten(u: Array, v: Array, factors: Array) -> None:
     """Multiply each point's two rows by its upper triangular factor, in place."""
     # The rows are used again: entries that stay 0 must be 0 before whitening mixes the rows.
     u[:, 2] = u[:, 4] = v[:, 0] = v[:, 1] = v[:, 3] = 0.0
-    v_rows = v * factors[:, None, 2]
     u *= factors[:, None, 0]
     u += v * factors[:, None, 1]
-    v[...] = v_rows
+    v *= factors[:, None, 2]
