@@ -122,12 +122,11 @@ def _by_distance(seen: Array, near: float) -> NDArray[np.intp]:
     leader = np.arange(V)
     fit = np.asarray(np.isfinite(seen).all(axis=1))
     seen = np.where(fit[:, None], seen, 0.0)
-    square = (seen**2).sum(axis=1)
     limit = near**2 * (seen.shape[1] / 2)  # rms over the places
+    half = np.where(fit, 0.5 * (seen**2).sum(axis=1), np.inf)
     for first in range(0, V, _ROWS):
         rows = slice(first, first + _ROWS)
-        close = square[rows, None] + square - 2.0 * seen[rows] @ seen.T < limit
-        close &= fit[rows, None] & fit
+        close = seen[rows] @ seen.T > half[rows, None] + (half - 0.5 * limit)  # |a - b|^2 < limit
         for k in np.flatnonzero(close.sum(axis=1) > 1):
             if leader[first + k] == first + k:
                 mine = close[k] & (leader == np.arange(V)) & (np.arange(V) > first + k)
