@@ -194,6 +194,9 @@ class Calibration:
         The verdict as a file has it, or what reaches it from this calibration; see `verdict`.
     lens_choice : dict of float by lens model [px]
         The models that ``distortion="auto"`` chose from and their rms error on data left out.
+    would_take : frozenset of str
+        Lens models that could have been the result, had they been `preferred`; with any other the result is
+        the same. Not in files.
     covariance : (n, n) array
         Of the free intrinsic parameters, in the order of `covariance_names`; per-view blocks are
         in `views`.
@@ -226,6 +229,7 @@ class Calibration:
     target: Target | None = None
     lens_choice: Mapping[str, float] = field(default_factory=dict)
     target_stretched: float = 0.0
+    would_take: frozenset[str] = frozenset()
     judgement: Verdict | Callable[[Calibration], Verdict | None] | None = None
 
     @cached_property

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,9 +16,11 @@ from neurocal_cli.calibration import Calibration, NetworkRecord, StraightLines, 
 from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
-from neurocal_cli.evaluation import CameraEvaluation
 from neurocal_cli.target import Target, scale_of
 from neurocal_cli.verdict.report import verdict_json, verdict_lines
+
+if TYPE_CHECKING:
+    from neurocal_cli.evaluation import CameraEvaluation
 
 __all__ = [
     "align",

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from neurocal_cli.board import Board, Plane, smooth_between
 from neurocal_cli.distances import NO_SCALE, Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import Array
+from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.points import Correspondences
 
 __all__ = [
@@ -225,11 +225,11 @@ def distinct_points(
 ) -> tuple[Array, NDArray[np.intp], NDArray[np.str_] | None]:
     """The different world points (n, 3), which of them each row is (N,), and their ids, if all have one."""
     world = np.concatenate([points.world for points in some])
-    _, first, label = np.unique(_whole(world, _scale(world)), axis=0, return_index=True, return_inverse=True)
+    first, label = distinct_rows(_whole(world, _scale(world)))
     ids = None
     if all(points.point is not None for points in some):
         ids = np.concatenate([np.asarray(points.point).astype(str) for points in some])[first]
-    return world[first], label.ravel(), ids
+    return world[first], label, ids
 
 
 def planes_of(given: Array, point: NDArray[np.str_] | None) -> NDArray[np.intp]:
@@ -258,7 +258,7 @@ def _in_plane(found: Array, given: Array) -> tuple[Array, Array]:
 
 def _places(known: Array, world: Array) -> NDArray[np.intp]:
     both = _whole(np.concatenate([known, world]), _scale(known))
-    label = np.unique(both, axis=0, return_inverse=True)[1].ravel()
+    label = distinct_rows(both)[1]
     place = np.full(int(label.max()) + 1, -1, dtype=np.intp)
     place[label[: len(known)]] = np.arange(len(known))
     return place[label[len(known) :]]

@@ -4,10 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.slow_cases import slow_but
 
 from neurocal_cli import calibrate, read_points
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.outlier_views import free_networks
+from neurocal_cli.bundle_adjustment.outlier_views import free_networks, least_of_free_networks
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, predicted_pixels
 from neurocal_cli.verdict.assessment import _AtMinimum
 
@@ -22,6 +23,17 @@ def test_free_networks_are_at_the_minimum(distortion: str, within: float) -> Non
     free = np.arange(5 + len(state.k)) < 5
     minimum = adjust(views.batches, own, free, True, 1000).cost.sum()
     assert np.sqrt(free_networks(views, state).sum() / minimum) == pytest.approx(1.0, abs=within)
+
+
+@pytest.mark.parametrize(
+    ("name", "distortion"),
+    slow_but((("bent", "k1"),), (("bent", "k1"), ("flat", "plumb_bob"), ("fisheye", "fisheye"))),
+)
+def test_the_common_camera_tells_nearly_what_many_steps_leave(name: str, distortion: str) -> None:
+    points = read_points(FLAT.with_name(f"{name}.csv"))
+    found = _AtMinimum(calibrate(points, distortion=distortion, outliers="keep", target="given"))
+    left = free_networks(found.views, found.state, 60).sum()
+    assert np.sqrt(least_of_free_networks(found.normal).sum() / left) == pytest.approx(1.0, abs=0.1)
 
 
 def test_views_that_the_camera_fits_exactly_leave_nothing() -> None:

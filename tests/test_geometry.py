@@ -7,10 +7,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
 
 from neurocal_cli.geometry import (
     Array,
     cross_matrix,
+    distinct_rows,
     euler_jacobian,
     euler_to_rotation,
     nearest_rotation,
@@ -182,3 +184,12 @@ def test_points_that_coincide_have_scale_1() -> None:
     centre, scale = similarity(np.full((4, 2), 3.0))
     assert centre.tolist() == [3.0, 3.0]
     assert scale == 1.0
+
+
+@quick
+@given(arrays(np.intp, st.tuples(st.integers(0, 12), st.integers(1, 3)), elements=st.integers(-1, 1)))
+def test_distinct_rows_are_those_of_numpy(table: NDArray[np.intp]) -> None:
+    first, label = distinct_rows(table)
+    _, expected, places = np.unique(table, axis=0, return_index=True, return_inverse=True)
+    assert first.tolist() == expected.tolist()
+    assert label.tolist() == places.ravel().tolist()

@@ -103,6 +103,14 @@ def test_the_alternatives_are_told() -> None:
     assert choice["none"] > 2 * choice["k1k2"]
 
 
+def test_only_models_that_would_be_taken_change_anything_when_they_are_preferred() -> None:
+    scene, _ = bent_set("k1", 4)
+    found = chosen(scene, 4)
+    assert found.would_take == {"fisheye"}
+    assert chosen(scene, 4, preferred="fisheye").distortion_model == "fisheye"
+    assert np.array_equal(chosen(scene, 4, preferred="k1k2").K, found.K)
+
+
 def test_too_few_points_for_a_lens_leave_none() -> None:
     scene = table_1()
     few = scene.points(0.1, np.random.default_rng(0)).select(np.arange(0, 440, 55))

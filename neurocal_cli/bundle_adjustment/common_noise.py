@@ -21,6 +21,7 @@ then count the same in both directions, and up to k = 2 as they were measured.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,41 +127,56 @@ def common_share(covariance: Array, residuals: Array, across: Array | None = Non
     r = measured_part(residuals[some], n)
     if not (r**2).sum() > 0:
         return 0.0
+    unlikelihood = _unlikelihood(C, r, n)
     low, high = 0.0, 1.0
     inner = [high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)]
-    values = [_unlikelihood(C, r, n, m) for m in inner]
+    values = [unlikelihood(m) for m in inner]
     for _ in range(_STEPS):
         if values[0] < values[1]:
             high, inner[1], values[1] = inner[1], inner[0], values[0]
             inner[0] = high - _GOLDEN * (high - low)
-            values[0] = _unlikelihood(C, r, n, inner[0])
+            values[0] = unlikelihood(inner[0])
         else:
             low, inner[0], values[0] = inner[0], inner[1], values[1]
             inner[1] = low + _GOLDEN * (high - low)
-            values[1] = _unlikelihood(C, r, n, inner[1])
-    best = min((0.0, 0.5 * (low + high), 1.0), key=lambda m: _unlikelihood(C, r, n, m))
-    enough = _unlikelihood(C, r, n, best) + 0.5 * _CONTRADICTED**2 / len(r)
+            values[1] = unlikelihood(inner[1])
+    best = min((0.0, 0.5 * (low + high), 1.0), key=unlikelihood)
+    enough = unlikelihood(best) + 0.5 * _CONTRADICTED**2 / len(r)
     for extreme in (0.0, 1.0):
-        if _unlikelihood(C, r, n, extreme) <= enough:
+        if unlikelihood(extreme) <= enough:
             return extreme
     low, high = best, 1.0
     for _ in range(_STEPS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if _unlikelihood(C, r, n, middle) <= enough else (low, middle)
+        low, high = (middle, high) if unlikelihood(middle) <= enough else (low, middle)
     return low
 
 
-def _unlikelihood(covariance: Array, residuals: Array, across: Array | None, share: float) -> float:
-    """The negative log-likelihood of a point, but for a constant, the level k at its best."""
-    C = with_common_share(covariance, share, across)
-    suu, suv, svv = C.T
-    det = suu * svv - suv * suv
-    u, v = residuals.T
-    chi = ((svv * u - 2 * suv * v) * u + suu * v * v) / det
-    if across is None:
-        return float(np.log(chi.mean()) + 0.5 * np.log(det).mean())
-    one_way, variance = single(across), variance_across(C, across)
-    chi = np.where(one_way, (u * u + v * v) / variance, chi)
-    det = np.where(one_way, variance, det)
-    count = np.where(one_way, 1.0, 2.0).mean()
-    return float(0.5 * count * np.log(chi.mean()) + 0.5 * np.log(det).mean())
+def _unlikelihood(covariance: Array, residuals: Array, across: Array | None) -> Callable[[float], float]:
+    """The negative log-likelihood of a point by the share, but for a constant, the level k at its best.
+
+    With covariances as `with_common_share` has them. Points that were measured in one direction have one
+    variance, the others two by two.
+    """
+    own = (
+        0.5 * (covariance[:, 0] + covariance[:, 2]) if across is None else variance_across(covariance, across)
+    )
+    one = np.zeros(len(own), dtype=bool) if across is None else single(across)
+    mean = np.average(own, weights=equations(across, len(own)))
+    count = np.where(one, 1.0, 2.0).mean()
+    squared, own, (suu, suv, svv), (u, v) = (
+        (residuals[one] ** 2).sum(axis=1),
+        own[one],
+        covariance[~one].T,
+        residuals[~one].T,
+    )
+
+    def at(share: float) -> float:
+        a, b = 1.0 - share, share * mean
+        variance, uu, uv, vv = a * own + b, a * suu + b, a * suv, a * svv + b
+        det = uu * vv - uv * uv
+        chi = (squared / variance).sum() + (((vv * u - 2 * uv * v) * u + uu * v * v) / det).sum()
+        log_det = np.log(variance).sum() + np.log(det).sum()
+        return float(0.5 * count * np.log(chi / len(one)) + 0.5 * log_det / len(one))
+
+    return at

@@ -20,7 +20,13 @@ from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.median import median
 
-__all__ = ["conditions_on_views", "find_outlier_view", "free_networks", "seen_from_behind"]
+__all__ = [
+    "conditions_on_views",
+    "find_outlier_view",
+    "free_networks",
+    "least_of_free_networks",
+    "seen_from_behind",
+]
 
 # Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones,
 # none blamed) and tests/test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
@@ -109,8 +115,11 @@ def free_networks(views: Views, state: CameraState, steps: int = _FREE_STEPS) ->
     """
     own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.model, state.k)
     free = np.concatenate([np.ones(5, dtype=bool), np.zeros(len(state.k), dtype=bool)])
-    normal = adjust(views.batches, own, free, True, steps).normal
-    # The minimum of the quadratic there.
+    return least_of_free_networks(adjust(views.batches, own, free, True, steps).normal)
+
+
+def least_of_free_networks(normal: Array) -> Array:
+    """The same by the quadratics at a state: normal matrices (V, 12 + K, 12 + K) to squared errors (V,)."""
     H, g = normal[:, : POSE.stop, : POSE.stop], normal[:, : POSE.stop, -1]
     H = H * (1.0 + _UNSEEN * np.eye(POSE.stop))
     gain = (g * solve_scaled(H, g[..., None])[..., 0]).sum(axis=1)

@@ -17,7 +17,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.projection import project_points
-from neurocal_cli.geometry import Array
+from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.least_squares.leave_out import folds_of
 
 __all__ = ["RepeatedPoses", "repeated_poses"]
@@ -122,12 +122,11 @@ def _by_distance(seen: Array, near: float) -> NDArray[np.intp]:
     leader = np.arange(V)
     fit = np.asarray(np.isfinite(seen).all(axis=1))
     seen = np.where(fit[:, None], seen, 0.0)
-    square = (seen**2).sum(axis=1)
     limit = near**2 * (seen.shape[1] / 2)  # rms over the places
+    half = np.where(fit, 0.5 * (seen**2).sum(axis=1), np.inf)
     for first in range(0, V, _ROWS):
         rows = slice(first, first + _ROWS)
-        close = square[rows, None] + square - 2.0 * seen[rows] @ seen.T < limit
-        close &= fit[rows, None] & fit
+        close = seen[rows] @ seen.T > half[rows, None] + (half - 0.5 * limit)  # |a - b|^2 < limit
         for k in np.flatnonzero(close.sum(axis=1) > 1):
             if leader[first + k] == first + k:
                 mine = close[k] & (leader == np.arange(V)) & (np.arange(V) > first + k)
@@ -144,8 +143,8 @@ def _correlation(views: Views, errors: Array, group: NDArray[np.intp]) -> float:
     world = views.local[rows] * views.scale[view, None] + views.centre[view]
     place = np.round(world / (1e-6 * views.scale[0]))
     key = np.column_stack([group[view], place])
-    _, same, n = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    same = same.reshape(-1)
+    _, same = distinct_rows(key)
+    n = np.bincount(same)
     errors = errors[rows]
     together = np.stack([np.bincount(same, errors[:, k], len(n)) for k in (0, 1)], axis=1)
     power = np.bincount(same, (errors**2).sum(axis=1), len(n))

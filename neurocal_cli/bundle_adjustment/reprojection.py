@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.point_batches import PointBatches
+from neurocal_cli.bundle_adjustment.point_batches import PointBatches, products
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
@@ -113,16 +113,15 @@ def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDA
     sensible : (V,) bool array
         Whether all the view's points have positive depth and lie where the distortion is monotonic.
     """
-    n_batches, n = len(batches.view), batches.local.shape[2]
+    n_batches = len(batches.view)
     width = _COEFFICIENTS + len(coefficient_names(state.model)) + 1
     by_batch = np.empty((n_batches, width, width))
     sensible = np.empty(n_batches, dtype=bool)
     buffer = batches.memory(width)
     for chunk in batches.chunks():
         part = buffer[: chunk.stop - chunk.start]
-        sensible[chunk] = derivatives(batches, chunk, state, part)
-        J = part.reshape(len(part), width, 2 * n)
-        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
+        sensible[chunk] = derivatives(batches, chunk, state, part[:, :-1])
+        products(part, by_batch[chunk])
     if n_batches == batches.n_views:
         return by_batch, sensible
     return batches.sum_by_view(by_batch), np.logical_and.reduceat(sensible, batches.first)
@@ -204,7 +203,6 @@ def _whiten(u: Array, v: Array, factors: Array) -> None:
     """Multiply each point's two rows by its upper triangular factor, in place."""
     # The rows are used again: entries that stay 0 must be 0 before whitening mixes the rows.
     u[:, 2] = u[:, 4] = v[:, 0] = v[:, 1] = v[:, 3] = 0.0
-    v_rows = v * factors[:, None, 2]
     u *= factors[:, None, 0]
     u += v * factors[:, None, 1]
-    v[...] = v_rows
+    v *= factors[:, None, 2]

@@ -72,11 +72,11 @@ def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
     r4 = r2 * r2
     R, inverse = _radial(k, r2)
     slope = k1 + r2 * (2 * k2 + r2 * (3 * k3))  # dR / d(r^2)
-    powers = (r2, r4, r4 * r2) if count > 4 else (r2, r4)[:count]
-    by_radial = [(x * power, y * power) for power in powers]
+    powers = [r2, r4, r4 * r2] if count > 4 else [r2, r4][:count]
     if count > 5:
         slope = (slope - R * (k4 + r2 * (2 * k5 + r2 * (3 * k6)))) * inverse
-        by_radial = [(dx * inverse, dy * inverse) for dx, dy in by_radial]
+        powers = [power * inverse for power in powers]
+    by_radial = [(x * power, y * power) for power in powers]
     twice = 2 * slope
     xy = x * y
     cross = xy * twice
@@ -88,7 +88,8 @@ def distorted_with_jacobian(k: Coefficients, x: Array, y: Array) -> Distorted:
     xy2 = 2 * xy
     by = [*by_radial[:2], (xy2, r2 + 2 * y2), (r2 + 2 * x2, xy2), *by_radial[2:]]
     if count > 5:
-        by += [(-R * dx, -R * dy) for dx, dy in by_radial]
+        lower = -R
+        by += [(lower * dx, lower * dy) for dx, dy in by_radial]
     if count <= 8:
         return distorted, (xx, cross, cross, yy), by
     s1, s2, s3, s4 = k[8:12]

@@ -179,10 +179,11 @@ def _project_wide(
 def _through_matrix(entries: Entries, changes: Sequence[tuple[Array, Array]], out: Array) -> None:
     """Fill in derivatives of pixels from those of x' and y'."""
     a, s, b, _, _ = entries
+    skewed = not _is_zero(s)
     for column, (dx, dy) in enumerate(changes):
         np.multiply(a, dx, out=out[..., column, 0, :])
         np.multiply(b, dy, out=out[..., column, 1, :])
-        if not _is_zero(s):
+        if skewed:
             out[..., column, 0, :] += s * dy
 
 

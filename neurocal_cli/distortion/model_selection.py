@@ -18,6 +18,7 @@ ordinary models: near the axis all lenses are alike.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from collections.abc import Set as AbstractSet
 from dataclasses import replace
 
 import numpy as np
@@ -57,7 +58,10 @@ _BETTER, _MUCH_BETTER = 0.999, 0.8  # times the squared error
 
 
 def select_model(
-    solution: Solution, more_starts: Callable[[], Iterable[CameraState]] = tuple, preferred: str = ""
+    solution: Solution,
+    more_starts: Callable[[], Iterable[CameraState]] = tuple,
+    preferred: str = "",
+    would_take: set[str] | None = None,
 ) -> Solution:
     """Fit all models, from a solution with any of them, and choose.
 
@@ -68,6 +72,8 @@ def select_model(
         Other states to begin with, where the first leads to nothing that explains the points.
     preferred : str
         A model to take where no other predicts decidedly better.
+    would_take : set of str, optional
+        Joined by the models that would be taken instead, were they preferred.
 
     Returns
     -------
@@ -92,13 +98,17 @@ def select_model(
     if not repeated.none:
         by_views = _views_can_spare_any(solution, repeated)
         fitted = judged_again(fitted, by_views, repeated) or fitted
-    chosen = fitted[_best(fitted, views, repeated, preferred)]
+    name, good = _best(fitted, views, repeated)
+    would_take = set() if would_take is None else would_take
+    would_take |= good - {name}
+    chosen = fitted[preferred if preferred in good else name]
     n, px = len(views.index), views.pixel_scale
     iterations = solution.adjusted.iterations + chosen.adjusted.iterations
     return replace(
         solution,
         problem=chosen.problem,
         adjusted=replace(chosen.adjusted, iterations=iterations),
+        would_take=would_take,
         model_errors={name: float(np.sqrt(c.lost.sum() / n)) * px for name, c in fitted.items()},
         refusal=_refusal(fitted, chosen),
     )
@@ -151,8 +161,12 @@ def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
     return pinhole.criterion(n) < lowest + _DECISIVE and not falls_short(views, [pinhole])
 
 
-def _best(fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses, preferred: str) -> str:
+def _best(
+    fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses
+) -> tuple[str, AbstractSet[str]]:
     """Of the models whose held-out error is as low as any, the one with the lowest criterion.
+
+    And all models than which none predicts decidedly better.
 
     What is held out may ask for two coefficients more than the criterion does, but not for more: a few
     folds tell the better of two models, but among many models one is better than it should be by chance.
@@ -165,16 +179,18 @@ def _best(fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses, p
     finite = {name: candidate for name, candidate in sound.items() if np.isfinite(candidate.lost).all()}
     few = {name: candidate for name, candidate in finite.items() if candidate.coefficients <= most}
     if not few:
-        return next(iter(sound))  # the simplest: nothing can be left out
+        return next(iter(sound)), set()  # the simplest: nothing can be left out
     pool = {
         name: candidate
         for name, candidate in finite.items()
         if name in few or all(_decidedly(candidate, other, repeated, _FAR_BETTER) for other in few.values())
     }
     best = min(pool, key=lambda name: _lost(pool[name]))
-    wanted = eligible.get(preferred)
-    if wanted is not None and np.isfinite(wanted.lost).all() and not _decidedly(pool[best], wanted, repeated):
-        return preferred
+    good = {
+        name
+        for name, candidate in eligible.items()
+        if np.isfinite(candidate.lost).all() and not _decidedly(pool[best], candidate, repeated)
+    }
     tied = []
     for name, candidate in pool.items():
         excess = _by_fold(candidate.lost - pool[best].lost, repeated)
@@ -182,7 +198,7 @@ def _best(fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses, p
         simpler = candidate.coefficients < pool[best].coefficients
         if excess.sum() <= max(2 * _TIE * _lost(pool[best]), chance if simpler else 0.0):
             tied.append(name)
-    return min(tied, key=lambda name: criterion[name])
+    return min(tied, key=lambda name: criterion[name]), good
 
 
 def _without_wide(

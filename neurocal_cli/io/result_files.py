@@ -17,10 +17,10 @@ from neurocal_cli.calibration import Calibration, Rejected
 from neurocal_cli.io.calibration_yaml import format_calibration
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
-from neurocal_cli.stereo.rig import Rig
 
 if TYPE_CHECKING:
     from neurocal_cli.io.exchange.camera_set import CameraSet
+    from neurocal_cli.stereo.rig import Rig
 
 __all__ = ["lean_calibration", "lean_rig", "write_result"]
 
@@ -51,7 +51,7 @@ def write_result(
         An XML file of a camera that OpenCV has no distortion model for.
     """
     if lean:
-        result = lean_rig(result) if isinstance(result, Rig) else lean_calibration(result)
+        result = lean_calibration(result) if isinstance(result, Calibration) else lean_rig(result)
     ending = os.path.splitext(str(path))[1].lower()
     # Formats that nobody asked for are not loaded.
     if ending == ".xml":
@@ -62,7 +62,7 @@ def write_result(
         write_whole(path, OPENCV.text(fitted.cameras, ending)[""])
         return (*fitted.losses, *fitted.remarks)
     by_rows = ending == ".json"  # which loads at once however long it is
-    if isinstance(result, Rig):
+    if not isinstance(result, Calibration):
         from neurocal_cli.io.rig_yaml import format_rig
 
         text = format_rig(result, alpha, by_rows)
@@ -100,7 +100,7 @@ def lean_rig(rig: Rig) -> Rig:
 def _cameras(result: Calibration | Rig) -> CameraSet:
     from neurocal_cli.io.exchange.camera_set import CameraSet
 
-    if isinstance(result, Rig):
+    if not isinstance(result, Calibration):
         poses = {name: view.pose for name, view in result.left.views.items()}
         cameras = result.left.camera, result.right.camera
         return CameraSet(cameras, (result.pose,), poses, result.unit, result, "neurocal")

@@ -20,7 +20,6 @@ from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
-from neurocal_cli.distortion.rich_fit import with_displacement
 from neurocal_cli.distortion.similar_lens import similar_states, tilted_states
 from neurocal_cli.distortion.xi_profile import with_xi_held_if_flat
 from neurocal_cli.errors import DegenerateGeometryError
@@ -52,7 +51,7 @@ def fit(problem: Problem, options: Options) -> Solution:
     if options.distortion == "plumb-line":
         return _plumb_line_first(problem, options)
     if problem.free_distortion and problem.distortion.model == "rich":
-        return with_displacement(fit(problem.with_model("fisheye"), options))
+        return _displaced(fit(problem.with_model("fisheye"), options))
     check_points(problem)
     first = _first_solution(problem, options)
     if options.distortion == "auto":
@@ -92,7 +91,7 @@ def fit_again(
         replace(record, agreed=record.agreed[place]),
     )
     if problem.restraint is not None:  # a rich lens's prior
-        return with_displacement(again)
+        return _displaced(again)
     return _finished(again, options, only_from_here)
 
 
@@ -100,7 +99,7 @@ def _finished(solution: Solution, options: Options, only_from_here: bool = False
     """With its distortion model, and weights that the residuals bear out."""
     chosen = options.distortion == "auto"
     if chosen and only_from_here:
-        solution = select_model(solution, preferred=options.preferred)
+        solution = select_model(solution, tuple, options.preferred, options.would_take)
     elif chosen:
         solution = _with_selected_model(solution, options)
     solution = reweighted(solution)
@@ -113,11 +112,12 @@ def _with_selected_model(solution: Solution, options: Options) -> Solution:
     def more_starts() -> Iterator[CameraState]:
         return _distorted_starts(solution.problem, options)
 
-    found = select_model(solution, more_starts, options.preferred)
+    found = select_model(solution, more_starts, options.preferred, options.would_take)
     turned = _turned(found)
     if turned is found:
         return found
-    return select_model(replace(solution, adjusted=turned.adjusted), more_starts, options.preferred)
+    again = replace(solution, adjusted=turned.adjusted)
+    return select_model(again, more_starts, options.preferred, options.would_take)
 
 
 def _first_solution(problem: Problem, options: Options) -> Solution:
@@ -185,6 +185,13 @@ def _through_distortion(problem: Problem, options: Options) -> Solution | None:
         return found
     fitted = fit_candidates(problem, found.state, by_views=False).get(wanted)
     return None if fitted is None else _turned(replace(found, problem=problem, adjusted=fitted.adjusted))
+
+
+def _displaced(solution: Solution) -> Solution:
+    """A rich lens's displacement, which other models are spared."""
+    from neurocal_cli.distortion.rich_fit import with_displacement
+
+    return with_displacement(solution)
 
 
 def _plumb_line_first(problem: Problem, options: Options) -> Solution:

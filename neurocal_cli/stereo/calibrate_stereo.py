@@ -128,7 +128,7 @@ def _on_one_target(
 
 
 def _others_model(cameras: Sequence[Calibration]) -> list[int]:
-    """Sides that may take the other camera's distortion model, first the one that it suits better.
+    """Sides that would take the other camera's distortion model, first the one that it suits better.
 
     Both cameras of a rig are mostly of one make, so their models differ only where the points insist on it.
     """
@@ -140,7 +140,10 @@ def _others_model(cameras: Sequence[Calibration]) -> list[int]:
         choices[side].get(models[1 - side], math.inf) / max(choices[side][models[side]], 1e-300)
         for side in (0, 1)
     ]
-    return sorted((side for side in (0, 1) if math.isfinite(cost[side])), key=lambda side: cost[side])
+    sides = [
+        side for side in (0, 1) if math.isfinite(cost[side]) and models[1 - side] in cameras[side].would_take
+    ]
+    return sorted(sides, key=lambda side: cost[side])
 
 
 def _named(progress: Progress | None, name: str) -> Progress | None:

@@ -59,7 +59,7 @@ class _Poses:
     def rigs(self) -> tuple[Array, Array]:
         """R and t of single pairs, for an even choice of the pairs."""
         n = len(self.R[0])
-        some = np.unique(np.linspace(0, n - 1, min(n, _MOST_HYPOTHESES)).astype(int))
+        some = np.linspace(0, n - 1, min(n, _MOST_HYPOTHESES)).astype(int)
         R = self.R[1][some] @ np.swapaxes(self.R[0][some], 1, 2)
         return R, self.m[1][some] - (R @ self.m[0][some][..., None])[..., 0]
 

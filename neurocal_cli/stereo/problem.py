@@ -17,6 +17,7 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import Array
+from neurocal_cli.median import median
 from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.reprojection import Frames, Observations, RigState
 
@@ -131,7 +132,7 @@ def rig_problem(left: Calibration, right: Calibration, views: ViewPairs) -> RigP
         np.concatenate([arranged[0].centre, arranged[1].centre[alone]]),
         scale := np.concatenate([arranged[0].scale, arranged[1].scale[alone]]),
         through,
-        float(np.median(scale)),
+        float(median(scale)),
     )
     sides = [
         _side(calibration, view, frames, frame_of)

@@ -17,6 +17,7 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.geometry import Array, nearest_similarity
+from neurocal_cli.median import median
 from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
 from neurocal_cli.target_shape.information import Information, Sight, information_of
 from neurocal_cli.target_shape.left_out import holds_for_views_left_out
@@ -66,7 +67,7 @@ def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -
     Two views tell how the planes of a folded target stand; the bend of one plane takes three.
     """
     least = _FEWEST if n_planes == 1 else _FEWEST_OF_FOLDED
-    return n_different >= least and bool(np.median(np.bincount(label)) >= least)
+    return n_different >= least and bool(median(np.bincount(label).astype(float)) >= least)
 
 
 def find_target(
@@ -112,7 +113,7 @@ def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Proble
     views = problem.views
     if views.n_views <= most:
         return problem, adjusted
-    which = np.unique(np.linspace(0, views.n_views - 1, most).astype(np.intp))
+    which = np.linspace(0, views.n_views - 1, most).astype(np.intp)
     names = {views.names[k] for k in which}
     rows = np.array([name in names for name in problem.points.view_names])[problem.points.view_index]
     known = in_pixels(problem, adjusted.state)

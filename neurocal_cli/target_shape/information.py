@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
+from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of, products
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
@@ -176,26 +176,26 @@ def point_terms(
     n_points : int
         Points of the target.
     """
-    width, n, f, V = 12 + len(state.k), batches.local.shape[2], len(columns), batches.n_views
-    used = np.concatenate([columns, np.arange(POSE.start, POSE.stop), [-1]])
+    width, f, V = 12 + len(state.k), len(columns), batches.n_views
+    used = np.concatenate([columns, np.arange(POSE.start, POSE.stop), [width - 1]])
     by_batch = np.empty((len(batches.view), width, width))
-    point = np.empty((len(batches.view), n, 3, f + 10))
+    summed, cross = np.zeros((n_points, 3, f + 10)), np.zeros((V * n_points, 6, 3))
     buffer = batches.memory(width)
     for chunk in batches.chunks():
         view = batches.view[chunk]
         part = buffer[: len(view)]
-        derivatives(batches, chunk, state, part)
-        J = part.reshape(len(view), width, 2 * n)
-        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
+        derivatives(batches, chunk, state, part[:, :-1])
+        products(part, by_batch[chunk])
         by_point = by_world(part, state, scale, view)
         rows = np.concatenate([by_point, part[:, used]], axis=1)
-        np.matmul(np.moveaxis(by_point, 3, 1), np.moveaxis(rows, 3, 1).swapaxes(2, 3), out=point[chunk])
-    view = np.broadcast_to(batches.view[:, None], label.shape)
-    real = label >= 0
-    flat, point = label[real], point[real]
-    summed = _summed_by(flat, point.reshape(len(flat), -1), n_points).reshape(-1, 3, f + 10)
-    cross = np.zeros((V * n_points, 6, 3))
-    np.add.at(cross, view[real] * n_points + flat, np.swapaxes(point[:, :, 3 + f : -1], 1, 2))
+        real = label[chunk] >= 0
+        point = (np.moveaxis(by_point, 3, 1) @ np.moveaxis(rows, 3, 1).swapaxes(2, 3))[
+            real
+        ]  # (.., 3, f + 10)
+        flat = label[chunk][real]
+        summed += _summed_by(flat, point.reshape(len(flat), -1), n_points).reshape(summed.shape)
+        place = np.broadcast_to(view[:, None] * n_points, real.shape)[real] + flat
+        np.add.at(cross, place, np.swapaxes(point[:, :, 3 + f : -1], 1, 2))
     return PointTerms(
         batches.sum_by_view(by_batch),
         summed[:, :, :3],

@@ -302,7 +302,8 @@ class _Parts:
         for name, ratio in now.ratios.items():
             w, var, unit = self._coefficients(now, name)
             determined += w.size - (unit / ratio) ** 2 * float(var.sum())
-        along = solved.camera_offsets.reshape(f, 3 * n)
+        rest = solved.rest()
+        along = rest.camera_offsets.reshape(f, 3 * n)
         followed = np.asarray(-np.linalg.solve(solved.camera_covariance, along) if f else along)
         noise = np.sqrt(now.variance)
         return Posterior(
@@ -311,9 +312,9 @@ class _Parts:
             camera_step=solved.camera,
             camera=solved.camera_covariance,
             followed=followed.reshape(f, n, 3),
-            std=noise * np.sqrt(np.maximum(solved.offset_variance, 0.0)),
+            std=noise * np.sqrt(np.maximum(rest.offset_variance, 0.0)),
             sizes={name: float(ratio * noise) for name, ratio in now.ratios.items()},
             determined=determined,
             evidence=now.evidence,
-            poses=now.solved.poses,
+            poses=rest.poses,
         )

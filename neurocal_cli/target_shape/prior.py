@@ -161,7 +161,7 @@ def _as_a_whole(centred: Array, axes: Array) -> Array:
 
 def _smooth(places: Array) -> Array:
     """(n, k) eigenfunctions of the smooth covariance times the roots of their eigenvalues."""
-    nodes = places[np.unique(np.linspace(0, len(places) - 1, _MOST).astype(np.intp))]
+    nodes = places[np.linspace(0, len(places) - 1, min(len(places), _MOST)).astype(np.intp)]
 
     def kernel(a: Array, b: Array) -> Array:
         squared = ((a[:, None] - b[None]) ** 2).sum(axis=2)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bundle_adjustment.point_batches import products
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
@@ -184,16 +185,14 @@ def _efficient(
 ) -> Array:
     batches, width = views.batches, 12 + len(state.k)
     columns = camera_columns(len(state.k))[free]
-    n = batches.local.shape[2]
     by_batch = np.empty((len(batches.view), width, width))
     buffer = batches.memory(width)
     for chunk in batches.chunks():
         view = batches.view[chunk]
         part = buffer[: len(view)]
-        derivatives(batches, chunk, state, part)
+        derivatives(batches, chunk, state, part[:, :-1])
         by_point = by_world(part, state, views.scale, view)
         J = part.copy()
         J[:, columns] -= np.einsum("ftni,ticn->tfcn", followed[:, label[chunk]], by_point)
-        J = J.reshape(len(view), width, 2 * n)
-        np.matmul(J, np.swapaxes(J, 1, 2), out=by_batch[chunk])
+        products(J, by_batch[chunk])
     return batches.sum_by_view(by_batch)

@@ -16,6 +16,7 @@ Everything follows from the calibration and its points, so a file can be judged 
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,10 +127,11 @@ def _views_behind(calibration: Calibration) -> int:
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
         world, index = points.world, points.view_index
         seen = calibration.camera.sees((R[index] @ world[..., None])[..., 0] + t[index])
-        return len(np.unique(index[~seen]))
+        return int(np.count_nonzero(np.bincount(index[~seen])))
     axis, t_z = np.array([pose.R[2] for pose in poses]), np.array([pose.t[2] for pose in poses])
     depth = (points.world * axis[points.view_index]).sum(axis=1) + t_z[points.view_index]
-    return len(np.unique(points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]))
+    behind = points.view_index[~(depth > _IN_PLANE * np.abs(depth).max())]
+    return int(np.count_nonzero(np.bincount(behind)))
 
 
 class _AtMinimum:
@@ -214,7 +216,12 @@ class _AtMinimum:
         exact = self.calibration.rmse_px < _EXACT * pixel_spread(self.points)
         if exact or not (self.free_poses and self.free[:5].any()):
             return None
-        return view_groups(self.views, self.state, self.normal, self.free)
+        return view_groups(self.views, self.state, self.normal, self.free, self.networks)
+
+    @cached_property
+    def networks(self) -> Array:
+        """(V,) squared error of a free network for each view."""
+        return free_networks(self.views, self.state)
 
     def _minimum(self) -> Minimum:
         return Minimum(self.views, self.state, self.normal, self.free, self.free_poses, self.repeated)
@@ -243,7 +250,7 @@ class _AtMinimum:
         own_spare = self.views.n_equations - int(freedom.sum())
         if own_spare <= 0 or freedom.sum() <= self.unknowns:
             return np.nan, np.nan
-        own = float(free_networks(self.views, self.state).sum()) / own_spare
+        own = float(self.networks.sum()) / own_spare
         px = self.views.pixel_scale
         floor = (1e-9 * px) ** 2
         ratio = np.sqrt((self.cost / self.spare + floor) / (own + floor))

@@ -104,7 +104,7 @@ def board_shape(
         return None
     seen = views.n_views
     if seen > _ENOUGH:
-        some = np.unique(np.linspace(0, views.n_views - 1, _ENOUGH).astype(np.intp))
+        some = np.linspace(0, seen - 1, _ENOUGH).astype(np.intp)
         views, state = views.subset(some), replace(state, R=state.R[some], t=state.t[some])
     shared = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     N = _with_shape(views, state, frame)

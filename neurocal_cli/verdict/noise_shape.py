@@ -44,7 +44,7 @@ def noise_shape(points: Correspondences, residuals: Array, correlation: float) -
     index, n_views = points.view_index, points.n_views
     counts = np.bincount(index, minlength=n_views)
     rms = np.sqrt(np.bincount(index, (residuals**2).sum(axis=1), n_views) / counts)
-    usual = float(np.quantile(rms, 0.25))
+    usual = float(np.interp(0.25 * (n_views - 1), np.arange(n_views), np.sort(rms)))
     off = (rms > max(_VIEW * usual, least)) & (counts >= _FEWEST)
     if n_views > 2 and off.any():
         names = np.array(points.view_names)[off]

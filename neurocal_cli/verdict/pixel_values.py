@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.geometry import Array
+from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import Finding, name_some
 
@@ -23,8 +23,8 @@ _NORMALISED = 2.0  # no image is that small
 
 def odd_pixels(points: Correspondences) -> Iterator[Finding]:
     """Name what is odd about the pixels as numbers."""
-    rows = np.unique(np.column_stack([points.pixels, points.world]), axis=0)  # copies count once
-    pixels = rows[:, :2]
+    first, _ = distinct_rows(np.column_stack([points.pixels, points.world]))  # copies count once
+    pixels = points.pixels[first]
     if np.abs(pixels).max() < _NORMALISED:
         yield (
             2,
@@ -101,9 +101,9 @@ def _beyond(pixels: Array, size: Array) -> NDArray[np.bool_]:
 def points_given_twice(points: Correspondences) -> Iterator[Finding]:
     """Name views that have pixels of several images, or several pixels of the same point."""
     table = np.column_stack([points.view_index, points.world])
-    _, first = np.unique(table, axis=0, return_index=True)
-    rows = np.unique(np.column_stack([table, points.pixels]), axis=0)
-    _, different = np.unique(rows[:, :4], axis=0, return_counts=True)
+    first, label = distinct_rows(table)
+    seen, _ = distinct_rows(np.column_stack([label, points.pixels]))
+    different = np.bincount(label[seen])
     view = points.view_index[first]
     n_twice = np.bincount(view, different > 1, points.n_views)
     n_points = np.bincount(view, minlength=points.n_views)

@@ -68,7 +68,7 @@ class ViewGroups:
 
 
 def view_groups(
-    views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_]
+    views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], networks: Array | None = None
 ) -> ViewGroups | None:
     """Find two cameras among the views, or a focal length that changes; None where neither explains more.
 
@@ -79,6 +79,8 @@ def view_groups(
         The common camera, at its minimum with all poses free.
     normal : (V, 12 + K, 12 + K) array
     free : (5 + K,) bool array
+    networks : (V,) array, optional
+        From `free_networks`, where that is known.
     """
     conditions = conditions_on_views(views, state)
     n_free = int(free[:5].sum())
@@ -87,7 +89,7 @@ def view_groups(
     if spare < n_free + _SPARE or freedom <= 0:
         return None
     cost = float(normal[:, -1, -1].sum())
-    own = float(free_networks(views, state).sum())
+    own = float((free_networks(views, state) if networks is None else networks).sum())
     if cost - own < _CONTRADICTS * spare * own / freedom:
         return None
     own = float(free_networks(views, state, _OWN_STEPS).sum())
