@@ -26,7 +26,16 @@ from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["Candidate", "as_fisheye", "falls_short", "fit_candidates", "is_weak", "judged_again", "supported", "worth"]
+__all__ = [
+    "Candidate",
+    "as_fisheye",
+    "falls_short",
+    "fit_candidates",
+    "is_weak",
+    "judged_again",
+    "supported",
+    "worth",
+]
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
 # tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
