@@ -6,10 +6,10 @@ the covariance s^2 exp(-d^2 / (2 l^2)); the profile's are odd. Where no point is
 k1 to k4 have a prior of real lenses' size, so that far from the points the fisheye goes on as a lens does. A
 has none: what the displacement can do of its work widens its standard deviation.
 
-The sizes have the largest evidence (MacKay 1992). With the prior's covariance C = sum_j s_j^2 C_j, its inverse
-P and the covariance S of w, all after the points,
+The sizes have the largest evidence (MacKay 1992). With the inverse P of the prior's covariance,
+C = sum_j s_j^2 C_j, and the covariance S of w that the points leave,
 
-    gamma_j = s_j^2 tr(C_j (P - P S P)),    s_j^2 <- s_j^2 (w^T P s_j^2 C_j P w) / gamma_j.
+    gamma_j = s_j^2 tr(C_j (P - P S P)),    s_j^2 <- s_j^4 (w^T P C_j P w) / gamma_j.
 
 A wide lognormal prior keeps those in bounds that no point tells. The prior is a part of the covariance.
 """
@@ -36,9 +36,8 @@ from neurocal_cli.least_squares.normal_equations import unit_diagonal
 __all__ = ["with_displacement"]
 
 _N = len(NODES)
-_UNKNOWNS = np.r_[
-    :4, FIRST_NODE : FIRST_NODE + _N
-]  # of the coefficients: k1 to k4 and the nodes, and of these
+# Of the coefficients, k1 to k4 and the nodes; and the parts of these.
+_UNKNOWNS = np.r_[:4, FIRST_NODE : FIRST_NODE + _N]
 _PROFILE, _FIELD_X, _FIELD_Y = (slice(4 + a, 4 + b) for a, b in pairwise((0, RADII, RADII + GRID**2, _N)))
 _MARGIN = 1.05  # of the reach, beyond the points or the image's corners
 _FARTHER = 1.5  # than the points: the largest reach
@@ -103,7 +102,7 @@ def _extent(directions: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """The restraint: rows of which the squares, of k1 to k4 and the nodes, are added to those of the residuals.
+    """The restraint: rows, of k1 to k4 and the nodes, whose squares are added to those of the residuals.
 
     Attributes
     ----------

@@ -1,9 +1,9 @@
-"""``auto`` takes a rich lens where no other lens, and no target, explains what all views share in the image.
+"""``auto`` takes a rich lens where views share, all over the image, what no other lens explains.
 
-A bent board, wrong points and a second camera bend residuals, too. So the rich lens comes last, for the target
-as it is given, and against the best other lens with the target that was found. Both predict the same views left
-out, the rich lens with its prior in place. It is taken where it predicts decidedly better, and leaves noise:
-what follows the board or single views stays in the residuals, because the image has no place for it.
+A bent board, wrong points and a second camera bend residuals, too. So the rich lens comes last: for the
+target as it is given, against the best other lens with the target that was found. Both predict the same views
+left out, the rich lens with its prior in place. It is taken where it predicts decidedly better and leaves
+noise. What follows the board or single views stays in its residuals: the image has no place for that.
 """
 
 from __future__ import annotations
@@ -88,8 +88,8 @@ def _rich(solution: Solution) -> Solution | None:
 
 
 def _is_the_lens(rich: Solution, other: Solution, repeated: RepeatedPoses) -> bool:
-    lost = [_lost(solution, repeated) for solution in (rich, other)]
-    if not (np.isfinite(lost).all() and predicts_decidedly_better(*lost, repeated, _BETTER)):
+    lost, others = _lost(rich, repeated), _lost(other, repeated)
+    if not (np.isfinite(lost).all() and predicts_decidedly_better(lost, others, repeated, _BETTER)):
         return False
     views, state = rich.problem.views, rich.state
     if correlation(views, point_residuals(views, state)) > _NOISE:
