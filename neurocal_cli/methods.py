@@ -21,6 +21,7 @@ from neurocal_cli.initialisation.options import Progress, options_for
 from neurocal_cli.pipeline.fit import fit
 from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.pipeline.result import calibration_of
+from neurocal_cli.pipeline.rich_choice import with_rich_lens
 from neurocal_cli.pipeline.target_choice import lines_that_are_bent, with_target
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import TARGETS, Target
@@ -161,6 +162,7 @@ def calibrate(
         else:
             solution, rejected = fit(problem, options), Rejected()
         solution, rejected = with_target(problem, solution, rejected, options, choice)
+        solution, rejected = with_rich_lens(problem, solution, rejected, options, choice)
         if known_target is not None:
             solution = replace(solution, target=known_target)
         solution = with_all_minima(solution)

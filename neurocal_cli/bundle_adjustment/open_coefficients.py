@@ -34,6 +34,7 @@ __all__ = [
     "OpenCoefficients",
     "OpenPrior",
     "corner_radius",
+    "fisheye_sizes",
     "open_coefficients",
     "open_of_calibration",
     "radius",
@@ -126,6 +127,11 @@ def corner_radius(
     y = ((v - pixel_centre[1]) / pixel_scale - a23) / a22
     x = ((u - pixel_centre[0]) / pixel_scale - a13 - a12 * y) / a11
     return float(np.hypot(x, y).max())
+
+
+def fisheye_sizes(far: float) -> Array:
+    """(4,) standard deviations of k1 to k4 of lenses that reach to an angle [rad]."""
+    return np.array([share / far**power for _, power, share in _FISHEYE])
 
 
 def open_coefficients(

@@ -26,7 +26,16 @@ from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["Candidate", "falls_short", "fit_candidates", "is_weak", "judged_again", "supported", "worth"]
+__all__ = [
+    "Candidate",
+    "as_fisheye",
+    "falls_short",
+    "fit_candidates",
+    "is_weak",
+    "judged_again",
+    "supported",
+    "worth",
+]
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
 # tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
@@ -111,6 +120,13 @@ def supported(problem: Problem, model: str) -> Problem | None:
     if model != "none" and equations < _SPARE * with_model.n_parameters + 4:
         return None
     return with_model
+
+
+def as_fisheye(problem: Problem, state: CameraState) -> tuple[Problem, Adjusted]:
+    """The fisheye, with all its coefficients, that begins with a state of any model."""
+    fisheye = problem.with_model("fisheye")
+    k = _coefficients(state, "fisheye", radius(problem.views, state))
+    return fisheye, fisheye.adjust(replace(state, model="fisheye", k=k), _STEPS)
 
 
 def fit_candidates(

@@ -39,7 +39,7 @@ from neurocal_cli.distortion.candidate_models import (
 )
 from neurocal_cli.geometry import Array
 
-__all__ = ["select_model"]
+__all__ = ["predicts_decidedly_better", "select_model"]
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models; the true one in 86 to
 # 100 %, never more than two coefficients too many, 1 % of the best error on new views) and
@@ -224,15 +224,27 @@ def _without_wide(
 def _decidedly(
     candidate: Candidate, other: Candidate, repeated: RepeatedPoses, enough: float = _DECIDEDLY
 ) -> bool:
-    """Whether a candidate predicts better than another by enough to matter, and nearly everywhere.
+    return predicts_decidedly_better(candidate.lost, other.lost, repeated, enough)
+
+
+def predicts_decidedly_better(lost: Array, others: Array, repeated: RepeatedPoses, enough: float) -> bool:
+    """Whether a fit predicts better than another by enough to matter, and nearly everywhere.
 
     Everywhere by the mean logarithm of the ratio of what the parts of the data lose: a part that one of both
     cannot do without has no more to say than others.
+
+    Parameters
+    ----------
+    lost, others : arrays
+        Squared error of each part of the data when it is left out.
+    repeated : RepeatedPoses
+    enough : float
+        How many times larger the other's rms error must be.
     """
-    lost = [np.maximum(_by_fold(c.lost, repeated), 1e-300) for c in (candidate, other)]
-    if not lost[1].sum() > enough**2 * lost[0].sum():
+    by_fold = [np.maximum(_by_fold(array, repeated), 1e-300) for array in (lost, others)]
+    if not by_fold[1].sum() > enough**2 * by_fold[0].sum():
         return False
-    ratio = np.log(lost[1] / lost[0])
+    ratio = np.log(by_fold[1] / by_fold[0])
     return bool(ratio.sum() > _CERTAIN * np.sqrt(len(ratio)) * ratio.std())
 
 

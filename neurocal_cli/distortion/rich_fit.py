@@ -1,53 +1,58 @@
 """A rich lens: a fisheye and a smooth displacement, of which there is as much as the points ask for.
 
-The displacement's nodes w (see `rich_lens`) have a Gaussian prior. With the noise's variance as the unit,
-adjusting minimises
+The displacement's nodes w (see `rich_lens`) have a Gaussian prior: its profile and its field are sums of
+Gaussian processes, each of another length. Of a process of length l and size s, nodes that are d apart have
+the covariance s^2 exp(-d^2 / (2 l^2)); the profile's are odd. Where no point is, the band is as wide as that.
+k1 to k4 have a prior of real lenses' size, so that far from the points the fisheye goes on as a lens does. A
+has none: what the displacement can do of its work widens its standard deviation.
 
-    E = |r|^2 + sum_i lambda_i w^T K_i w,    lambda_i = sigma^2 / size_i^2,
+The sizes have the largest evidence (MacKay 1992). With the inverse P of the prior's covariance,
+C = sum_j s_j^2 C_j, and the covariance S of w that the points leave,
 
-where two parts K_i hold the bending energy of the profile and of the field, and two their squares: the
-first lets the points fill the gaps between them, the second lets what no point tells stay 0 but for its size.
-Such a prior is a Matern process (Lindgren, Rue and Lindstrom 2011). MacKay's (1992) steps find the sizes from
-the evidence: with the Hessian H of E and P = sum_i lambda_i K_i,
+    gamma_j = s_j^2 tr(C_j (P - P S P)),    s_j^2 <- s_j^4 (w^T P C_j P w) / gamma_j.
 
-    gamma_i = lambda_i tr((P^-1 - H^-1) K_i),    lambda_i <- gamma_i sigma^2 / (w^T K_i w).
-
-What A, k1 to k4 and the turns of all poses can do by themselves is held out of w, over the points seen, so
-that these parameters mean what they mean for a fisheye. The prior is a part of the covariance.
+A wide lognormal prior keeps those in bounds that no point tells. The prior is a part of the covariance.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.open_coefficients import fisheye_sizes
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NODES, RADII, REACHES
-from neurocal_cli.geometry import Array, cross_matrix
-from neurocal_cli.least_squares.normal_equations import solve_scaled
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
 __all__ = ["with_displacement"]
 
 _N = len(NODES)
-_NODES = slice(5 + FIRST_NODE, 5 + FIRST_NODE + _N)  # of the shared parameters, which begin with A's entries
-_COLUMNS = np.arange(_N) + POSE.stop + FIRST_NODE  # of normal matrices
+# Of the coefficients, k1 to k4 and the nodes; and the parts of these.
+_UNKNOWNS = np.r_[:4, FIRST_NODE : FIRST_NODE + _N]
+_PROFILE, _FIELD_X, _FIELD_Y = (slice(4 + a, 4 + b) for a, b in pairwise((0, RADII, RADII + GRID**2, _N)))
 _MARGIN = 1.05  # of the reach, beyond the points or the image's corners
 _FARTHER = 1.5  # than the points: the largest reach
-_START = np.array([1.0, 10.0, 1.0, 10.0])  # sizes, in rms residuals
-_LARGEST, _SMALLEST = 1e3, 1e-4  # sizes, likewise
-_HELD = 1e-2  # size of what is held out, likewise
-_TINY, _SAME = 1e-300, 1e-6
-_NO_GAIN = 0.02  # of the logarithm of the evidence
-_LEAST_GAMMA, _LONGEST = 1e-6, 1.0  # of a step, in logarithms of the sizes
-_ROUNDS, _PASSES = 4, 60
-_SETTLED, _NEARLY = 0.02, 0.1  # relative changes of the sizes, within a round and between rounds
+_TINY, _NOTHING, _NEWTON = 1e-300, 1e-17, 8
+# Lengths of the processes, in reaches, and what keeps their sizes in bounds, in rms residuals of the fisheye.
+# Repeated by tests/test_rich_lens.py (slow): with these, errors where no point was seen are as large as their
+# standard deviations.
+_OF_PROFILE, _OF_FIELD = (0.1, 0.25), (0.25, 0.5, 1.0)
+_LARGEST, _SMALLEST, _SPREAD = 10.0, 1e-3, 1.5  # the last one is a std of logarithms
+_ROUGH = 2e-3  # size of a process without length, likewise
+_LONGEST = 1.0  # of a step, in logarithms of the sizes
+_AT_FIRST, _EASED = 4, 0.7  # passes with whole steps; later shares of them, because lengths take turns
+_ROUNDS, _PASSES = 4, 40
+_NO_GAIN, _SETTLED = 0.05, 0.02  # of the logarithm of the evidence; relative change of the variance
+_NEARLY = 0.1  # of the evidence's logarithm and its parts' weights, between rounds
 
 
 def with_displacement(solution: Solution) -> Solution:
@@ -97,52 +102,107 @@ def _extent(directions: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Prior:
-    """The restraint: rows of which the squares, of the nodes, are added to those of the residuals."""
+    """The restraint: rows, of k1 to k4 and the nodes, whose squares are added to those of the residuals.
+
+    Attributes
+    ----------
+    rows : (n, n) array
+    sizes : array
+        Of the processes, in units of x'.
+    scale : float
+        Rms residual of the fisheye, likewise.
+    """
 
     rows: Array
+    sizes: Array
+    scale: float
 
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
         """Derivatives (m, 5 + K) and what is missing (m,)."""
         by_camera = np.zeros((len(self.rows), 5 + len(state.k)))
-        by_camera[:, _NODES] = self.rows
-        return by_camera, -self.rows @ state.k[FIRST_NODE:]
+        by_camera[:, 5 + _UNKNOWNS] = self.rows
+        return by_camera, -self.rows @ state.k[_UNKNOWNS]
 
 
 def _by_evidence(solution: Solution) -> Solution:
     """Adjust, and find the sizes anew, until they stay."""
     problem, adjusted = solution.problem, solution.adjusted
     normal, _ = normal_blocks(problem.views.batches, adjusted.state)
-    held = _held_out(problem, adjusted.state, normal)
-    parts = _parts()
-    scale = np.sqrt(normal[:, -1, -1].sum() / problem.views.n_equations) / adjusted.state.entries[0, 0]
-    sizes = _START * scale
-    found = None
+    if isinstance(problem.restraint, _Prior):
+        sizes, scale = problem.restraint.sizes, problem.restraint.scale
+    else:
+        scale = float(np.sqrt(normal[:, -1, -1].sum() / problem.views.n_equations))
+        scale /= float(adjusted.state.entries[0, 0])
+        sizes = np.full(len(_OF_PROFILE) + len(_OF_FIELD), scale)
+    processes = _processes(adjusted.state.k[FIRST_NODE - len(REACHES) : FIRST_NODE], scale)
+    found = _sizes(problem, adjusted.state, normal, processes, sizes)
     for _ in range(_ROUNDS):
-        before = sizes if found is None else found.sizes
-        found = _sizes(problem, adjusted.state, normal, parts, held, before, scale)
+        before = found.sizes
         rows = np.asarray(np.linalg.cholesky(found.precision).T, dtype=float)
-        problem = replace(problem, restraint=_Prior(rows))
+        problem = replace(problem, restraint=_Prior(rows, before, scale))
         adjusted = problem.adjust(replace(adjusted, state=adjusted.state))
         normal = adjusted.normal
-        if np.abs(np.log(found.sizes / before)).max() < _NEARLY:
+        found = _sizes(problem, adjusted.state, normal, processes, before)
+        if (found.gamma * np.abs(np.log(found.sizes / before))).max() < _NEARLY:
             break
-    assert found is not None
-    last = _sizes(problem, adjusted.state, normal, parts, held, found.sizes, scale, learn=False)
     return replace(
-        solution, problem=problem, adjusted=adjusted, shared=last.covariance, by_prior=_N - last.determined
+        solution, problem=problem, adjusted=adjusted, shared=found.covariance, by_prior=_N - found.determined
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """Sizes of the parts, and what follows from them.
+class _Processes:
+    """What the prior is made of.
 
     Attributes
     ----------
-    sizes : (4,) array
-        In units of x'.
+    profile : (p, n, n) array
+    field : (f, m, m) array
+        Covariances of processes of size 1, the same for both of the field's directions.
+    of_fisheye : (4,) array
+        Standard deviations of k1 to k4.
+    scale : float
+    """
+
+    profile: Array
+    field: Array
+    of_fisheye: Array
+    scale: float
+
+    def inverses(self, sizes: Array) -> tuple[Array, Array]:
+        """Of the covariances of the profile and of the field, for sizes of all processes."""
+        rough, n = (_ROUGH * self.scale) ** 2, len(self.profile)
+        both = (self.profile, sizes[:n] ** 2), (self.field, sizes[n:] ** 2)
+        sums = [np.tensordot(s, C, axes=1) + rough * np.eye(C.shape[1]) for C, s in both]
+        return _inverse(sums[0]), _inverse(sums[1])
+
+
+def _processes(reaches: Array, scale: float) -> _Processes:
+    reach, *sides = reaches
+    r = np.arange(1, RADII + 1) * reach / (RADII - 1)
+    odd = np.array(
+        [_alike(r[:, None] - r, n * reach) - _alike(r[:, None] + r, n * reach) for n in _OF_PROFILE]
+    )
+    along = [2 * side / (GRID - 3) * np.subtract.outer(np.arange(GRID), np.arange(GRID)) for side in sides]
+    field = np.array([np.kron(_alike(along[1], n * reach), _alike(along[0], n * reach)) for n in _OF_FIELD])
+    return _Processes(odd, field, fisheye_sizes(2 * float(np.arctan(reach))), scale)
+
+
+def _alike(distance: Array, length: float) -> Array:
+    alike = np.exp(-0.5 * (distance / length) ** 2)
+    return np.where(alike < _NOTHING, 0.0, alike)  # numbers far below 1 are slow
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Sizes of the processes, and what follows from them.
+
+    Attributes
+    ----------
+    sizes, gamma : arrays
+        In units of x', and how many unknowns the points determine of each process.
     precision : (n, n) array
-        P, of the nodes, in units of the residuals' squares.
+        P, of k1 to k4 and the nodes, in units of the residuals' squares.
     covariance : (f, f) array
         Of the free shared parameters.
     determined : float
@@ -150,84 +210,77 @@ class _Found:
     """
 
     sizes: Array
+    gamma: Array
     precision: Array
     covariance: Array
     determined: float
 
 
 def _sizes(
-    problem: Problem, state: CameraState, normal: Array, parts: list[Array], held: Array,
-    sizes: Array, scale: float, learn: bool = True,
-) -> _Found:  # fmt: skip
-    """MacKay's steps on the quadratic around a state; or what follows from sizes that are known."""
-    free = problem.free_camera
-    q = reduced(normal, free, problem.free_poses)
+    problem: Problem, state: CameraState, normal: Array, processes: _Processes, sizes: Array
+) -> _Found:
+    """MacKay's steps on the quadratic around a state."""
+    q = reduced(normal, problem.free_camera, problem.free_poses)
     S, g, cost = q.S.sum(axis=0), q.g.sum(axis=0), float(q.cost.sum())
-    w = state.k[FIRST_NODE:]
-    nodes = slice(len(g) - _N, None)
+    x = state.k[_UNKNOWNS]
+    own = slice(len(g) - len(x), None)
     spare = problem.views.n_equations - problem.n_parameters
-    determined = 0.0
-    variance = cost / max(spare, 1)
-    for _ in range(_PASSES):
-        strength = variance / sizes**2
-        P = held * (variance / (_HELD * scale) ** 2) + sum(
-            s * K for s, K in zip(strength, parts, strict=True)
-        )
+    variance, scale = cost / max(spare, 1), processes.scale
+    for n_pass in range(_PASSES):
+        of_profile, of_field = processes.inverses(sizes)
+        P = np.zeros((len(x), len(x)))
+        P[range(4), range(4)] = processes.of_fisheye**-2
+        for part, block in ((_PROFILE, of_profile), (_FIELD_X, of_field), (_FIELD_Y, of_field)):
+            P[part, part] = block
         H, right = S.copy(), g.copy()
-        H[nodes, nodes] += P
-        right[nodes] -= P @ w
-        inverse, prior = solve_scaled(H, np.eye(len(H))), solve_scaled(P, np.eye(_N))
+        H[own, own] += variance * P
+        right[own] -= variance * (P @ x)
+        inverse = _inverse(H)
         step = inverse @ right
-        after = w + step[nodes]
-        free = strength * [(prior * K).sum() for K in parts]
-        gamma = np.maximum(free - strength * [(inverse[nodes, nodes] * K).sum() for K in parts], _LEAST_GAMMA)
-        determined = float(gamma.sum())
+        covariance, w = variance * inverse[own, own], x + step[own]
+        num, den = (
+            np.concatenate(
+                [
+                    _evidence(processes.profile, of_profile, w, covariance, (_PROFILE,)),
+                    _evidence(processes.field, of_field, w, covariance, (_FIELD_X, _FIELD_Y)),
+                ],
+                axis=1,
+            )
+            * sizes**2
+        )
+        determined = _N - float((P[4:, 4:] * covariance[4:, 4:]).sum())
         last, variance = variance, (cost - 2 * g @ step + step @ S @ step) / max(spare - determined, 1)
-        # MacKay's step, longer for parts of which the data determine little, where it would be too short.
-        wanted = np.log([after @ K @ after for K in parts] / gamma / sizes**2)
-        change = np.clip(wanted * (1 - 0.5 * gamma / free), -_LONGEST, _LONGEST) * learn
-        new = np.clip(sizes * np.exp(change), _SMALLEST * scale, _LARGEST * scale)
-        change = np.abs(np.log(new / sizes))
-        gain = float((gamma * np.abs(np.expm1(wanted)) * change).sum())  # of the evidence's logarithm
-        settled = (change.max() < _SETTLED or gain < _NO_GAIN) and abs(np.log(variance / last)) < _SETTLED
-        sizes = new
-        if settled:
+        change = np.clip(_change(num, den, np.log(sizes / scale)), -_LONGEST, _LONGEST)
+        change *= 1.0 if n_pass < _AT_FIRST else _EASED
+        if (den * np.abs(change)).max() < _NO_GAIN and abs(np.log(variance / last)) < _SETTLED:
             break
-    return _Found(sizes, P, variance * inverse, determined)
+        sizes = np.clip(sizes * np.exp(change), _SMALLEST * scale, _LARGEST * scale)
+    return _Found(sizes, den, last * P, last * inverse, determined)
 
 
-def _parts() -> list[Array]:
-    """(n, n) matrices: bending and squares of the profile, bending and squares of the field.
-
-    The field's bending is of third order, the sum of squared third derivatives: beyond the points it goes on
-    with the curvature that it has there, and the band is as wide as that is uncertain.
-    """
-    profile = np.diff(np.eye(RADII + 1), 2, axis=0)[:, 1:]  # the node on the axis is 0
-    one = np.eye(GRID)
-    first, second, third = (np.diff(one, order, axis=0) for order in (1, 2, 3))
-    mixed = np.concatenate([np.kron(first, second), np.kron(second, first)])
-    field = np.concatenate([np.kron(one, third), np.kron(third, one), np.sqrt(3) * mixed])
-    bending, squares = np.kron(np.eye(2), field.T @ field), np.eye(2 * GRID * GRID)
-    parts = []
-    for at, block in ((0, profile.T @ profile), (0, np.eye(RADII)), (RADII, bending), (RADII, squares)):
-        whole = np.zeros((_N, _N))
-        whole[at : at + len(block), at : at + len(block)] = block
-        parts.append(whole)
-    return parts
+def _evidence(
+    covariances: Array, precision: Array, w: Array, after: Array, parts: tuple[slice, ...]
+) -> Array:
+    """(2, n) what w has of each process, and what is expected of it, over its squared size."""
+    found = np.zeros((2, len(covariances)))
+    for part in parts:
+        a = precision @ w[part]
+        left = precision - precision @ after[part, part] @ precision
+        found += (covariances @ a) @ a, (covariances * left).sum(axis=(1, 2))
+    return np.maximum(found, _TINY)
 
 
-def _held_out(problem: Problem, state: CameraState, normal: Array) -> Array:
-    """(n, n) projection of the nodes on what other parameters can do, over the points that are seen."""
-    # The camera's entries and coefficients, where they are free.
-    others = camera_columns(len(state.k))[np.flatnonzero(problem.free_camera)][:-_N]
-    rows = [normal[:, others[:, None], _COLUMNS].sum(axis=0)]
-    if problem.free_poses:
-        # All poses turn about the camera: tau follows omega as omega x t.
-        by_omega, by_tau = np.split(normal[:, POSE][:, :, _COLUMNS], 2, axis=1)
-        turns = by_omega + cross_matrix(state.t) @ by_tau
-        rows.append(turns.sum(axis=0))
-    stacked = np.concatenate(rows)
-    stacked /= np.linalg.norm(stacked, axis=1, keepdims=True) + _TINY
-    _, values, axes = np.linalg.svd(stacked, full_matrices=False)
-    axes = axes[values > _SAME * values[0]]
-    return np.asarray(axes.T @ axes)
+def _change(num: Array, den: Array, size: Array) -> Array:
+    """Change d of the logarithms of the sizes: den - num exp(-2 d) + (size + d) / _SPREAD^2 = 0."""
+    d = np.zeros_like(size)
+    for _ in range(_NEWTON):
+        rest = num * np.exp(-2 * d)
+        f = den - rest + (size + d) / _SPREAD**2
+        d -= np.clip(f / (2 * rest + _SPREAD**-2), -_LONGEST, _LONGEST)
+    return d
+
+
+def _inverse(H: Array) -> Array:
+    """Of a positive matrix, scaled to a unit diagonal."""
+    scaled, scale = unit_diagonal(H)
+    return np.asarray(np.linalg.inv(scaled) * np.outer(scale, scale))

@@ -40,7 +40,7 @@ from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import why_odd
 from neurocal_cli.points import Correspondences
 
-__all__ = ["fit_robustly"]
+__all__ = ["fit_robustly", "judged_again"]
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view; clean data are the same to the last bit with and without) and
@@ -80,6 +80,39 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
     search.without_outlier_views()
     search.judge_all_points()
     return search.solution, search.rejected()
+
+
+def judged_again(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options
+) -> tuple[Solution, Rejected]:
+    """All points judged by another lens, which was fitted to those that an earlier one had kept.
+
+    Parameters
+    ----------
+    problem : Problem
+        With all points.
+    solution : Solution
+    rejected : Rejected
+        Points that the earlier lens did not explain, and no views.
+    options : Options
+    """
+    search = _Search(problem, options)
+    search.solution = solution
+    if rejected.points is not None:
+        search.kept = ~_among(problem.points, rejected.points)
+    search.judge_all_points()
+    return search.solution, search.rejected()
+
+
+def _among(points: Correspondences, some: Correspondences) -> NDArray[np.bool_]:
+    """(N,) which points are the same measurements as some others."""
+
+    def keys(of: Correspondences) -> list[tuple[str, float, float]]:
+        names = [of.view_names[v] for v in of.view_index]
+        return list(zip(names, *of.pixels.T.tolist(), strict=True))
+
+    known = set(keys(some))
+    return np.array([key in known for key in keys(points)])
 
 
 class _Search:

@@ -1,0 +1,109 @@
+"""``auto`` takes a rich lens where views share, all over the image, what no other lens explains.
+
+A bent board, wrong points and a second camera bend residuals, too. So the rich lens comes last: for the
+target as it is given, against the best other lens with the target that was found. Both predict the same views
+left out, the rich lens with its prior in place. It is taken where it predicts decidedly better and leaves
+noise. What follows the board or single views stays in its residuals: the image has no place for that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from neurocal_cli.bundle_adjustment.cross_validation import held_out_views
+from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
+from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals, shared_by_place
+from neurocal_cli.bundle_adjustment.solution import Solution
+from neurocal_cli.bundle_adjustment.units import normalised
+from neurocal_cli.calibration import Rejected
+from neurocal_cli.distortion.candidate_models import as_fisheye
+from neurocal_cli.distortion.model_selection import predicts_decidedly_better
+from neurocal_cli.distortion.monotonic_fit import normal_part
+from neurocal_cli.distortion.rich_fit import with_displacement
+from neurocal_cli.geometry import Array
+from neurocal_cli.initialisation.options import Options
+from neurocal_cli.pipeline.outlier_rejection import judged_again
+from neurocal_cli.verdict.view_groups import view_groups
+
+__all__ = ["with_rich_lens"]
+
+# Repeated by tests/test_rich_lens.py (slow).
+_FEWEST = 20  # different views
+_SHARED = 0.1  # of the squared residuals, by all views at a place: a gain of _BETTER is 0.17
+_BETTER = 1.1  # times the rms error on views left out
+_NOISE = 0.15  # correlation of neighbours' residuals that is left
+
+
+def with_rich_lens(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
+) -> tuple[Solution, Rejected]:
+    """Take a rich lens if it predicts decidedly better.
+
+    Parameters
+    ----------
+    problem : Problem
+        With all points, where their file has them.
+    solution, rejected
+        The best of the other lenses, with the target where it was found.
+    options : Options
+    choice : {"auto", "given", "flat", "free"}
+        How the target is found. Unless it is looked for, nobody knows whether it is bent.
+
+    Returns
+    -------
+    solution, rejected
+        The ones given where the lens stays as it is.
+    """
+    looked_for = choice == "auto" and options.distortion == "auto" and problem.points.world_std is None
+    if not looked_for or solution.refusal or rejected.views or not solution.problem.free_poses:
+        return solution, rejected
+    views, errors = solution.problem.views, point_residuals(solution.problem.views, solution.state)
+    if views.n_views < _FEWEST or shared_by_place(views, errors) < _SHARED:
+        return solution, rejected
+    repeated = repeated_poses(views, solution.state, errors)
+    if repeated.n_poses < _FEWEST:
+        return solution, rejected
+    rich = _rich(solution)
+    if rich is None or not _is_the_lens(rich, solution, repeated):
+        return solution, rejected
+    found = {**(solution.model_errors or {}), "rich": _held_out_rms(rich, repeated)}
+    if len(rejected):
+        rich, rejected = judged_again(problem, rich, rejected, options)
+    return replace(rich, model_errors=found), rejected
+
+
+def _rich(solution: Solution) -> Solution | None:
+    """A rich lens for the target as it is given; None where it cannot be found."""
+    problem, target = solution.problem, solution.target
+    points = problem.points if target is None else target.as_given(problem.points)
+    given = problem.with_points(points)
+    fisheye = as_fisheye(given, normalised(solution.in_pixels, given.views))
+    try:
+        return with_displacement(replace(solution, problem=fisheye[0], adjusted=fisheye[1], target=None))
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _is_the_lens(rich: Solution, other: Solution, repeated: RepeatedPoses) -> bool:
+    lost, others = _lost(rich, repeated), _lost(other, repeated)
+    if not (np.isfinite(lost).all() and predicts_decidedly_better(lost, others, repeated, _BETTER)):
+        return False
+    views, state = rich.problem.views, rich.state
+    if correlation(views, point_residuals(views, state)) > _NOISE:
+        return False
+    return view_groups(views, state, rich.adjusted.normal, rich.problem.free_of_prior) is None
+
+
+def _held_out_rms(solution: Solution, repeated: RepeatedPoses) -> float:
+    views = solution.problem.views
+    return float(np.sqrt(_lost(solution, repeated).sum() / len(views.index))) * views.pixel_scale
+
+
+def _lost(solution: Solution, repeated: RepeatedPoses) -> Array:
+    """Squared error of each view when it is left out."""
+    problem, state, free = solution.problem, solution.state, solution.problem.free_camera
+    held = None if problem.restraint is None else normal_part(problem.restraint, state, free)
+    return held_out_views(solution.adjusted.normal, free, True, held, repeated)
