@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -85,7 +84,7 @@ class Solution:
         Share of the noise that is the same for all points; see `common_noise`.
     model_errors : dict of float by distortion model [px], optional
         Cross-validation errors of the models that ``distortion="auto"`` chose from.
-    would_take : set of str
+    would_take : frozenset of str
         Models that would have been taken in one of these choices, had they been preferred.
     straight_lines : StraightLines, optional
         What ``distortion="plumb-line"`` found the distortion from.
@@ -106,7 +105,7 @@ class Solution:
     by_prior: float = 0.0
     common_noise: float = 0.0
     model_errors: Mapping[str, float] | None = None
-    would_take: AbstractSet[str] = frozenset()
+    would_take: frozenset[str] = frozenset()
     straight_lines: StraightLines | None = None
     refusal: str = ""
     target: Target | None = None

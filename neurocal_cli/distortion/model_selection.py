@@ -58,10 +58,7 @@ _BETTER, _MUCH_BETTER = 0.999, 0.8  # times the squared error
 
 
 def select_model(
-    solution: Solution,
-    more_starts: Callable[[], Iterable[CameraState]] = tuple,
-    preferred: str = "",
-    would_take: set[str] | None = None,
+    solution: Solution, more_starts: Callable[[], Iterable[CameraState]] = tuple, preferred: str = ""
 ) -> Solution:
     """Fit all models, from a solution with any of them, and choose.
 
@@ -72,8 +69,6 @@ def select_model(
         Other states to begin with, where the first leads to nothing that explains the points.
     preferred : str
         A model to take where no other predicts decidedly better.
-    would_take : set of str, optional
-        Joined by the models that would be taken instead, were they preferred.
 
     Returns
     -------
@@ -99,8 +94,6 @@ def select_model(
         by_views = _views_can_spare_any(solution, repeated)
         fitted = judged_again(fitted, by_views, repeated) or fitted
     name, good = _best(fitted, views, repeated)
-    would_take = set() if would_take is None else would_take
-    would_take |= good - {name}
     chosen = fitted[preferred if preferred in good else name]
     n, px = len(views.index), views.pixel_scale
     iterations = solution.adjusted.iterations + chosen.adjusted.iterations
@@ -108,7 +101,7 @@ def select_model(
         solution,
         problem=chosen.problem,
         adjusted=replace(chosen.adjusted, iterations=iterations),
-        would_take=would_take,
+        would_take=solution.would_take | (good - {name}),
         model_errors={name: float(np.sqrt(c.lost.sum() / n)) * px for name, c in fitted.items()},
         refusal=_refusal(fitted, chosen),
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from neurocal_cli.training import Task, Trained, Trainer
@@ -44,8 +44,6 @@ class Options:
         "auto": choose the model; "plumb-line": find it from straight lines first; else as the problem says.
     preferred : str
         With "auto", a model to take where no other predicts decidedly better.
-    would_take : set of str
-        Filled with the models that, had they been preferred, would have been taken in one of the choices.
     seed : int
         Of the random weights.
     progress : callable
@@ -61,7 +59,6 @@ class Options:
     distortion: str = ""
     preferred: str = ""
     seed: int = 0
-    would_take: set[str] = field(default_factory=set, compare=False)
     progress: Progress = lambda stage, share: None
 
 
@@ -111,15 +108,5 @@ def options_for(
 
     agreement = Agreement(0.02, 1e-4)
     return Options(
-        train,
-        agreement,
-        (1024, 1024),
-        None,
-        1024,
-        starts,
-        constrained,
-        distortion,
-        preferred,
-        seed,
-        progress=report,
+        train, agreement, (1024, 1024), None, 1024, starts, constrained, distortion, preferred, seed, report
     )

@@ -89,6 +89,7 @@ def fit_again(
         problem,
         problem.adjust(replace(solution.adjusted, state=start)),
         replace(record, agreed=record.agreed[place]),
+        would_take=solution.would_take,
     )
     if problem.restraint is not None:  # a rich lens's prior
         return _displaced(again)
@@ -99,7 +100,7 @@ def _finished(solution: Solution, options: Options, only_from_here: bool = False
     """With its distortion model, and weights that the residuals bear out."""
     chosen = options.distortion == "auto"
     if chosen and only_from_here:
-        solution = select_model(solution, tuple, options.preferred, options.would_take)
+        solution = select_model(solution, preferred=options.preferred)
     elif chosen:
         solution = _with_selected_model(solution, options)
     solution = reweighted(solution)
@@ -112,12 +113,12 @@ def _with_selected_model(solution: Solution, options: Options) -> Solution:
     def more_starts() -> Iterator[CameraState]:
         return _distorted_starts(solution.problem, options)
 
-    found = select_model(solution, more_starts, options.preferred, options.would_take)
+    found = select_model(solution, more_starts, options.preferred)
     turned = _turned(found)
     if turned is found:
         return found
-    again = replace(solution, adjusted=turned.adjusted)
-    return select_model(again, more_starts, options.preferred, options.would_take)
+    again = replace(solution, adjusted=turned.adjusted, would_take=found.would_take)
+    return select_model(again, more_starts, options.preferred)
 
 
 def _first_solution(problem: Problem, options: Options) -> Solution:

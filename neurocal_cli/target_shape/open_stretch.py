@@ -174,7 +174,7 @@ def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Ar
     buffer = batches.memory(width)
     for chunk in batches.chunks():
         view = batches.view[chunk]
-        part = buffer[: len(view)]
+        part = buffer[: len(view), :-1]
         derivatives(batches, chunk, state, part)
         by_tau = part[:, POSE.start + 3 : POSE.stop].reshape(len(view), 3, -1)
         by_local = (np.swapaxes(state.R[view], 1, 2) @ by_tau).reshape(-1, 3, 2, n)
