@@ -133,8 +133,10 @@ def test_stretches_are_along_the_sides_of_any_board_however_the_world_lies(rows:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("n_views", [5, 8, 15, 40])
-def test_clean_sets_are_as_certain_as_before(n_views: int) -> None:
+@pytest.mark.parametrize(
+    ("n_views", "most"), [(3, 1.10), (4, 1.05), (5, 1.02), (8, 1.02), (15, 1.02), (40, 1.02)]
+)
+def test_clean_sets_are_about_as_certain_as_on_a_target_given_by_name(n_views: int, most: float) -> None:
     more, z = [], []
     for seed in range(1000, 1100):
         points, truth = photographed("flat", seed, n_views, sigma=0.3)
@@ -145,5 +147,5 @@ def test_clean_sets_are_as_certain_as_before(n_views: int) -> None:
             more.append(std / [by_name.std[name] for name in names])
             z.append((found.K[[0, 1, 0, 1], [0, 1, 2, 2]] - truth.K[[0, 1, 0, 1], [0, 1, 2, 2]]) / std)
     assert len(more) > 95
-    assert np.median(more, axis=0).max() < 1.02
-    assert 0.8 < np.sqrt(np.square(z).mean()) < 1.1
+    assert np.median(more, axis=0).max() < most
+    assert 0.7 < np.sqrt(np.square(z).mean()) < 1.1
