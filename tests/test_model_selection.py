@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.campaign import scene as campaign_scene
 from support.distorted import BENT, SIGMA, bent_set, new_views, within_reach
 from support.scenes import Scene, random_solid, table_1
 from support.slow_cases import slow_but
@@ -133,3 +134,10 @@ def test_a_lens_is_chosen_whatever_else_is_given(type: int) -> None:
     scene, _ = bent_set("k1k2", 11)
     given = dict(scene.given(type))
     assert chosen(scene, 11, **given).distortion_model == "k1k2"
+
+
+def test_where_only_a_fisheye_is_sound_an_ordinary_lens_that_predicts_as_well_is_taken() -> None:
+    """Coefficients of k1k2 are strongly correlated here; without the fisheye only the pinhole would be left."""
+    points, truth = campaign_scene(8615)
+    found = calibrate(points, outliers="keep", target="given")
+    assert found.distortion_model == truth.model == "k1k2"

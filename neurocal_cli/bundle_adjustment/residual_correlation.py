@@ -14,10 +14,9 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, residuals
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
 
-__all__ = ["correlation", "effective_number", "point_residuals", "shared_by_place"]
+__all__ = ["correlation", "effective_number", "point_residuals"]
 
 _SOME_SAY = 0.5  # from which on what points say along their edges counts
-_CELLS = 12  # across the image, and down
 
 
 def correlation(views: Views, errors: Array) -> float:
@@ -71,34 +70,6 @@ def effective_number(n: float, rho: float) -> float:
     """How many independent points n correlated ones are worth, in the plane."""
     rho = min(max(rho, 0.0), 0.99)
     return max(n * ((1 - rho) / (1 + rho)) ** 2, 1.0)
-
-
-def shared_by_place(views: Views, errors: Array) -> float:
-    """Share of the squared residuals that different views have in common at one place of the image.
-
-    It is 0 for noise. What a lens does is the same in all views; what a target does is not.
-
-    Parameters
-    ----------
-    views : Views
-    errors : (N, 2) array
-        Residual of each point, in the order of `views`.
-    """
-    low, high = views.pixels.min(axis=0), views.pixels.max(axis=0)
-    column, row = np.minimum((views.pixels - low) / (high - low) * _CELLS, _CELLS - 1).astype(np.intp).T
-    cells = _CELLS * _CELLS
-    place = views.index * cells + row * _CELLS + column
-    columns = (np.ones(len(place)), *errors.T)
-    number, *sums = (
-        np.bincount(place, values, views.n_views * cells).reshape(-1, cells) for values in columns
-    )
-    # Products of residuals of two views, summed over all pairs of points in a cell.
-    of_pairs = [a.sum(axis=0) ** 2 - (a**2).sum(axis=0) for a in (number, *sums)]
-    several = of_pairs[0] > 0
-    common = (of_pairs[1] + of_pairs[2])[several] / of_pairs[0][several]
-    weight = number.sum(axis=0)[several]
-    square = (errors**2).sum() / len(errors)
-    return float(common @ weight / weight.sum() / square) if square > 0 and several.any() else 0.0
 
 
 def point_residuals(views: Views, state: CameraState) -> Array:

@@ -166,7 +166,7 @@ def _best(
     """
     eligible = _eligible(fitted, views.n_views > 1)
     n = worth(views, eligible.values()) * repeated.worth
-    sound = _without_wide(eligible, fitted, n)
+    sound = _eligible(_without_wide(fitted, n), views.n_views > 1)
     criterion = {name: candidate.criterion(n) for name, candidate in sound.items()}
     most = sound[min(criterion, key=lambda name: criterion[name])].coefficients + _MORE
     finite = {name: candidate for name, candidate in sound.items() if np.isfinite(candidate.lost).all()}
@@ -194,9 +194,7 @@ def _best(
     return min(tied, key=lambda name: criterion[name]), good
 
 
-def _without_wide(
-    eligible: dict[str, Candidate], fitted: dict[str, Candidate], n: float
-) -> dict[str, Candidate]:
+def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate]:
     """Without wide-angle lenses' models where ordinary ones do nearly as well.
 
     An ordinary one need not be sound to tell that the lens may be ordinary.
@@ -204,14 +202,13 @@ def _without_wide(
     ordinary = [c for name, c in fitted.items() if name not in WIDE and c.coefficients <= _MOST_ORDINARY]
     ordinary = [c for c in ordinary if c.not_monotonic is None and np.isfinite(c.lost).all()]
     if not ordinary:
-        return eligible
+        return fitted
     lowest, least = min(c.criterion(n) for c in ordinary), min(map(_lost, ordinary))
-    some = {
+    return {
         name: c
-        for name, c in eligible.items()
+        for name, c in fitted.items()
         if name not in WIDE or (c.criterion(n) < lowest - _DECISIVE and _lost(c) <= (1 + 2 * _TIE) * least)
     }
-    return some or eligible
 
 
 def _decidedly(

@@ -21,9 +21,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.cross_validation import held_out_views, reduced
 from neurocal_cli.bundle_adjustment.open_coefficients import fisheye_sizes
 from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
@@ -33,7 +34,7 @@ from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NODES, RADII, REACHE
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
-__all__ = ["with_displacement"]
+__all__ = ["promised", "with_displacement"]
 
 _N = len(NODES)
 # Of the coefficients, k1 to k4 and the nodes; and the parts of these.
@@ -68,17 +69,43 @@ def with_displacement(solution: Solution) -> Solution:
     Solution
         Its problem has the prior as the restraint; `shared` is the covariance with the prior.
     """
-    problem = solution.problem.with_model("rich")
-    problem = replace(problem, fixed=problem.fixed | set(REACHES))
-    state = solution.state
-    if state.model != "rich":
-        k = np.concatenate([state.k, _reaches(problem, state), np.zeros(_N)])
-        state = replace(state, model="rich", k=k)
-    start = replace(solution, problem=problem, adjusted=replace(solution.adjusted, state=state), shared=None)
-    solution = _by_evidence(start)
-    if problem.points.covariance is not None:
+    solution = _by_evidence(_begun(solution))
+    if solution.problem.points.covariance is not None:
         solution = _by_evidence(reweighted(solution))
     return solution
+
+
+def promised(solution: Solution, repeated: RepeatedPoses) -> Array:
+    """Squared error of each view when it is left out, as a rich lens promises it that is not yet adjusted.
+
+    Parameters
+    ----------
+    solution : Solution
+        A fisheye, at the minimum.
+    repeated : RepeatedPoses
+        Views of one pose are left out together.
+    """
+    solution = _begun(solution)
+    problem, state = solution.problem, solution.state
+    normal, _ = normal_blocks(problem.views.batches, state)
+    processes, sizes = _beginning(problem, state, normal)
+    found = _sizes(problem, state, normal, processes, sizes)
+    free = problem.free_camera
+    n, m = int(free.sum()), len(_UNKNOWNS)
+    held = np.pad(found.precision, (n - m, 0))
+    missing = np.pad(-found.precision @ state.k[_UNKNOWNS], (n - m, 0))
+    return held_out_views(normal, free, problem.free_poses, (held, missing), repeated)
+
+
+def _begun(solution: Solution) -> Solution:
+    """A rich lens without a displacement, or the one that is there."""
+    if solution.state.model == "rich":
+        return replace(solution, shared=None)
+    problem = solution.problem.with_model("rich")
+    problem = replace(problem, fixed=problem.fixed | set(REACHES))
+    k = np.concatenate([solution.state.k, _reaches(problem, solution.state), np.zeros(_N)])
+    state = replace(solution.state, model="rich", k=k)
+    return replace(solution, problem=problem, adjusted=replace(solution.adjusted, state=state), shared=None)
 
 
 def _reaches(problem: Problem, state: CameraState) -> Array:
@@ -128,18 +155,12 @@ def _by_evidence(solution: Solution) -> Solution:
     """Adjust, and find the sizes anew, until they stay."""
     problem, adjusted = solution.problem, solution.adjusted
     normal, _ = normal_blocks(problem.views.batches, adjusted.state)
-    if isinstance(problem.restraint, _Prior):
-        sizes, scale = problem.restraint.sizes, problem.restraint.scale
-    else:
-        scale = float(np.sqrt(normal[:, -1, -1].sum() / problem.views.n_equations))
-        scale /= float(adjusted.state.entries[0, 0])
-        sizes = np.full(len(_OF_PROFILE) + len(_OF_FIELD), scale)
-    processes = _processes(adjusted.state.k[FIRST_NODE - len(REACHES) : FIRST_NODE], scale)
+    processes, sizes = _beginning(problem, adjusted.state, normal)
     found = _sizes(problem, adjusted.state, normal, processes, sizes)
     for _ in range(_ROUNDS):
         before = found.sizes
         rows = np.asarray(np.linalg.cholesky(found.precision).T, dtype=float)
-        problem = replace(problem, restraint=_Prior(rows, before, scale))
+        problem = replace(problem, restraint=_Prior(rows, before, processes.scale))
         adjusted = problem.adjust(replace(adjusted, state=adjusted.state))
         normal = adjusted.normal
         found = _sizes(problem, adjusted.state, normal, processes, before)
@@ -148,6 +169,15 @@ def _by_evidence(solution: Solution) -> Solution:
     return replace(
         solution, problem=problem, adjusted=adjusted, shared=found.covariance, by_prior=_N - found.determined
     )
+
+
+def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Processes, Array]:
+    """The processes and their first sizes."""
+    reaches = state.k[FIRST_NODE - len(REACHES) : FIRST_NODE]
+    if isinstance(problem.restraint, _Prior):
+        return _processes(reaches, problem.restraint.scale), problem.restraint.sizes
+    scale = float(np.sqrt(normal[:, -1, -1].sum() / problem.views.n_equations) / state.entries[0, 0])
+    return _processes(reaches, scale), np.full(len(_OF_PROFILE) + len(_OF_FIELD), scale)
 
 
 @dataclass(frozen=True, eq=False)
