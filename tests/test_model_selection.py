@@ -137,7 +137,7 @@ def test_a_lens_is_chosen_whatever_else_is_given(type: int) -> None:
 
 
 def test_where_only_a_fisheye_is_sound_an_ordinary_lens_that_predicts_as_well_is_taken() -> None:
-    """Coefficients of k1k2 are strongly correlated here; without the fisheye only the pinhole would be left."""
+    """Its coefficients are strongly correlated here; without the fisheye only the pinhole would be left."""
     points, truth = campaign_scene(8615)
     found = calibrate(points, outliers="keep", target="given")
     assert found.distortion_model == truth.model == "k1k2"
