@@ -21,9 +21,10 @@ from neurocal_cli import Correspondences, calibrate, read_points, write_points
 from neurocal_cli.io.calibration_yaml import format_calibration
 
 VIEWS = [13, 100, 1000]
-GIVEN = ["--distortion", "plumb_bob", "--outliers", "keep"]
+GIVEN = ["--distortion", "plumb_bob", "--outliers", "keep", "--target", "given"]
 
 
+PLAIN = {"distortion": "none", "outliers": "keep", "target": "given"}
 PLUMB_BOB = [-0.2, 0.05, 0.001, -0.001, 0.02]
 
 
@@ -40,8 +41,17 @@ def flat_points(n_views: int, model: str) -> Correspondences:
 )
 def test_neurocal_on_flat_views(benchmark: BenchmarkFixture, n_views: int, model: str) -> None:
     points = flat_points(n_views, model)
-    calibration = benchmark(lambda: calibrate(points, skew=False, distortion=model, outliers="keep"))
+    calibration = benchmark(
+        lambda: calibrate(points, skew=False, distortion=model, outliers="keep", target="given")
+    )
     assert calibration.converged
+
+
+@pytest.mark.benchmark(group="flat views of 54 points")
+@pytest.mark.parametrize(("n_views", "model"), [(n, model) for model in ("none", "plumb_bob") for n in VIEWS])
+def test_neurocal_with_the_target_looked_for(benchmark: BenchmarkFixture, n_views: int, model: str) -> None:
+    points = flat_points(n_views, model)
+    assert benchmark(lambda: calibrate(points, skew=False, distortion=model, outliers="keep")).converged
 
 
 @pytest.mark.benchmark(group="flat views of 54 points")
@@ -64,7 +74,7 @@ def test_opencv_on_the_same_views(benchmark: BenchmarkFixture, n_views: int, mod
     pinhole = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     flags = pinhole if model == "none" else 0
     result = benchmark(lambda: cv2.calibrateCamera(world, pixels, points.image_size, None, None, flags=flags))
-    same = calibrate(points, skew=False, distortion=model, outliers="keep")
+    same = calibrate(points, skew=False, distortion=model, outliers="keep", target="given")
     assert result[0] == pytest.approx(same.rmse_px, rel=1e-3)
 
 
@@ -73,7 +83,7 @@ def test_opencv_on_the_same_views(benchmark: BenchmarkFixture, n_views: int, mod
 def test_one_view_of_440_points(benchmark: BenchmarkFixture, type: int) -> None:
     scene = table_1()
     points = scene.points(0.3, np.random.default_rng(1))
-    assert benchmark(lambda: calibrate(points, **scene.given(type))).converged
+    assert benchmark(lambda: calibrate(points, **PLAIN, **scene.given(type))).converged
 
 
 def million_points() -> Correspondences:
@@ -86,7 +96,7 @@ def million_points() -> Correspondences:
 @pytest.mark.benchmark(group="one view")
 def test_one_view_of_a_million_points(benchmark: BenchmarkFixture) -> None:
     points = million_points()
-    assert benchmark.pedantic(lambda: calibrate(points), rounds=3).converged
+    assert benchmark.pedantic(lambda: calibrate(points, **PLAIN), rounds=3).converged
 
 
 @pytest.mark.benchmark(group="reading")
