@@ -16,7 +16,7 @@ from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views, arrange
-from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
+from neurocal_cli.least_squares.chi_squared import chi_squared, exceeded_by_chance
 from neurocal_cli.verdict.assessment import _AtMinimum
 
 NO_SKEW = np.array([1, 0, 1, 1, 1], dtype=bool)
@@ -171,3 +171,13 @@ def test_coefficients_that_only_tell_together_do_not_hide_that_views_contradict_
     _, both = std(J, again, residual)
     assert (one > 1.3 * plain).all()
     np.testing.assert_allclose(both, one, rtol=0.05)
+
+
+def test_a_direction_without_variance_does_not_count() -> None:
+    """Rounding makes the smallest variance of a nearly singular covariance negative."""
+    cov = np.array([[4.0, 2.0 * (1 + 1e-13)], [2.0 * (1 + 1e-13), 1.0]])
+    assert np.linalg.eigvalsh(cov)[0] < 0
+    assert chi_squared(np.array([2.0, 1.01]), cov) == pytest.approx(1.01, abs=0.01)
+    regular = np.array([[4.0, 1.0], [1.0, 2.0]])
+    z = np.array([0.3, -0.2])
+    assert chi_squared(z, regular) == pytest.approx(z @ np.linalg.inv(regular) @ z)

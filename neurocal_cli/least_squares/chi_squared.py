@@ -1,4 +1,4 @@
-"""Levels that a chi-squared variable exceeds by chance only, without SciPy, which takes long to load."""
+"""Chi-squared of differences, and levels that chance exceeds; without SciPy, which takes long to load."""
 
 from __future__ import annotations
 
@@ -6,7 +6,26 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["exceeded_by_chance"]
+__all__ = ["chi_squared", "exceeded_by_chance"]
+
+_ROUNDING = 1e-15  # of the largest eigenvalue
+
+
+def chi_squared(difference: Array, covariance: Array) -> float:
+    """Differences in units of their covariance, squared: d^T C^-1 d.
+
+    A direction in which rounding has left no variance, or less than none, does not count.
+
+    Parameters
+    ----------
+    difference : (n,) array
+    covariance : (n, n) array
+    """
+    scale = np.sqrt(np.diagonal(covariance))
+    variance, directions = np.linalg.eigh(covariance / np.outer(scale, scale))
+    known = variance > _ROUNDING * variance[-1]
+    along = (difference / scale) @ directions[:, known]
+    return float((along**2 / variance[known]).sum())
 
 
 def exceeded_by_chance(freedom: float | Array, sigmas: float) -> Array:

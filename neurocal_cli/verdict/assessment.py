@@ -47,6 +47,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.chi_squared import chi_squared
 from neurocal_cli.median import median
 from neurocal_cli.target_shape.camera_covariance import CameraSeen, camera_covariance
 from neurocal_cli.verdict.board_shape import BoardShape, board_shape
@@ -281,10 +282,8 @@ class _AtMinimum:
         difference, cov = disagreement(self._minimum())
         if not np.isfinite(cov).all():
             return np.nan
-        scale = np.sqrt(np.diagonal(cov))
-        z = difference / scale
-        chi = z @ np.linalg.pinv(cov / np.outer(scale, scale), hermitian=True) @ z
-        return float(chi * self.spare / max(self.cost, 1e-300) / len(z))
+        chi = chi_squared(difference, cov)
+        return chi * self.spare / max(self.cost, 1e-300) / len(difference)
 
     def projection(self) -> ProjectionUncertainty | None:
         """How uncertain projected pixels are all over the image, if its size is known."""
