@@ -13,6 +13,7 @@ from support.targets import photographed
 
 from neurocal_cli import calibrate
 from neurocal_cli.bundle_adjustment.adjust import adjust
+from neurocal_cli.bundle_adjustment.open_coefficients import SpreadOfOpen
 from neurocal_cli.bundle_adjustment.problem import problem_for
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.geometry import Array
@@ -24,7 +25,7 @@ from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.stretch_covariance import stretched_rig
 from neurocal_cli.target_shape import open_stretch as open_stretch_module
-from neurocal_cli.target_shape.open_stretch import SpreadOfStretch, open_stretch, spread_of_stretch, stretches
+from neurocal_cli.target_shape.open_stretch import open_stretch, spread_of_stretch, stretches
 
 EPS = 1e-6
 
@@ -50,10 +51,10 @@ def test_a_stretch_that_noise_hides_is_in_the_standard_deviations() -> None:
 def only(which: int, monkeypatch: pytest.MonkeyPatch, module: object) -> None:
     """One of the stretches is there, with a std of 1; how all that is free follows is as it was found."""
 
-    def known(S: Array, g: Array, variance: float) -> SpreadOfStretch:
+    def known(S: Array, g: Array, variance: float) -> SpreadOfOpen:
         found = spread_of_stretch(S, g, 1e12)
         assert found is not None
-        return SpreadOfStretch(1.0, np.diag(np.eye(2)[which]), found.follow)
+        return SpreadOfOpen(np.diag(np.eye(2)[which]), found.follow, 1.0)
 
     monkeypatch.setattr(module, "spread_of_stretch", known)
 

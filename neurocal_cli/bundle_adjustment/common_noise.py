@@ -158,18 +158,14 @@ def _unlikelihood(covariance: Array, residuals: Array, across: Array | None) -> 
     With covariances as `with_common_share` has them. Points that were measured in one direction have one
     variance, the others two by two.
     """
-    own = (
-        0.5 * (covariance[:, 0] + covariance[:, 2]) if across is None else variance_across(covariance, across)
-    )
-    one = np.zeros(len(own), dtype=bool) if across is None else single(across)
+    if across is None:
+        own, one = 0.5 * (covariance[:, 0] + covariance[:, 2]), np.zeros(len(covariance), dtype=bool)
+    else:
+        own, one = variance_across(covariance, across), single(across)
     mean = np.average(own, weights=equations(across, len(own)))
     count = np.where(one, 1.0, 2.0).mean()
-    squared, own, (suu, suv, svv), (u, v) = (
-        (residuals[one] ** 2).sum(axis=1),
-        own[one],
-        covariance[~one].T,
-        residuals[~one].T,
-    )
+    squared, own = (residuals[one] ** 2).sum(axis=1), own[one]
+    (suu, suv, svv), (u, v) = covariance[~one].T, residuals[~one].T
 
     def at(share: float) -> float:
         a, b = 1.0 - share, share * mean

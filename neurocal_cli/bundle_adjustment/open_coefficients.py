@@ -33,6 +33,7 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 __all__ = [
     "OpenCoefficients",
     "OpenPrior",
+    "SpreadOfOpen",
     "corner_radius",
     "fisheye_sizes",
     "open_coefficients",
@@ -65,11 +66,33 @@ class OpenPrior:
         Std of the open ones, where they are there.
     groups : tuple of int arrays
         Places among the open ones that come and go together.
+    odds : float
+        That a group is there.
     """
 
     is_open: NDArray[np.bool_]
     size: Array
     groups: tuple[NDArray[np.intp], ...]
+    odds: float = _ODDS
+
+
+@dataclass(frozen=True, eq=False)
+class SpreadOfOpen:
+    """What points tell of open unknowns o.
+
+    Attributes
+    ----------
+    E : (o, o) array
+        Mean of o o^T; nan where the points leave open what was estimated.
+    follow : (f, o) array
+        [T; 1]: how all that is free follows.
+    probability : float
+        That any group is there.
+    """
+
+    E: Array
+    follow: Array
+    probability: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,7 +223,7 @@ def open_of_calibration(
 
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> tuple[Array, Array]:
+def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> SpreadOfOpen:
     """What the points tell of the open unknowns.
 
     Parameters
@@ -212,13 +235,6 @@ def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> tup
     variance : float
         Of the residuals, larger where they are correlated.
     prior : OpenPrior
-
-    Returns
-    -------
-    E : (o, o) array
-        Mean of o o^T; nan where the points leave open what was estimated.
-    follow : (f, o) array
-        [T; 1]: how all that is free follows.
     """
     size, is_open = prior.size, prior.is_open
     c, o = np.flatnonzero(~is_open), np.flatnonzero(is_open)
@@ -233,17 +249,17 @@ def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> tup
         Q = left[np.ix_(some, some)] + np.eye(len(some))
         mean = solve_or_nan(Q, right[some])
         logarithm = 0.5 * float(right[some] @ mean) - 0.5 * float(np.linalg.slogdet(Q)[1])
-        models.append(
-            (logarithm + sum(there) * np.log(_ODDS), some, inverse_or_nan(Q) + np.outer(mean, mean))
-        )
+        logarithm += sum(there) * np.log(prior.odds)
+        models.append((logarithm, some, inverse_or_nan(Q) + np.outer(mean, mean)))
     most = max(logarithm for logarithm, *_ in models)
     for logarithm, some, moment in models:
         weight = np.exp(logarithm - most)
         second[np.ix_(some, some)] += weight * moment
         total += weight
+    none = np.exp(models[0][0] - most) / total  # of the first model
     follow = np.zeros((len(is_open), len(o)))
     follow[c], follow[o] = T, np.eye(len(o))
-    return second * size[:, None] * size / total, follow
+    return SpreadOfOpen(second * size[:, None] * size / total, follow, float(1.0 - none))
 
 
 def wide_covariance(entries: Array, E: Array, follow: Array, is_open: NDArray[np.bool_]) -> Array:

@@ -68,9 +68,9 @@ def open_covariance(
     kept = np.append(np.flatnonzero(all_free), columns.width - 1)
     left, _ = eliminate(normal, kept, columns.pose)
     whole = left.sum(axis=0)
-    E, follow = spread_of_open(whole[:-1, :-1], whole[:-1, -1], variance, _joined(is_open, opened))
-    follow = follow[~is_open]
-    added = follow @ E @ follow.T
+    spread = spread_of_open(whole[:-1, :-1], whole[:-1, -1], variance, _joined(is_open, opened))
+    follow = spread.follow[~is_open]
+    added = follow @ spread.E @ follow.T
     return added if np.isfinite(added).all() else None
 
 

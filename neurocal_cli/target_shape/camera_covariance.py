@@ -169,7 +169,8 @@ def _opened(
     normal = _basis(seen, state, richer.free, normal).normal
     q = reduced(normal, richer.free, seen.free_poses)
     is_open = richer.prior.is_open
-    E, follow = spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
+    spread = spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
+    E, follow = spread.E, spread.follow
     entries = wide_covariance(known.found.entries, E, follow, is_open)
     if not np.isfinite(entries).all():
         return known

@@ -189,10 +189,8 @@ def point_terms(
         by_point = by_world(part, state, scale, view)
         rows = np.concatenate([by_point, part[:, used]], axis=1)
         real = label[chunk] >= 0
-        point = (np.moveaxis(by_point, 3, 1) @ np.moveaxis(rows, 3, 1).swapaxes(2, 3))[
-            real
-        ]  # (.., 3, f + 10)
-        flat = label[chunk][real]
+        every = np.moveaxis(by_point, 3, 1) @ np.moveaxis(rows, 3, 1).swapaxes(2, 3)
+        point, flat = every[real], label[chunk][real]  # (.., 3, f + 10), (..,)
         summed += _summed_by(flat, point.reshape(len(flat), -1), n_points).reshape(summed.shape)
         place = np.broadcast_to(view[:, None] * n_points, real.shape)[real] + flat
         np.add.at(cross, place, np.swapaxes(point[:, :, 3 + f : -1], 1, 2))

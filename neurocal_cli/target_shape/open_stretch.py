@@ -2,14 +2,9 @@
 
 Noise can hide that a print is stretched, and a stretched print moves the focal length. So where the choice
 kept the target, two stretches are open unknowns o: one side longer than stated, and sides that are not at
-right angles. Each is absent, or Gaussian with the size that prints have. To second order around the minimum,
-all four models follow from one normal matrix. With w_m the posterior probability of model m, P_m and o_m its
-posterior covariance and mean of o, and T = dc/do how the parameters c follow,
-
-    cov(c) + T E T^T,    E = sum_m w_m (P_m + o_m o_m^T),
-
-which is the covariance that model averaging has (Hoeting et al. 1999), around the parameters for the given
-target, because those are reported. `bundle_adjustment.open_coefficients` does the same for the lens.
+right angles. Each is absent, or Gaussian with the size that prints have. The covariance is that of averaging
+over all four models, around the parameters for the given target, because those are reported; see
+`bundle_adjustment.open_coefficients`, which does the same for the lens.
 """
 
 from __future__ import annotations
@@ -20,16 +15,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.open_coefficients import OpenPrior, SpreadOfOpen, spread_of_open
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.leave_out import inverse_or_nan, solve_or_nan
+from neurocal_cli.least_squares.leave_out import solve_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.target import is_flat
 
 __all__ = [
-    "SpreadOfStretch",
     "StretchedCovariance",
     "open_stretch",
     "spread_of_stretch",
@@ -45,25 +40,6 @@ _SIZE = 1.5e-3
 _ODDS = 0.2
 _NEGLIGIBLE = 1e-3  # a probability that leaves standard deviations as they are, to the last bit
 _NO_PRINT = 5.0  # standard deviations of prints and pixels together: the points ask for something else
-
-
-@dataclass(frozen=True, eq=False)
-class SpreadOfStretch:
-    """What points leave open of a stretch.
-
-    Attributes
-    ----------
-    probability : float
-        That the print is stretched.
-    E : (2, 2) array
-        Mean of o o^T.
-    follow : (f + 2, 2) array
-        [T; 1]: how all that is free follows.
-    """
-
-    probability: float
-    E: Array
-    follow: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,8 +102,7 @@ def stretches(world: Array) -> Array:
     return np.stack([np.outer(x, x) - np.outer(y, y), np.outer(x, y) + np.outer(y, x)])
 
 
-@np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfStretch | None:
+def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfOpen | None:
     """What points tell of two stretches; None where that is negligible, or more than prints are stretched.
 
     Parameters
@@ -139,24 +114,14 @@ def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfStretch | 
     variance : float
         Of the residuals.
     """
-    T = -solve_scaled(S[:-2, :-2], S[:-2, -2:])
+    is_open = np.arange(len(g)) >= len(g) - 2
+    prior = OpenPrior(is_open, np.full(2, _SIZE), (np.array([0]), np.array([1])), _ODDS)
+    found = spread_of_open(S, g, variance, prior)
+    T = found.follow[:-2]
     left = (S[-2:, -2:] + S[-2:, :-2] @ T) / variance
     right = (g[-2:] + T.T @ g[:-2]) / variance
-    there = np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1.0]])
-    size = _SIZE * there
-    Q = np.eye(2) + size[:, :, None] * left * size[:, None, :]
-    mean = solve_or_nan(Q, size * right)
-    logarithm = 0.5 * (size * right * mean).sum(axis=1) - 0.5 * np.linalg.slogdet(Q)[1]
-    logarithm += there.sum(axis=1) * np.log(_ODDS)
-    weight = np.exp(logarithm - logarithm.max())
-    weight /= weight.sum()
-    moment = size[:, :, None] * (inverse_or_nan(Q) + mean[:, :, None] * mean[:, None, :]) * size[:, None, :]
-    E = (weight[:, None, None] * moment).sum(axis=0)
-    probability = float(weight[1:].sum())
     beyond = float(right @ solve_or_nan(left + _SIZE**2 * left @ left, right))
-    if not probability > _NEGLIGIBLE or beyond > _NO_PRINT**2:
-        return None
-    return SpreadOfStretch(probability, E, np.concatenate([T, np.eye(2)]))
+    return found if found.probability > _NEGLIGIBLE and not beyond > _NO_PRINT**2 else None
 
 
 def stretched_blocks(batches: PointBatches, state: CameraState, by: Array) -> Array:
