@@ -1,23 +1,25 @@
 """What a camera is uncertain by because its distortion model was chosen.
 
 A model that was chosen for what it predicts lacks coefficients that real lenses have: p1 and p2 move the
-image centre, k3 moves k1 and k2. They are left open here, each group of them absent or with a Gaussian prior
-of the size that lenses have (George and McCulloch 1993). To second order around the minimum, all the models
-that the chosen one is part of follow from one normal matrix. With w_m the posterior probability of model m,
-P_m and o_m its posterior covariance and mean of the open coefficients o, and T = dc/do how the parameters c
-of the camera follow them,
+image centre, k3 moves k1 and k2. Where it has them, noise may be why: they are taken where noise makes them
+large. All of these are open here, each group of them absent or with a Gaussian prior, three times or a third
+as wide as real lenses are, all groups alike (George and McCulloch 1993). To second order around the minimum,
+all these models follow from one normal matrix. With w_m the posterior probability of model m, P_m and o_m its
+posterior covariance and mean of the open coefficients o, o_r their reported values, which are 0 where they
+were left out, and T = dc/do how the parameters c of the camera follow them,
 
-    E = sum_m w_m (P_m + o_m o_m^T),    cov(c, o) = [T; 1] E [T; 1]^T + [cov(c), 0; 0, 0],
+    E = sum_m w_m (P_m + (o_m - o_r) (o_m - o_r)^T),    added(c, o) = [T; 1] E [T; 1]^T,
 
-which is the covariance that model averaging has (Hoeting et al. 1999), around the parameters of the chosen
-model, because those are reported.
+which is what model averaging adds (Hoeting et al. 1999) to the covariance for known o, around the parameters
+of the chosen model, because those are reported. The covariance of the chosen model counts already that noise
+moves the open coefficients that it has, and E only what goes beyond it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from itertools import compress, product
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +29,8 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.geometry import Array
-from neurocal_cli.least_squares.leave_out import inverse_or_nan, solve_or_nan
-from neurocal_cli.least_squares.normal_equations import solve_scaled
+from neurocal_cli.least_squares.leave_out import inverse_or_nan
+from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 
 __all__ = [
     "OpenCoefficients",
@@ -50,7 +52,9 @@ __all__ = [
 _POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015), (("k3",), 6, 0.012))
 _FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
 _STEEPEST = 1.55  # rad
-_ODDS = 3.0  # that a group is there
+_NOISE_MAY_MAKE = ("p1", "p2", "k3")  # of those that were estimated; k1 and k2 stand far above their noise
+_ODDS = 10.0  # that a group is there
+_SCALES = (3.0, 0.3)  # of the sizes of all groups together: half a decade above and below
 _RICHEST = ("plumb_bob", "k1k2p1p2", "k1k2", "k1")
 
 
@@ -62,18 +66,27 @@ class OpenPrior:
     ----------
     is_open : (f,) bool array
         Which of the free unknowns are open.
+    left_out : (f,) bool array
+        Which of these were not estimated.
+    value : (o,) array
+        What is reported of the open ones; 0 where they were left out.
     size : (o,) array
-        Std of the open ones, where they are there.
+        Std of the open ones around 0, where they are there.
     groups : tuple of int arrays
         Places among the open ones that come and go together.
     odds : float
         That a group is there.
+    scales : tuple of float
+        Of all sizes together; each is as probable as the others.
     """
 
     is_open: NDArray[np.bool_]
+    left_out: NDArray[np.bool_]
+    value: Array
     size: Array
     groups: tuple[NDArray[np.intp], ...]
     odds: float = _ODDS
+    scales: tuple[float, ...] = _SCALES
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +96,8 @@ class SpreadOfOpen:
     Attributes
     ----------
     E : (o, o) array
-        Mean of o o^T; nan where the points leave open what was estimated.
+        What is to be added to the covariance of the open ones that was estimated, which is 0 where they were
+        left out; nan where the points leave open what was estimated.
     follow : (f, o) array
         [T; 1]: how all that is free follows.
     probability : float
@@ -106,7 +120,7 @@ class OpenCoefficients:
     k : (K,) array
         Its coefficients; the open ones are 0.
     free : (5 + K,) bool array
-        What is free of A's entries and the coefficients, open ones included.
+        What is free of A's entries and the coefficients, those left out included.
     prior : OpenPrior
     """
 
@@ -181,22 +195,33 @@ def open_coefficients(
     if not choice or not np.isfinite(reach) or not reach > 0 or not set(own) <= set(names):
         return None
     value = dict(zip(own, k.tolist(), strict=True))
-    estimated = dict(zip(own, free[5:].tolist(), strict=True))
-    is_open = np.array([False] * 5 + [not estimated.get(name, False) for name in names])
-    if not is_open.any():
+    estimated = {name for name, is_free in zip(own, free[5:].tolist(), strict=True) if is_free}
+    wide = richer == "fisheye"
+    may_be_noise = () if wide else _NOISE_MAY_MAKE
+    open_names = [name for name in names if name not in estimated or name in may_be_noise]
+    if not open_names:
         return None
-    wanted = free.copy()[:5].tolist() + [True] * len(names)
-    far = max(float(np.arctan(reach)) if richer == "fisheye" else reach, corner)
-    at = {name: place for place, name in enumerate(np.array(names)[is_open[5:]].tolist())}
-    size, groups = np.zeros(len(at)), []
-    for members, power, share in _FISHEYE if richer == "fisheye" else _POLYNOMIAL:
-        places = [at[name] for name in members if name in at]
+    far = max(float(np.arctan(reach)) if wide else reach, corner)
+    size, groups = np.zeros(len(open_names)), []
+    for members, power, share in _FISHEYE if wide else _POLYNOMIAL:
+        places = [open_names.index(name) for name in members if name in open_names]
         size[places] = share / far**power
         if places:
             groups.append(np.array(places))
-    everything = np.array(wanted)
-    kept = np.array([value.get(name, 0.0) for name in names])
-    return OpenCoefficients(richer, kept, everything, OpenPrior(is_open[everything], size, tuple(groups)))
+    everything = np.append(free[:5], np.ones(len(names), dtype=bool))
+    is_open, left_out = (
+        np.array([False] * 5 + [name in some for name in names])[everything]
+        for some in (open_names, set(names) - estimated)
+    )
+    reported = np.array([value.get(name, 0.0) for name in names])
+    prior = OpenPrior(
+        is_open,
+        left_out,
+        np.where(left_out, 0.0, np.append(np.zeros(int(free[:5].sum())), reported))[is_open],
+        size,
+        tuple(groups),
+    )
+    return OpenCoefficients(richer, reported, everything, prior)
 
 
 def open_of_calibration(
@@ -231,39 +256,55 @@ def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> Spr
     S : (f, f) array
         Normal matrix of what is free, poses eliminated.
     g : (f,) array
-        Right side, J^T r.
+        Right side, J^T r, at the reported values.
     variance : float
         Of the residuals, larger where they are correlated.
     prior : OpenPrior
     """
-    size, is_open = prior.size, prior.is_open
-    c, o = np.flatnonzero(~is_open), np.flatnonzero(is_open)
+    c, o = np.flatnonzero(~prior.is_open), np.flatnonzero(prior.is_open)
     T = -solve_scaled(S[np.ix_(c, c)], S[np.ix_(c, o)])
-    # In units of the prior: what is left of the open ones once the others have followed.
-    left = (S[np.ix_(o, o)] + S[np.ix_(o, c)] @ T) * size[:, None] * size / variance
-    right = (g[o] + T.T @ g[c]) * size / variance
-    second, total = np.zeros_like(left), 0.0
-    models = []
-    for there in product((False, True), repeat=len(prior.groups)):
-        some = np.concatenate([np.zeros(0, np.intp), *compress(prior.groups, there)])
-        Q = left[np.ix_(some, some)] + np.eye(len(some))
-        mean = solve_or_nan(Q, right[some])
-        logarithm = 0.5 * float(right[some] @ mean) - 0.5 * float(np.linalg.slogdet(Q)[1])
-        logarithm += sum(there) * np.log(prior.odds)
-        models.append((logarithm, some, inverse_or_nan(Q) + np.outer(mean, mean)))
-    most = max(logarithm for logarithm, *_ in models)
-    for logarithm, some, moment in models:
-        weight = np.exp(logarithm - most)
-        second[np.ix_(some, some)] += weight * moment
-        total += weight
-    none = np.exp(models[0][0] - most) / total  # of the first model
-    follow = np.zeros((len(is_open), len(o)))
+    # What is left of the open ones once the others have followed, as a Gaussian's J^T J and J^T r at 0.
+    left = (S[np.ix_(o, o)] + S[np.ix_(o, c)] @ T) / variance
+    right = (g[o] + T.T @ g[c]) / variance + left @ prior.value
+    size, logarithm, is_none = _models(prior)
+    P = np.linalg.inv(np.eye(len(o)) + size[:, :, None] * left * size[:, None, :])  # in units of the prior
+    mean = (P @ (size * right)[..., None])[..., 0]
+    logarithm = logarithm + 0.5 * (size * right * mean).sum(axis=1) + 0.5 * np.linalg.slogdet(P)[1]
+    weight = np.exp(logarithm - logarithm.max())
+    weight /= weight.sum()
+    away = size * mean - prior.value
+    second = size[:, :, None] * P * size[:, None, :] + away[:, :, None] * away[:, None, :]
+    E = _beyond(np.einsum("m,mij->ij", weight, second), left, prior.left_out[prior.is_open])
+    follow = np.zeros((len(prior.is_open), len(o)))
     follow[c], follow[o] = T, np.eye(len(o))
-    return SpreadOfOpen(second * size[:, None] * size / total, follow, float(1.0 - none))
+    return SpreadOfOpen(E, follow, float(1.0 - weight[is_none].sum()))
 
 
-def wide_covariance(entries: Array, E: Array, follow: Array, is_open: NDArray[np.bool_]) -> Array:
+def _models(prior: OpenPrior) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Sizes (m, o) of the open ones in each model, 0 where they are absent; log prior; which has none."""
+    there = np.array(list(product((False, True), repeat=len(prior.groups))))
+    size = np.zeros((len(prior.scales), len(there), len(prior.size)))
+    for group, present in zip(prior.groups, there.T, strict=True):
+        size[..., group] = np.where(present[:, None], np.outer(prior.scales, prior.size[group])[:, None], 0.0)
+    n_there = np.tile(there.sum(axis=1), len(prior.scales))
+    return size.reshape(len(n_there), -1), n_there * np.log(prior.odds), n_there == 0
+
+
+def _beyond(second: Array, left: Array, left_out: NDArray[np.bool_]) -> Array:
+    """(o, o) of the second moment what the covariance of the estimated ones does not have; never negative."""
+    if left_out.all():
+        return second
+    more, own = second.copy(), np.ix_(~left_out, ~left_out)
+    more[own] -= inverse_or_nan(left[own])
+    if not np.isfinite(more).all():
+        return np.full_like(second, np.nan)
+    scale = unit_diagonal(second)[1]
+    values, vectors = np.linalg.eigh(more * scale[:, None] * scale)
+    return np.asarray((vectors * values.clip(min=0.0)) @ vectors.T / scale[:, None] / scale)
+
+
+def wide_covariance(entries: Array, E: Array, follow: Array, left_out: NDArray[np.bool_]) -> Array:
     """(f, f) covariance of all that is free, from that of what was estimated for known open ones."""
     wide = follow @ E @ follow.T
-    wide[np.ix_(~is_open, ~is_open)] += entries
+    wide[np.ix_(~left_out, ~left_out)] += entries
     return np.asarray(wide)

@@ -162,7 +162,8 @@ class _Known:
         if (opened := open_of_calibration(calibration, free)) is not None:
             camera, free = replace(camera, distortion=Distortion(opened.model, opened.k)), opened.free
             beforehand = np.zeros(int(free.sum()))
-            beforehand[opened.prior.is_open] = (sigma / opened.prior.size) ** 2
+            prior = opened.prior
+            beforehand[prior.left_out] = (sigma / prior.size[prior.left_out[prior.is_open]]) ** 2
         information, depths = np.diag(beforehand), []
         for k, name in enumerate(points.view_names):
             pose, own = calibration.views[name].pose, points.world[points.view_index == k]

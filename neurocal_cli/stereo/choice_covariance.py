@@ -57,19 +57,17 @@ def open_covariance(
     state = replace(adjusted.state, cameras=(cameras[0], cameras[1]))
     columns = Columns.of(state)
     parts = [
-        (free[place], np.zeros(int(free[place].sum()), dtype=bool))
-        if found is None
-        else (found.free, found.prior.is_open)
+        _not_open(free[place]) if found is None else (found.free, found.prior.is_open, found.prior.left_out)
         for found, place in zip(opened, (own.left, own.right), strict=True)
     ]
-    parts.append((free[own.rig], np.zeros(int(free[own.rig].sum()), dtype=bool)))
-    all_free, is_open = (np.concatenate(part) for part in zip(*parts, strict=True))
+    parts.append(_not_open(free[own.rig]))
+    all_free, is_open, left_out = (np.concatenate(part) for part in zip(*parts, strict=True))
     normal, _ = rig_normal_blocks(problem.frames, problem.observations, state, columns)
     kept = np.append(np.flatnonzero(all_free), columns.width - 1)
     left, _ = eliminate(normal, kept, columns.pose)
     whole = left.sum(axis=0)
-    spread = spread_of_open(whole[:-1, :-1], whole[:-1, -1], variance, _joined(is_open, opened))
-    follow = spread.follow[~is_open]
+    spread = spread_of_open(whole[:-1, :-1], whole[:-1, -1], variance, _joined(is_open, left_out, opened))
+    follow = spread.follow[~left_out]
     added = follow @ spread.E @ follow.T
     return added if np.isfinite(added).all() else None
 
@@ -83,9 +81,17 @@ def _opened(
     return open_of_calibration(calibration, free, adjusted.state.cameras[side].k)
 
 
-def _joined(is_open: NDArray[np.bool_], opened: list[OpenCoefficients | None]) -> OpenPrior:
+def _not_open(free: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    none = np.zeros(int(free.sum()), dtype=bool)
+    return free, none, none
+
+
+def _joined(
+    is_open: NDArray[np.bool_], left_out: NDArray[np.bool_], opened: list[OpenCoefficients | None]
+) -> OpenPrior:
     """Both cameras' open coefficients, each with groups of its own."""
     priors = [found.prior for found in opened if found is not None]
     starts = np.cumsum([0, *(len(prior.size) for prior in priors)])
     groups = [start + group for start, prior in zip(starts, priors, strict=False) for group in prior.groups]
-    return OpenPrior(is_open, np.concatenate([prior.size for prior in priors]), tuple(groups))
+    value, size = (np.concatenate(parts) for parts in zip(*((p.value, p.size) for p in priors), strict=True))
+    return OpenPrior(is_open, left_out, value, size, tuple(groups))

@@ -168,10 +168,10 @@ def _opened(
     normal, _ = normal_blocks(seen.views.batches, state)
     normal = _basis(seen, state, richer.free, normal).normal
     q = reduced(normal, richer.free, seen.free_poses)
-    is_open = richer.prior.is_open
+    left_out = richer.prior.left_out
     spread = spread_of_open(q.S.sum(axis=0), q.g.sum(axis=0), variance, richer.prior)
     E, follow = spread.E, spread.follow
-    entries = wide_covariance(known.found.entries, E, follow, is_open)
+    entries = wide_covariance(known.found.entries, E, follow, left_out)
     if not np.isfinite(entries).all():
         return known
     poses = known.found.poses
@@ -179,7 +179,7 @@ def _opened(
         columns = camera_columns(len(richer.free) - 5)[np.flatnonzero(richer.free)]
         gain = solve_scaled(normal[:, POSE, POSE], np.swapaxes(normal[:, columns, POSE], 1, 2)) @ follow
         poses = poses + gain @ E @ np.swapaxes(gain, 1, 2)
-    found = replace(known.found, entries=entries[np.ix_(~is_open, ~is_open)], poses=poses)
+    found = replace(known.found, entries=entries[np.ix_(~left_out, ~left_out)], poses=poses)
     return replace(known, found=found, wide=WideCovariance(richer, normal, entries))
 
 
@@ -192,7 +192,8 @@ def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> Ca
     found, wide = replace(known.found, entries=entries, poses=poses), known.wide
     if wide is not None:
         everything = wide.entries.copy()
-        everything[np.ix_(~wide.open.prior.is_open, ~wide.open.prior.is_open)] += added.entries
+        estimated = ~wide.open.prior.left_out
+        everything[np.ix_(estimated, estimated)] += added.entries
         wide = replace(wide, entries=everything)
     return replace(known, found=found, wide=wide, stretched=added.probability)
 

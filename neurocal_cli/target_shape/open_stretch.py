@@ -115,7 +115,8 @@ def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfOpen | Non
         Of the residuals.
     """
     is_open = np.arange(len(g)) >= len(g) - 2
-    prior = OpenPrior(is_open, np.full(2, _SIZE), (np.array([0]), np.array([1])), _ODDS)
+    groups = (np.array([0]), np.array([1]))
+    prior = OpenPrior(is_open, is_open, np.zeros(2), np.full(2, _SIZE), groups, _ODDS, scales=(1.0,))
     found = spread_of_open(S, g, variance, prior)
     T = found.follow[:-2]
     left = (S[-2:, -2:] + S[-2:, :-2] @ T) / variance
