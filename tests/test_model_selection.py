@@ -14,6 +14,7 @@ from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.camera.distortion import MODELS
+from neurocal_cli.distortion.candidate_models import _Chain
 from neurocal_cli.errors import DegenerateGeometryError
 
 
@@ -141,3 +142,16 @@ def test_where_only_a_fisheye_is_sound_an_ordinary_lens_that_predicts_as_well_is
     points, truth = campaign_scene(8615)
     found = calibrate(points, outliers="keep", target="given")
     assert found.distortion_model == truth.model == "k1k2"
+
+
+@pytest.mark.parametrize("seed", slow_but((7003, 7024), range(7000, 7100)))
+def test_a_rational_model_that_promises_little_would_not_be_chosen(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    points, _ = campaign_scene(seed)
+    found = calibrate(points)
+    monkeypatch.setattr(_Chain, "_promises_little", lambda *_: False)
+    fitted = calibrate(points)
+    assert fitted.distortion_model == found.distortion_model
+    assert abs(fitted.K[0, 0] - found.K[0, 0]) < 1e-3 * found.std["alpha_u"]
+    assert seed != 7024 or found.distortion_model == "rational"

@@ -9,13 +9,13 @@ import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
-from neurocal_cli.bundle_adjustment.cross_validation import held_out_points, held_out_views
+from neurocal_cli.bundle_adjustment.cross_validation import held_out_points, held_out_views, reduced
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined, relative_std_of_scale
 from neurocal_cli.bundle_adjustment.open_coefficients import radius
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, least_of_free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
-from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle, normal_blocks
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
@@ -25,6 +25,7 @@ from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, wh
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
 __all__ = [
     "Candidate",
@@ -55,6 +56,10 @@ _FAR_FROM_SHORT = 1.15
 _VIEWS_THAT_TELL = 60  # of it: 1000 views take as long as these
 _BEHIND = 1.5  # times the squared error
 _LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
+_PROMISING = (
+    0.5  # of the gain that the criterion asks of the rational model; below, 180 fits were never chosen
+)
+_ROUNDING = 1e-12  # of a normal matrix: narrow fields of view leave combinations of coefficients untold
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
 _SPARE = 1.3  # equations for each unknown
 _WIDE = 0.7  # radius from which on a model can be a fisheye's: 35 degrees off the axis
@@ -184,7 +189,9 @@ class _Chain:
         least = self._cost(state)
         for model in ("none", *_CHAIN):
             problem = supported(self.problem, model)
-            candidate = None if problem is None else self._fit(problem, state)
+            if problem is None or (model == "rational" and self._promises_little(problem, fitted)):
+                continue
+            candidate = self._fit(problem, state)
             if candidate is None:
                 continue
             fitted[model] = candidate
@@ -197,6 +204,27 @@ class _Chain:
         fitted = dict(zip(fitted, found, strict=False))
         best = _fewest_coefficients(found[len(fitted) :], self.problem.views)
         return fitted if best is None else fitted | {"fisheye": best}
+
+    def _promises_little(self, rational: Problem, fitted: dict[str, Candidate]) -> bool:
+        """Whether the rational model need not be fitted, because the criterion cannot be for it.
+
+        Its descent is long, and what it gains is told by the quadratic around the minimum of `plumb_bob`.
+        """
+        simpler = fitted.get("plumb_bob")
+        if simpler is None or self.wanted == "rational" or rational.restraint is not None:
+            return False
+        free, state = rational.free_camera, simpler.adjusted.state
+        start = replace(state, model="rational", k=_coefficients(state, "rational", self.reach))
+        normal, _ = normal_blocks(rational.views.batches, start)
+        q = reduced(normal, free, rational.free_poses)
+        S, scale = unit_diagonal(q.S.sum(axis=0))
+        g = scale * q.g.sum(axis=0)
+        if not np.isfinite(S).all():
+            return False
+        gain = float(g @ np.linalg.lstsq(S, g, rcond=_ROUNDING)[0])
+        return (
+            gain < _PROMISING * _LEAST_PENALTY * _NEW["rational"] * simpler.cost / rational.views.n_equations
+        )
 
     def _cost(self, state: CameraState) -> float:
         """Of a state that has a distortion; a pinhole is no start to go back to."""
