@@ -16,7 +16,7 @@ model, because those are reported.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import compress, product
 
 import numpy as np
@@ -26,6 +26,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import inverse_or_nan, solve_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
@@ -54,7 +55,7 @@ _ODDS = 3.0  # that a group is there
 _RICHEST = ("plumb_bob", "k1k2p1p2", "k1k2", "k1")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class OpenPrior:
     """What is known of open unknowns before any point is seen.
 
@@ -76,7 +77,7 @@ class OpenPrior:
     odds: float = _ODDS
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class SpreadOfOpen:
     """What points tell of open unknowns o.
 
@@ -95,7 +96,7 @@ class SpreadOfOpen:
     probability: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class OpenCoefficients:
     """A camera with the coefficients that its model was chosen without.
 

@@ -7,7 +7,7 @@ distortion, the residual.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.projection import ENTRIES, project_points, project_with_jacobian
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_step
 
 __all__ = [
@@ -41,7 +42,7 @@ def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
     return np.concatenate([np.arange(5), _COEFFICIENTS + np.arange(n_coefficients)])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CameraState:
     """Camera and poses as an adjustment moves them, in normalised units or in pixels and world units.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names, distor
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -63,7 +64,7 @@ _WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (
 _LARGEST_TERM = 3.0  # of one coefficient at the farthest point; all terms together are about 1
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Candidate:
     """A distortion model fitted to the points.
 
@@ -159,7 +160,7 @@ def judged_again(
     return again
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Chain:
     """What all fits have in common.
 

@@ -8,12 +8,12 @@ entries learn them from random values, again by Levenberg-Marquardt.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 
@@ -30,7 +30,7 @@ _LONGEST = 2.0  # step of any entry; in the logarithm a factor of 7
 _ENOUGH = 3  # starts that have ended at the same, lowest loss
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class SharedIntrinsics:
     """Candidates for W's entries, best first.
 

@@ -11,11 +11,10 @@ left out follow from these few small matrices: exactly where the problem is line
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
@@ -26,7 +25,7 @@ _REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal; b
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Quadratics:
     """Errors of G groups as functions of the f unknowns that they share.
 

@@ -8,7 +8,7 @@ open (`open_coefficients`, `open_stretch`).
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,7 @@ from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camer
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.points import Correspondences
@@ -38,7 +39,7 @@ from neurocal_cli.target_shape.uncertainty import CovarianceBasis, covariance_ba
 __all__ = ["CameraCovariance", "CameraSeen", "WideCovariance", "camera_covariance"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CameraSeen:
     """A camera at its minimum with the points that it saw.
 
@@ -80,7 +81,7 @@ class CameraSeen:
     target_kept: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class WideCovariance:
     """Of a camera with the coefficients that its distortion model was chosen without.
 
@@ -101,7 +102,7 @@ class WideCovariance:
     entries: Array
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CameraCovariance:
     """Covariance of a camera that was calibrated from points.
 

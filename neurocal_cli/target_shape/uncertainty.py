@@ -10,7 +10,7 @@ of which sums over views have the information that is left.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.point_batches import products
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.information import Sight, by_world, information_of, labelled
@@ -33,7 +34,7 @@ _MOST_POSES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CovarianceBasis:
     """What the covariance of a camera is computed from (`covariance`, `counting_views`).
 
@@ -99,7 +100,7 @@ def covariance_basis(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _TargetUncertainty:
     """What a camera is known to be when its target is not quite known.
 
