@@ -10,7 +10,7 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.cross_validation import held_out_points, held_out_views
-from neurocal_cli.bundle_adjustment.observability import refuse_undetermined, relative_std_of_scale
+from neurocal_cli.bundle_adjustment.observability import is_weak, refuse_undetermined
 from neurocal_cli.bundle_adjustment.open_coefficients import radius
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, least_of_free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
@@ -32,7 +32,6 @@ __all__ = [
     "as_fisheye",
     "falls_short",
     "fit_candidates",
-    "is_weak",
     "judged_again",
     "supported",
     "worth",
@@ -60,7 +59,6 @@ _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but c
 _SPARE = 1.3  # equations for each unknown
 _WIDE = 0.7  # radius from which on a model can be a fisheye's: 35 degrees off the axis
 _TOLD_APART = 4.0  # squared standard deviations, for each coefficient
-_WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (slow) repeats it
 _LARGEST_TERM = 3.0  # of one coefficient at the farthest point; all terms together are about 1
 
 
@@ -302,11 +300,6 @@ def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
         return False
     own = free_networks(views.subset(some), replace(state, R=state.R[some], t=state.t[some]), _STEPS)
     return cost > _SHORT**2 * float(own.sum()) + 1e-20
-
-
-def is_weak(problem: Problem, state: CameraState, cov: Covariance) -> bool:
-    """Whether the points tell a focal length so badly that other minima may be lower."""
-    return not relative_std_of_scale(problem, state, cov) < _WEAK
 
 
 def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate | None:

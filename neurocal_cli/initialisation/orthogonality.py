@@ -151,7 +151,7 @@ def _columns(group: Array, pairs: tuple[tuple[int, int], ...]) -> Array:
 
 
 def _conic(p: Array) -> tuple[Array, Array]:
-    """The image of the absolute conic, W^-T W^-1: h.conic.h' is the product of the columns W^-1 h and W^-1 h'.
+    """The image of the absolute conic, W^-T W^-1, gives the scalar products of columns W^-1 h.
 
     Parameters
     ----------
