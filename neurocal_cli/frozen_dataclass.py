@@ -7,7 +7,8 @@ is compiled when it is first called: most classes that a command imports never g
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, Field, FrozenInstanceError, dataclass, field, fields
 from functools import cache
 from reprlib import recursive_repr
@@ -79,29 +80,31 @@ class _Init:
 
 
 def _compiled_init(cls: Any) -> Any:
-    known: dict[str, Any] = {"_set": object.__setattr__, "_NOT_GIVEN": _NOT_GIVEN}
-    known |= {f"_{f.name}_default": f.default for f in fields(cls)}
-    known |= {f"_{f.name}_factory": f.default_factory for f in fields(cls)}
-    body = [f"_set(self, {f.name!r}, {value})" for f in fields(cls) if (value := _value(f))]
+    members = fields(cls)
+    # A dictionary of its own, but with the module's names, for those who look for what annotations mean.
+    known = {
+        **getattr(sys.modules.get(cls.__module__), "__dict__", {}),
+        "_set": object.__setattr__,
+        "_NOT_GIVEN": _NOT_GIVEN,
+    }
+    known |= {f"_{f.name}_default": f.default for f in members if f.default is not MISSING}
+    known |= {f"_{f.name}_factory": f.default_factory for f in members if f.default_factory is not MISSING}
+    body = [f" _set(self, {f.name!r}, {value})" for f in members if (value := _value(f))]
     if hasattr(cls, "__post_init__"):
-        body.append("self.__post_init__()")
-    # Compiled in a function, so that `known` are its own and not the module's.
-    text = f"def made({', '.join(known)}):\n def __init__({', '.join(_parameters(cls))}):\n  "
-    namespace: dict[str, Any] = {}
-    exec(text + "\n  ".join(body or ["pass"]) + "\n return __init__", {}, namespace)
-    init = namespace["made"](**known)
+        body.append(" self.__post_init__()")
+    exec("\n".join([f"def __init__({', '.join(_parameters(members))}):", *(body or [" pass"])]), known)
+    init: Any = known["__init__"]
     init.__qualname__ = f"{cls.__qualname__}.__init__"
-    init.__annotations__ = {f.name: f.type for f in fields(cls) if f.init} | {"return": None}
+    init.__annotations__ = {f.name: f.type for f in members if f.init} | {"return": None}
     return init
 
 
-def _parameters(cls: Any) -> Iterator[str]:
-    given = [f for f in fields(cls) if f.init]
+def _parameters(members: Sequence[Field[Any]]) -> Iterator[str]:
     yield "self"
-    yield from (_parameter(f) for f in given if not f.kw_only)
-    if any(f.kw_only for f in given):
-        yield "*"
-        yield from (_parameter(f) for f in given if f.kw_only)
+    yield from (_parameter(f) for f in members if f.init and not f.kw_only)
+    by_name = [_parameter(f) for f in members if f.init and f.kw_only]
+    if by_name:
+        yield from ("*", *by_name)
 
 
 def _parameter(f: Field[Any]) -> str:
