@@ -7,13 +7,14 @@ The edges between neighbouring vertices carry the mid-points: ``h:c:r`` halfway 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.distances import Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Board", "Plane", "smooth_between"]
@@ -25,7 +26,7 @@ _FEWEST_MEASURED = 4  # places that tell a plane's bend
 _MOST_VERTICES = 1000  # along one side; no printer makes more, and a typing error asks for gigabytes
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Plane:
     """One flat chessboard.
 
@@ -177,7 +178,7 @@ class Plane:
             )
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Board:
     """A calibration target of one or several flat chessboards.
 

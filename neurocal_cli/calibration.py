@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from enum import Enum
 from functools import cached_property
 
@@ -14,6 +14,7 @@ from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
@@ -39,7 +40,7 @@ class StopReason(str, Enum):
     NOT_MINIMISED = "solved; the method does not minimise the reprojection error"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class NetworkRecord:
     """What the training did, kept with the result.
 
@@ -81,7 +82,7 @@ class NetworkRecord:
     curve: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class StraightLines:
     """What a lens was found from, where it was found from straight lines alone.
 
@@ -102,7 +103,7 @@ class StraightLines:
     rms_after: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class ViewResult:
     """One view's pose.
 
@@ -124,7 +125,7 @@ class ViewResult:
     fixed: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Rejected:
     """Points that were set aside because they contradict the others.
 
@@ -147,7 +148,7 @@ class Rejected:
         return len(self.error_px)
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Verdict:
     """One word on a calibration, and why.
 
@@ -169,7 +170,7 @@ class Verdict:
     measures: Mapping[str, float]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Calibration:
     """A calibrated camera.
 

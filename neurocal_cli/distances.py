@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["NO_SCALE", "Distance", "Scale", "fitted_scale", "grid_place"]
@@ -18,7 +18,7 @@ _LABEL = re.compile(rf"(?:(?P<plane>.*)/)?(?P<c>{_NUMBER}):(?P<r>{_NUMBER})")
 _ANOTHER_UNIT = 0.1  # a scale further from 1 is no print of the stated board
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Distance:
     """A measured distance between two places of a board.
 
@@ -54,7 +54,7 @@ class Distance:
             object.__setattr__(self, name, float(value))
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Scale:
     """What measured distances say of the scale of a target.
 

@@ -9,7 +9,7 @@ which the calibration knows only the name: another image may have been given the
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.given_points import GivenPoints
@@ -31,7 +32,7 @@ _NEAR = 5.0  # times the rms error of the calibration
 _FEWEST = 4  # points that a pose can be found from
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class ViewEvaluation:
     """One view's error.
 
@@ -53,7 +54,7 @@ class ViewEvaluation:
     fitted: bool
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CameraEvaluation:
     """A camera's error over all the points.
 

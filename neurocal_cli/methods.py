@@ -12,17 +12,14 @@ from neurocal_cli.bundle_adjustment.problem import problem_for
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Calibration, Rejected, camera_of
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.distortion.xi_profile import with_all_minima
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Progress, options_for
 from neurocal_cli.pipeline.fit import fit
-from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.pipeline.result import calibration_of
-from neurocal_cli.pipeline.rich_choice import with_rich_lens
-from neurocal_cli.pipeline.target_choice import lines_that_are_bent, with_target
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.verdict.assessment import assess
@@ -157,15 +154,25 @@ def calibrate(
                 warnings=(*found.warnings, *_unused(points, f"the method is {method}")),
                 judgement=assess,
             )
+        # What is not asked for is not imported, either.
         if outliers == "reject":
+            from neurocal_cli.pipeline.outlier_rejection import fit_robustly
+
             solution, rejected = fit_robustly(problem, options)
         else:
             solution, rejected = fit(problem, options), Rejected()
-        solution, rejected = with_target(problem, solution, rejected, options, choice)
-        solution, rejected = with_rich_lens(problem, solution, rejected, options, choice)
+        if choice != "given":
+            from neurocal_cli.pipeline.rich_choice import with_rich_lens
+            from neurocal_cli.pipeline.target_choice import with_target
+
+            solution, rejected = with_target(problem, solution, rejected, options, choice)
+            solution, rejected = with_rich_lens(problem, solution, rejected, options, choice)
         if known_target is not None:
             solution = replace(solution, target=known_target)
-        solution = with_all_minima(solution)
+        if solution.state.model in WITH_XI:
+            from neurocal_cli.distortion.xi_profile import with_all_minima
+
+            solution = with_all_minima(solution)
         if solution.refusal:
             raise DegenerateGeometryError(solution.refusal)
         found = calibration_of(
@@ -212,6 +219,8 @@ def _distortion_of(method: str, distortion: str) -> str:
 def _about_target(found: Calibration, solution: Solution, choice: str) -> tuple[str, ...]:
     """What the user should know of a target that stays as given."""
     if choice != "given" and solution.straight_lines is not None:
+        from neurocal_cli.pipeline.target_choice import lines_that_are_bent
+
         bent = lines_that_are_bent(solution, found.unit)
         if bent:
             return (bent,)

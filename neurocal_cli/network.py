@@ -17,12 +17,11 @@ Index conventions: the paper swaps V's indices between (6) and (9)-(10) and W's 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -39,7 +38,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Patterns:
     """Training data of a stack of networks.
 
@@ -92,7 +91,7 @@ def e_2d(W: Array, V: Array, gamma: Array, patterns: Patterns) -> Array:
     return np.asarray(0.5 * (patterns.weights * (error**2).sum(-1)).sum(-1))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Gradients:
     """Derivatives of E_2D by W (G, 3, 3), V (G, 3, I) and gamma (G, N)."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurocal_cli.distances import Distance
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Correspondences"]
@@ -19,7 +20,7 @@ _ONLY_VIEW = "view"  # the name of the single view of points that name none
 _LARGEST = 1e100  # squares of coordinates beyond this overflow; no camera sees such a point
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Correspondences:
     """World points and their pixels, grouped by view.
 

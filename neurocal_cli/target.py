@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from neurocal_cli.board import Board, Plane, smooth_between
 from neurocal_cli.distances import NO_SCALE, Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.points import Correspondences
 
@@ -31,7 +32,7 @@ _DIGITS = 9  # of a coordinate over the target's size: the same point is written
 _THIN = 1e-6  # of the size: a plane up to rounding
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Target:
     """Points of a target, given and found.
 

@@ -38,7 +38,7 @@ HOMES = {
 }
 # Rooms, a folder or a module each, from the ground up: each imports from itself and from lower levels only.
 LEVELS = (
-    {"errors", "geometry"},
+    {"errors", "frozen_dataclass", "geometry"},
     {"distances", "processes"},
     {"board", "camera", "least_squares", "median", "network", "points"},
     {"target"},

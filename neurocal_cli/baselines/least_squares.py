@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Least", "Parts", "least_squares"]
@@ -19,7 +19,7 @@ _MOST = 200  # steps
 _STEP = 1.5e-8  # of differences
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Parts:
     """Which residuals an unknown moves: all, or those of one view.
 
@@ -45,7 +45,7 @@ class Parts:
         return cls(of_residual, of_unknown, turn)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Least:
     """A minimum.
 

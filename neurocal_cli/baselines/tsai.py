@@ -23,7 +23,7 @@ large). Stage 2 does not mend that, and a wrong centre goes into everything.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +39,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.projection import normalised_points
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 
 __all__ = ["tsai", "with_known_centre"]
@@ -112,7 +113,7 @@ def _remarks(problem: Problem) -> tuple[str, ...]:
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Alignment:
     """What stage 1 finds of a group of views.
 

@@ -11,13 +11,14 @@ grows linearly with the views; views that share nothing are a group each.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, orthonormalised
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.normal_equations import damped_step
@@ -34,7 +35,7 @@ FLOOR = 1e-13  # rms in normalised pixels that rounding alone accounts for
 Restraint = Callable[[CameraState], tuple[Array, Array]]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Adjusted:
     """Result of `adjust`.
 

@@ -22,7 +22,6 @@ then count the same in both directions, and up to k = 2 as they were measured.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,6 +32,7 @@ from neurocal_cli.bundle_adjustment.measured_directions import (
     single,
     variance_across,
 )
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Noise", "common_share", "measured", "noise_of", "with_common_share"]
@@ -47,7 +47,7 @@ _CONTRADICTED = 3.0  # standard deviations
 _MEASURED, _MISFIT = 2.0, 4.0  # levels up to and from which residuals are and are not the measurement's
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Noise:
     """How far stated covariances are believed.
 

@@ -7,12 +7,11 @@ uncertainty adds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import inverse_scaled
 from neurocal_cli.least_squares.schur_complement import schur_covariance
@@ -20,7 +19,7 @@ from neurocal_cli.least_squares.schur_complement import schur_covariance
 __all__ = ["Covariance", "covariance"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Covariance:
     """Covariances in normalised units.
 

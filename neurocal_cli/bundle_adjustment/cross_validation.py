@@ -9,7 +9,7 @@ instead.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from neurocal_cli.bundle_adjustment.point_batches import batches_of
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
 from neurocal_cli.least_squares.schur_complement import eliminate
@@ -62,7 +63,7 @@ def _shared(free: NDArray[np.bool_]) -> NDArray[np.intp]:
     return camera_columns(len(free) - 5)[np.flatnonzero(free)]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Minimum:
     """A calibration at its minimum.
 

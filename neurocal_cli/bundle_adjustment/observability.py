@@ -13,7 +13,7 @@ from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["check_points", "refuse_undetermined", "relative_std_of_scale"]
+__all__ = ["check_points", "is_weak", "refuse_undetermined", "relative_std_of_scale"]
 
 # Repeated by tests/test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal
 # matrix.
@@ -24,6 +24,7 @@ _SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below whi
 # targets have to do better than that by this factor.
 _MEANINGLESS = 0.5
 _NEARLY_PARALLEL = 5.0  # degrees
+_WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (slow) repeats it
 
 
 def check_points(problem: Problem) -> None:
@@ -155,6 +156,11 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
         f"the focal length {known_to}; bring the target nearer, tilt it more{more}, and check that each "
         "pixel belongs to its point"
     )
+
+
+def is_weak(problem: Problem, state: CameraState, cov: Covariance) -> bool:
+    """Whether the points tell a focal length so badly that other minima may be lower."""
+    return not relative_std_of_scale(problem, state, cov) < _WEAK
 
 
 def relative_std_of_scale(problem: Problem, state: CameraState, cov: Covariance) -> float:

@@ -18,7 +18,7 @@ moves the open coefficients that it has, and E only what goes beyond it.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -28,6 +28,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
@@ -58,7 +59,7 @@ _SCALES = (3.0, 0.3)  # of the sizes of all groups together: half a decade above
 _RICHEST = ("plumb_bob", "k1k2p1p2", "k1k2", "k1")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class OpenPrior:
     """What is known of open unknowns before any point is seen.
 
@@ -89,7 +90,7 @@ class OpenPrior:
     scales: tuple[float, ...] = _SCALES
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class SpreadOfOpen:
     """What points tell of open unknowns o.
 
@@ -109,7 +110,7 @@ class SpreadOfOpen:
     probability: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class OpenCoefficients:
     """A camera with the coefficients that its model was chosen without.
 

@@ -8,11 +8,12 @@ handful of batches at a time stays in the processor's cache.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["PointBatches", "batches_of", "products"]
@@ -22,7 +23,7 @@ _LARGEST_BATCH = 512
 _POINTS_AT_ONCE = 4096  # about 1.5 MB of derivatives, a share of the second-level cache
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class PointBatches:
     """Points of several views in batches of n points.
 

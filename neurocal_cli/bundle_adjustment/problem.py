@@ -7,7 +7,7 @@ Type 4: the extrinsics, V.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.camera.projection import image_points, undistorted_pixels
 from neurocal_cli.camera.rich_lens import FIRST_NODE
 from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_to_axis
 from neurocal_cli.points import Correspondences
 
@@ -32,7 +33,7 @@ _RIM, _HALVINGS = 0.02, 30  # of the distance from the centre: noise puts pixels
 _MAX_ITERATIONS = 200
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Problem:
     """Which parameters are estimated from which points.
 

@@ -8,8 +8,6 @@ n / (1 + (n - 1) rho) views.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +15,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.projection import project_points
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.least_squares.leave_out import folds_of
 
@@ -29,7 +28,7 @@ _NOISE = 3.0  # standard deviations of their noise
 _ROWS = 1000  # of a table of distances that is held at a time
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class RepeatedPoses:
     """Which views repeat which.
 

@@ -7,7 +7,9 @@ distortion, the residual.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +19,7 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.projection import ENTRIES, project_points, project_with_jacobian
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_step
 
 __all__ = [
@@ -41,7 +44,7 @@ def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
     return np.concatenate([np.arange(5), _COEFFICIENTS + np.arange(n_coefficients)])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CameraState:
     """Camera and poses as an adjustment moves them, in normalised units or in pixels and world units.
 
@@ -98,9 +101,11 @@ class CameraState:
         bend[:, :3] = by_xi / (1 + xi) * (by_entries[:, :3] - self.entries[:, :3] * by_xi / (1 + xi))
         return bend
 
-    def coefficients(self, view: NDArray[np.intp]) -> Array:
-        """The coefficients for the points of some batches, given each batch's view."""
-        return self.k if self.k.ndim == 1 else self.k[view].T[..., None]
+    def camera_of(self, view: NDArray[np.intp]) -> tuple[Sequence[Any] | Array, Sequence[Any] | Array]:
+        """A's entries and the coefficients for the points of some batches, given each batch's view."""
+        # Of one camera: plain numbers are quicker than NumPy's, or than columns of one.
+        entries = self.entries[view].T[..., None] if len(self.entries) > 1 else self.entries[0].tolist()
+        return entries, self.k.tolist() if self.k.ndim == 1 else self.k[view].T[..., None]
 
 
 def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
@@ -133,9 +138,8 @@ def residuals(batches: PointBatches, state: CameraState) -> Array:
     for chunk in batches.chunks():
         view = batches.view[chunk]
         Xc = state.R[view] @ batches.local[chunk] + state.t[view][:, :, None]
-        u, v, _ = project_points(
-            state.entries[0], state.model, state.coefficients(view), Xc[:, 0], Xc[:, 1], Xc[:, 2]
-        )
+        entries, k = state.camera_of(view)
+        u, v, _ = project_points(entries, state.model, k, Xc[:, 0], Xc[:, 1], Xc[:, 2])
         out[chunk, 0] = batches.pixels[chunk, 0] - u
         out[chunk, 1] = batches.pixels[chunk, 1] - v
     return out
@@ -178,13 +182,12 @@ def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Ar
     by tau is that by the point, and by omega it is Y x the same.
     """
     view, pixels = batches.view[chunk], batches.pixels[chunk]
-    # One camera: plain numbers are quicker than columns of one.
-    entries = state.entries[0] if len(state.entries) == 1 else state.entries[view].T[..., None]
+    entries, k = state.camera_of(view)
     Y = state.R[view] @ batches.local[chunk]
     Xc = Y + state.t[view][:, :, None]
     by_omega, by_point = out[:, _OMEGA], out[:, _TAU]
     u, v, valid = project_with_jacobian(
-        entries, state.model, state.coefficients(view), (Xc[:, 0], Xc[:, 1], Xc[:, 2]),
+        entries, state.model, k, (Xc[:, 0], Xc[:, 1], Xc[:, 2]),
         out[:, :5], by_point, out[:, _COEFFICIENTS:-1],
     )  # fmt: skip
     product = np.empty(by_omega[:, 0].shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +14,14 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels
 from neurocal_cli.calibration import StraightLines
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target
 
 __all__ = ["Solution", "TrainingRecord"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class TrainingRecord:
     """What was tried.
 
@@ -64,7 +65,7 @@ class TrainingRecord:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Solution:
     """What was found, in normalised units.
 

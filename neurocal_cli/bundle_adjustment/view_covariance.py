@@ -15,7 +15,7 @@ allows, and nowhere below the normal matrix's. Views that repeat a pose (`repeat
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from neurocal_cli.bundle_adjustment.covariance import Covariance
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan, solve_or_nan
@@ -89,7 +90,7 @@ def counting_views(
     return replace(found, entries=entries, poses=_followed(found, normal, free, free_poses, entries))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Determined:
     """Directions of the unknowns that the points tell: p = into z, z = back p."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.measured_directions import LEAST, equations, loosened
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, similarity
 from neurocal_cli.network import Patterns
 from neurocal_cli.points import Correspondences
@@ -24,7 +25,7 @@ _EXACTLY_FLAT = 1e-6
 _NEARLY_FLAT = 0.02
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Views:
     """All points, sorted by view, in normalised coordinates.
 

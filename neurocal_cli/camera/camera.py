@@ -6,7 +6,7 @@ Points are in the camera's own frame, x right, y down, z forward; a `Pose` takes
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from functools import cached_property
 
 import numpy as np
@@ -27,12 +27,13 @@ from neurocal_cli.camera.projection import (
 )
 from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Camera"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Camera:
     """A camera, whatever its pose.
 

@@ -9,13 +9,14 @@ The inverse is `neurocal_cli.camera.monotonic.undistort`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 
 from neurocal_cli.camera.directions import WIDE, project_directions
 from neurocal_cli.camera.polynomial import Coefficients, Distorted, distorted, distorted_with_jacobian
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -71,7 +72,7 @@ def coefficient_names(model: str) -> tuple[str, ...]:
     return MODELS[model]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Distortion:
     """A distortion model with its coefficients; without arguments, none.
 

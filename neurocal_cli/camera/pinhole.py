@@ -7,12 +7,12 @@ follow from them. Conventions: see `geometry`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation, rotation_to_euler, rq
 
 __all__ = [
@@ -31,7 +31,7 @@ POSE_NAMES = ("R_x", "R_y", "R_z", "t_x", "t_y", "t_z")
 _ROTATION_TOLERANCE = 1e-4
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Intrinsics:
     """The five intrinsic parameters of the paper's matrix A.
 
@@ -108,7 +108,7 @@ class Intrinsics:
         return J
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Pose:
     """World to camera, ``Xc = R M + t``.
 

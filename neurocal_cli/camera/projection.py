@@ -189,7 +189,7 @@ def _through_matrix(entries: Entries, changes: Sequence[tuple[Array, Array]], ou
 
 def _is_zero(s: Any) -> bool:
     """Whether there is no skew, as in most cameras; it saves a share of the time."""
-    return np.ndim(s) == 0 and s == 0.0
+    return isinstance(s, (float, int)) and s == 0.0
 
 
 def normalised_points(entries: Entries, u: Array, v: Array) -> tuple[Array, Array]:

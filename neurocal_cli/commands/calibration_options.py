@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from functools import wraps
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +12,7 @@ import click
 from neurocal_cli.commands.options import INPUT, FiniteNumber
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 if TYPE_CHECKING:
     from neurocal_cli.camera.camera import Camera
@@ -23,7 +24,7 @@ __all__ = ["Estimation", "estimation_options", "estimation_options_without_files
 _BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Estimation:
     """What the user asked for; file names are not read yet."""
 

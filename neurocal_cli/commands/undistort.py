@@ -16,6 +16,7 @@ from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, complain, is_terminal, note, say
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 if TYPE_CHECKING:
     from neurocal_cli.camera.camera import Camera
@@ -262,7 +263,7 @@ def _correct_all(work: _Work, paths: Sequence[str], outputs: Sequence[str]) -> d
     return failed
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class _View:
     """What the results show, as the options say."""
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.comparison.by_method import calibrate_with
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.evaluation import StereoEvaluation, evaluate_stereo
@@ -22,7 +22,7 @@ _FOLDS = 5
 Progress = Callable[[str, float], None]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Compared:
     """What one method makes of one camera's points.
 
@@ -44,7 +44,7 @@ class Compared:
     problem: str = ""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Comparison:
     """What `compare` finds.
 

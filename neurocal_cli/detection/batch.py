@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import cv2
@@ -16,6 +15,7 @@ from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.memory import Memory, Remembered
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.images import Image, encode_png, parse_image
 from neurocal_cli.processes import start_worker, usable_cores, work_through
@@ -26,7 +26,7 @@ _WORTH_A_PROCESS = 4  # images; fewer take less time than the start of a process
 _KEPT = 31 << 20  # bytes; glibc learns nothing from blocks of 32 MiB and more
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class DetectionOptions:
     """What to detect, and how.
 
@@ -51,7 +51,7 @@ class DetectionOptions:
     memory: Memory | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Outcome:
     """Result of one image file: a detection, or a problem in one line.
 

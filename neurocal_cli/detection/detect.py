@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -20,6 +20,7 @@ from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.measuring import measure
 from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -32,7 +33,7 @@ _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: from a point's index to 
 _PREFIXES = ("h:", "v:", "")  # by kind: of a point's id
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Labels:
     """Points of a plane.
 
@@ -69,7 +70,7 @@ class Labels:
         return np.lexsort((self.place[:, 0], self.place[:, 1], self.kind))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Detection:
     """The board's points in one image.
 

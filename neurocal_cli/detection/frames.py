@@ -8,12 +8,12 @@ the next one would hardly differ: a board that is held still gives one frame.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["choose_frames"]
@@ -26,7 +26,7 @@ _SHARP = 0.4  # of the median sharpness of the stretches
 _DIFFERENT = 6.0  # DN, rms; noise of a still camera leaves 1 after averaging
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Best:
     """The sharpest frame of a stretch."""
 

@@ -7,11 +7,10 @@ here; `identity` finds those of the board.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["EDGE_H", "EDGE_V", "VERTEX", "Grid", "Measured"]
@@ -21,7 +20,7 @@ __all__ = ["EDGE_H", "EDGE_V", "VERTEX", "Grid", "Measured"]
 EDGE_H, EDGE_V, VERTEX = 0, 1, 2
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Grid:
     """Vertices of one chessboard, as far as they were found.
 
@@ -48,7 +47,7 @@ class Grid:
         return self.pixels.shape[1], self.pixels.shape[0]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Measured:
     """Points of one grid, measured in the image.
 

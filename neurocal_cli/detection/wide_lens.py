@@ -8,10 +8,9 @@ smooth and small. In: vertices with their places in a grid. Out: `WideFit`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["WideFit", "WideLens", "fit_wide_lens"]
@@ -25,7 +24,7 @@ _SQUARE = 0.05  # ... at which deviations of so many squares are believed
 _FARTHEST = 3.0  # rad; no lens sees farther
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class WideLens:
     """A lens of equal angles.
 
@@ -59,7 +58,7 @@ class WideLens:
         return np.asarray(self.centre + self.focal * share[..., None] * directions[..., :2])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class WideFit:
     """A lens and a plane in front of it.
 

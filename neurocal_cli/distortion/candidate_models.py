@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.cross_validation import held_out_points, held_out_views, reduced
-from neurocal_cli.bundle_adjustment.observability import refuse_undetermined, relative_std_of_scale
+from neurocal_cli.bundle_adjustment.observability import is_weak, refuse_undetermined
 from neurocal_cli.bundle_adjustment.open_coefficients import radius
 from neurocal_cli.bundle_adjustment.outlier_views import free_networks, least_of_free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
@@ -24,6 +24,7 @@ from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names, distor
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
@@ -32,7 +33,6 @@ __all__ = [
     "as_fisheye",
     "falls_short",
     "fit_candidates",
-    "is_weak",
     "judged_again",
     "supported",
     "worth",
@@ -64,11 +64,10 @@ _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but c
 _SPARE = 1.3  # equations for each unknown
 _WIDE = 0.7  # radius from which on a model can be a fisheye's: 35 degrees off the axis
 _TOLD_APART = 4.0  # squared standard deviations, for each coefficient
-_WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (slow) repeats it
 _LARGEST_TERM = 3.0  # of one coefficient at the farthest point; all terms together are about 1
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Candidate:
     """A distortion model fitted to the points.
 
@@ -164,7 +163,7 @@ def judged_again(
     return again
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Chain:
     """What all fits have in common.
 
@@ -329,11 +328,6 @@ def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
         return False
     own = free_networks(views.subset(some), replace(state, R=state.R[some], t=state.t[some]), _STEPS)
     return cost > _SHORT**2 * float(own.sum()) + 1e-20
-
-
-def is_weak(problem: Problem, state: CameraState, cov: Covariance) -> bool:
-    """Whether the points tell a focal length so badly that other minima may be lower."""
-    return not relative_std_of_scale(problem, state, cov) < _WEAK
 
 
 def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate | None:

@@ -7,12 +7,11 @@ the same direction and the same offset.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.measured_directions import unit
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -34,7 +33,7 @@ _MOST_PLACES = 200_000  # points on lines; more of them do not change the result
 Index = NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CollinearPoints:
     """Points of each view, grouped by the lines on which they are.
 

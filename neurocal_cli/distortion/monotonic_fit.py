@@ -17,7 +17,7 @@ there: it can make them smaller, but its own bias is not in them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from neurocal_cli.camera.monotonic import monotonic_radius, radial_slope, reache
 from neurocal_cli.camera.projection import ENTRIES, normalised_points, undistorted_pixels
 from neurocal_cli.camera.tilt import untilted
 from neurocal_cli.camera.unprojection import largest_angle, unproject_directions
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -55,7 +56,7 @@ _TIE = 0.009  # of the rms error, that makes no difference
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class MonotonicFit:
     """The condition that a distortion is monotonic, as a `Restraint`.
 

@@ -14,14 +14,13 @@ from dataclasses import replace
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.observability import is_weak
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import WIDE, WITH_PRISM
-from neurocal_cli.distortion.candidate_models import fit_candidates, is_weak
 from neurocal_cli.distortion.denominator import DENOMINATOR
-from neurocal_cli.distortion.similar_lens import similar_states
 
 __all__ = ["with_more_starts"]
 
@@ -49,6 +48,10 @@ def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[Came
     weak = is_weak(problem, best.state, cov)
     if best.converged and not weak and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
         return solution
+
+    # Most are at the lowest minimum, and need none of what follows.
+    from neurocal_cli.distortion.candidate_models import fit_candidates
+
     fitted = "fisheye" if wanted in WIDE else "rational" if wanted in WITH_PRISM else wanted
     for start in (best.state, *more_starts()):
         found = fit_candidates(problem, start, by_views=False, wanted=fitted).get(fitted)
@@ -65,5 +68,7 @@ def _as(wanted: str, found: Adjusted, views: Views) -> list[Adjusted]:
     """The fit itself where it is of the wanted model, else the most similar lenses of that model."""
     if found.state.model == wanted:
         return [found]
+    from neurocal_cli.distortion.similar_lens import similar_states
+
     starts = similar_states(found.state, wanted, farthest_angle(views, found.state))
     return [replace(found, state=start) for start in starts]

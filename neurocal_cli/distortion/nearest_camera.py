@@ -8,8 +8,6 @@ and the share of the image that it loses is told.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +18,7 @@ from neurocal_cli.camera.distortion import WIDE, Distortion, coefficient_names, 
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Distance", "NearestCamera", "image_rays", "nearest_camera", "with_model"]
@@ -31,7 +30,7 @@ _STARTS, _STEPS = 3, 100
 _FINE = 80  # pixels along each side of which the share that is lost is counted
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Distance:
     """Distance of a camera's pixels from those of another [px]."""
 
@@ -39,7 +38,7 @@ class Distance:
     max_px: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class NearestCamera:
     """A camera and what it differs by.
 

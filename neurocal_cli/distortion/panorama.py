@@ -15,12 +15,11 @@ On both, lines parallel to the camera's y axis are vertical. f is in pixels a ra
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["PANORAMAS", "Panorama"]
@@ -28,7 +27,7 @@ __all__ = ["PANORAMAS", "Panorama"]
 PANORAMAS = ("cylinder", "equirectangular")
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Panorama:
     """A picture on a cylinder or a sphere around the camera.
 

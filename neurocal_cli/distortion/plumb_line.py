@@ -13,7 +13,7 @@ quarter of the image's size.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from neurocal_cli.distortion.straightness import (
     straightness_error,
 )
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.normal_equations import damped_step, unit_diagonal
@@ -57,7 +58,7 @@ _UNDETERMINED = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class PlumbLine:
     """A distortion that was estimated from lines alone.
 

@@ -28,7 +28,7 @@ estimates the noise from its own residuals.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -48,6 +48,7 @@ from neurocal_cli.camera.projection import normalised_points
 from neurocal_cli.distortion.plumb_line import PlumbLine, lines_in_pixels
 from neurocal_cli.distortion.straightness import CAMERA, DistortedLines, distorted_lines
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.points import Correspondences
@@ -119,7 +120,7 @@ def _in_camera_terms(entries: Array, observed: Array, undistorted: Array) -> Arr
     return np.linalg.lstsq(columns, np.concatenate([distorted_x - x, distorted_y - y]), rcond=None)[0]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _PointEquations:
     """The points' equations, reduced to A by elimination of the poses.
 

@@ -16,7 +16,7 @@ A wide lognormal prior keeps those in bounds that no point tells. The prior is a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -31,6 +31,7 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NODES, RADII, REACHES
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
@@ -127,7 +128,7 @@ def _extent(directions: Array) -> Array:
     return np.abs(np.column_stack([np.hypot(*s.T), s])).max(axis=0, initial=0.0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Prior:
     """The restraint: rows, of k1 to k4 and the nodes, whose squares are added to those of the residuals.
 
@@ -180,7 +181,7 @@ def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Pr
     return _processes(reaches, scale), np.full(len(_OF_PROFILE) + len(_OF_FIELD), scale)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Processes:
     """What the prior is made of.
 
@@ -223,7 +224,7 @@ def _alike(distance: Array, length: float) -> Array:
     return np.where(alike < _NOTHING, 0.0, alike)  # numbers far below 1 are slow
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Found:
     """Sizes of the processes, and what follows from them.
 

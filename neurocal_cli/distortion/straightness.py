@@ -13,7 +13,7 @@ enter.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 from neurocal_cli.distortion.collinear_points import CollinearPoints
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["CAMERA", "DistortedLines", "LineImages", "distorted_lines", "straightness_error"]
@@ -31,7 +32,7 @@ _SETTLED = 1e-10  # a step of feet and lines below this, in normalised image uni
 _MOST_STEPS = 15
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class LineImages:
     """Images of the points on lines, in any unit and from any origin.
 
@@ -59,7 +60,7 @@ class LineImages:
         return np.add.reduceat(values, self.lines.first, axis=0)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class DistortedLines:
     """Straight lines and their distorted images.
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from importlib.metadata import PackageNotFoundError, version
 
 from neurocal_cli import __version__
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 __all__ = ["Origin", "versions"]
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Origin:
     """The run that gave a result, as far as it is known.
 

@@ -13,12 +13,13 @@ left out here by mistake comes back when the camera is known (`outlier_rejection
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.network import Patterns, random_weights
@@ -50,7 +51,7 @@ _HALF_ANGLES = (0.8, 1.1, 1.4, 1.7)
 _TIGHTER = 0.5
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Consensus:
     """What the views' networks agree on, sorted as the views are.
 

@@ -27,7 +27,6 @@ from neurocal_cli.bundle_adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products, candidate_intrinsics
 from neurocal_cli.initialisation.constrained_training import train_constrained
-from neurocal_cli.initialisation.given_poses import solve_given_poses
 from neurocal_cli.initialisation.local_minima import (
     better_by_view,
     reaches_bound,
@@ -37,7 +36,6 @@ from neurocal_cli.initialisation.local_minima import (
     try_start,
 )
 from neurocal_cli.initialisation.options import Options
-from neurocal_cli.initialisation.random_cameras import find_camera, find_poses
 from neurocal_cli.initialisation.view_networks import (
     Group,
     begin_flat,
@@ -65,6 +63,8 @@ def solve(problem: Problem, options: Options) -> Solution:
     """
     rng = np.random.default_rng(options.seed)
     if problem.type == 4:
+        from neurocal_cli.initialisation.given_poses import solve_given_poses
+
         return solve_given_poses(problem, options, rng)
     search = _Search(problem, options, rng)
     # A free product needs 4 points of a plane or 6 in space.
@@ -124,6 +124,8 @@ class _Search:
         spare = 2 * int(self.views.distinct.sum()) - problem.n_parameters
         if spare >= _MANY_EQUATIONS and reaches_bound(problem, best, groups):
             return best, record
+        from neurocal_cli.initialisation.random_cameras import find_camera
+
         found = find_camera(
             self.views, problem.normalised_entries, problem.free, self.rng, self.options.starts
         )
@@ -134,6 +136,8 @@ class _Search:
 
     def camera_from_few_points(self) -> _Found:
         """Type 2 with one view of 5 points: random cameras instead of a free product."""
+        from neurocal_cli.initialisation.random_cameras import find_camera
+
         problem = self.problem
         starts = max(self.options.starts, _FEW_POINT_STARTS)
         found = find_camera(self.views, problem.normalised_entries, problem.free, self.rng, starts)
@@ -190,6 +194,8 @@ class _Search:
         members = np.flatnonzero(which)
         if not members.size:
             return state, record
+        from neurocal_cli.initialisation.random_cameras import find_poses
+
         starts = max(self.options.starts, _FEW_POINT_STARTS)
         found = find_poses(self.views, members, state.entries, self.rng, starts)
         R, t = state.R.copy(), state.t.copy()

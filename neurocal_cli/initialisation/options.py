@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.training import Task, Trained, Trainer
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
 from neurocal_cli.training.starts import Agreement
@@ -19,7 +20,7 @@ __all__ = ["Options", "Progress", "options_for"]
 Progress = Callable[[str, float], None]
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Options:
     """How networks are trained, and how the distortion is found.
 

@@ -8,12 +8,12 @@ entries learn them from random values, again by Levenberg-Marquardt.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 
@@ -30,7 +30,7 @@ _LONGEST = 2.0  # step of any entry; in the logarithm a factor of 7
 _ENOUGH = 3  # starts that have ended at the same, lowest loss
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class SharedIntrinsics:
     """Candidates for W's entries, best first.
 
@@ -105,57 +105,79 @@ class _Conditions:
 
     def __init__(self, solid: Array, flat: Array, free: NDArray[np.bool_]) -> None:
         self.free = np.flatnonzero(free)
-        self.columns, self.pairs = [], []
-        for group, pairs in ((solid, ((0, 1), (0, 2), (1, 2))), (flat, ((0, 1),))):
-            if len(group):
-                unit = group / np.linalg.norm(group, axis=(1, 2))[:, None, None]
-                # Products of each column with itself, then those of the pairs.
-                both = np.array([*((n, n) for n in range(group.shape[2])), *pairs]).T
-                self.columns.append(np.ascontiguousarray(unit[:, :, both].transpose(1, 2, 3, 0)))
-                self.pairs.append(pairs)
+        self.groups = [
+            (_columns(group, pairs), pairs, group.shape[2])
+            for group, pairs in ((solid, ((0, 1), (0, 2), (1, 2))), (flat, ((0, 1),)))
+            if len(group)
+        ]
 
     def __call__(self, p: Array) -> tuple[Array, Array]:
         """Residuals (B, m) and derivatives (B, f, m) of B parameter sets (B, 5)."""
+        conic, by_p = _conic(p)
+        by_p = by_p[:, self.free]
         residuals, derivatives = [], []
-        for columns, pairs in zip(self.columns, self.pairs, strict=True):
-            product, by_p = _products(p, columns)
-            for n, (i, j) in enumerate(pairs, start=product.shape[1] - len(pairs)):
-                one, two = product[:, i], product[:, j]
+        for columns, pairs, n_columns in self.groups:
+            product, by = conic @ columns, by_p @ columns[:, None]  # (q, B, K) and (q, B, f, K)
+            by_length = 0.5 * by[:n_columns] / product[:n_columns, :, None]  # relative
+            for n, (i, j) in enumerate(pairs, start=n_columns):
+                one, two = product[i], product[j]
                 length = np.sqrt(one * two)
-                cosine = product[:, n] / length
+                cosine = product[n] / length
                 residuals += [cosine, 0.5 * np.log(one / two)]
-                by_one, by_two = (0.5 * by_p[:, :, k] / product[:, None, k] for k in (i, j))  # of log lengths
                 derivatives += [
-                    by_p[:, :, n] / length[:, None] - cosine[:, None] * (by_one + by_two),
-                    by_one - by_two,
+                    by[n] / length[:, None] - cosine[:, None] * (by_length[i] + by_length[j]),
+                    by_length[i] - by_length[j],
                 ]
-        return np.concatenate(residuals, axis=1), np.concatenate(derivatives, axis=2)[:, self.free]
+        return np.concatenate(residuals, axis=1), np.concatenate(derivatives, axis=2)
 
 
-def _products(p: Array, h: Array) -> tuple[Array, Array]:
-    """Scalar products of columns W^-1 h and their derivatives.
+def _columns(group: Array, pairs: tuple[tuple[int, int], ...]) -> Array:
+    """What the conic is multiplied with for scalar products: of each column with itself, then of the pairs.
+
+    Parameters
+    ----------
+    group : (K, 3, c) array
+        Products W V of K views.
+    pairs : pairs of columns
+
+    Returns
+    -------
+    (q, 9, K) array
+    """
+    unit = group / np.linalg.norm(group, axis=(1, 2))[:, None, None]
+    one, two = np.array([*((n, n) for n in range(group.shape[2])), *pairs]).T
+    outer = unit[:, :, None, one] * unit[:, None, :, two]
+    return np.ascontiguousarray(outer.reshape(len(group), 9, -1).transpose(2, 1, 0))
+
+
+def _conic(p: Array) -> tuple[Array, Array]:
+    """The image of the absolute conic, W^-T W^-1, gives the scalar products of columns W^-1 h.
 
     Parameters
     ----------
     p : (B, 5) array
         log W11, W12, log W22, W13, W23.
-    h : (3, 2, q, K) array
-        Both columns of q products of each of K views.
 
     Returns
     -------
-    product : (B, q, K) array
-    by_p : (B, 5, q, K) array
+    conic : (B, 9) array
+    by_p : (B, 5, 9) array
     """
-    la, s, lb, u, v = (p[:, n, None, None] for n in range(5))
-    a, b = np.exp(la), np.exp(lb)
-    (z, z_), by_b = h[2], s / b
-    y, y_ = ((h[1, n] - v * h[2, n]) / b for n in range(2))
-    x, x_ = ((h[0, n] - u * h[2, n] - s * column) / a for n, column in enumerate((y, y_)))
-    xx, yy = x * x_, y * y_
-    xy, xz, yz = (x * y_ + y * x_) / a, (x * z_ + z * x_) / a, (y * z_ + z * y_) / b
-    by_p = np.stack([-2 * xx, -xy, s * xy - 2 * yy, -xz, by_b * xz - yz], axis=1)
-    return xx + yy + z * z_, by_p
+    _, s, _, u, v = p.T
+    a, b = np.exp(-p[:, 0]), np.exp(-p[:, 2])
+    ab = a * b
+    inverse, change = np.zeros((len(p), 3, 3)), np.zeros((len(p), 5, 3, 3))
+    inverse[:, 0] = np.stack([a, -s * ab, s * v * ab - u * a], axis=1)
+    inverse[:, 1, 1], inverse[:, 1, 2], inverse[:, 2, 2] = b, -v * b, 1.0
+    skew = inverse[:, 0, 1]
+    change[:, 0, 0] = -inverse[:, 0]
+    change[:, 1, 0, 1], change[:, 1, 0, 2] = -ab, v * ab
+    change[:, 2, 0, 1], change[:, 2, 0, 2], change[:, 2, 1] = -skew, v * skew, -inverse[:, 1]
+    change[:, 3, 0, 2] = -a
+    change[:, 4, 0, 2], change[:, 4, 1, 2] = -skew, -b
+    half = np.swapaxes(inverse, 1, 2)[:, None] @ change
+    by_p = half + np.swapaxes(half, 2, 3)
+    return (np.swapaxes(inverse, 1, 2) @ inverse).reshape(-1, 9), by_p.reshape(-1, 5, 9)
 
 
 _Trial = tuple[Array, Array, Array]  # parameters, their residuals and derivatives

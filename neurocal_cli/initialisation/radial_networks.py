@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.local_minima import try_mirrored
 from neurocal_cli.initialisation.neuro import solve
@@ -93,7 +94,7 @@ def middle_of_image(problem: Problem) -> Array:
     return np.asarray(0.5 * (points.pixels.min(axis=0) + points.pixels.max(axis=0)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Search:
     """For the distortion with which the free networks fit best."""
 

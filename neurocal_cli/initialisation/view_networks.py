@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
 from neurocal_cli.bundle_adjustment.solution import TrainingRecord
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.network import Patterns, residual_jacobian
@@ -24,7 +25,7 @@ _NO_CONDITION = 1e-13
 _SMALL = 1500  # patterns in all up to which fewer of them save no time (tests/benchmarks/test_speed.py)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Group:
     """Views of one kind, flat or solid, and what their networks learnt.
 

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.distortion.panorama import Panorama
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.distortion_names import to_ros
 from neurocal_cli.io.yaml_text import flow, mapping, number, text
+
+if TYPE_CHECKING:
+    from neurocal_cli.distortion.panorama import Panorama
 
 __all__ = ["camera_info_lines", "format_camera_info", "format_panorama"]
 

@@ -12,9 +12,9 @@ import re
 import struct
 import zlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 from neurocal_cli.errors import FormatError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 __all__ = ["Header", "is_video_header", "read_header"]
 
@@ -40,7 +40,7 @@ _OTHERS = (
 )
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Header:
     """Size and orientation of a stored image.
 

@@ -7,7 +7,6 @@ import tempfile
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import FormatError, InputError, NeurocalError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.image_headers import Header, read_header
 
@@ -49,7 +49,7 @@ _STDERR = 2
 _ONE_AT_A_TIME = threading.Lock()  # the program's stderr is one
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Image:
     """A picture.
 
@@ -78,7 +78,7 @@ class Image:
         return self.grey.shape[1], self.grey.shape[0]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Picture:
     """A picture with its colours.
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_files import read_intrinsics
 from neurocal_cli.io.table import Schema, Table, parse_table
@@ -26,7 +26,7 @@ _LIST = Schema(kind="cameras", required=(_FILES,), optional=("t_z", *CONTROLS), 
 _NESTED = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")  # each begins with the one before
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Rows:
     """Cameras of one file.
 

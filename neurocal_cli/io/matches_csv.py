@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.table import Schema, stream_table
 
@@ -26,7 +26,7 @@ MATCHES = Schema(
 _LARGEST = 1e100  # squares of pixels beyond this overflow
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Matches:
     """Some rows of a file.
 

@@ -12,13 +12,14 @@ import io
 import math
 import warnings
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import FormatError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import decode, one_line, read_blocks, read_bytes
 from neurocal_cli.io.table_header import (
@@ -49,7 +50,7 @@ _BLOCK = 1 << 22  # bytes of a stream at a time: some ten thousand rows
 _PLAIN = bytes(c for c in range(32, 127) if c != ord('"')) + b"\t\n"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Table:
     """Columns of one file, or of a part of it.
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from neurocal_cli.distances import Distance
 from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import one_line
 
 __all__ = [
@@ -34,7 +35,7 @@ _METADATA = re.compile(r"#\s*(image_size|image_center|unit|distances)\s*:(.*)", 
 _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Schema:
     """Which columns a kind of table has.
 
@@ -125,7 +126,7 @@ _VALUES: dict[str, tuple[Callable[[str], Any], str]] = {
 }
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Layout:
     """Where a table's rows begin and how to split them.
 

@@ -11,11 +11,10 @@ left out follow from these few small matrices: exactly where the problem is line
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
@@ -26,7 +25,7 @@ _REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal; b
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Quadratics:
     """Errors of G groups as functions of the f unknowns that they share.
 
@@ -94,23 +93,27 @@ def folds_of(n_groups: int, n_folds: int) -> NDArray[np.intp]:
     return np.arange(n_groups) % n_folds if n_groups > n_folds else np.arange(n_groups)
 
 
-@_quietly
 def solve_or_nan(S: Array, g: Array) -> Array:
     """S^-1 g of a stack (..., f, f), (..., f); nan where S is singular to rounding."""
-    scaled, scale = unit_diagonal(S)
-    usable = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
-    step = np.full(g.shape, np.nan)
-    if g.shape[-1] == 0:
-        return np.zeros(g.shape)
-    if usable.any():
-        usable[usable] = np.linalg.eigvalsh(scaled[usable])[..., 0] > _REGULAR
-    if usable.any():
-        step[usable] = scale[usable] * np.linalg.solve(scaled[usable], (scale * g)[usable][..., None])[..., 0]
-    return step
+    return _solved(S, g[..., None])[..., 0]
+
+
+def inverse_or_nan(S: Array) -> Array:
+    """S^-1 of a stack of symmetric matrices; nan where they are singular to rounding."""
+    return _solved(S, np.broadcast_to(np.eye(S.shape[-1]), S.shape))
 
 
 @_quietly
-def inverse_or_nan(S: Array) -> Array:
-    """S^-1 of a stack of symmetric matrices; nan where they are singular to rounding."""
-    f = S.shape[-1]
-    return solve_or_nan(np.repeat(S[..., None, :, :], f, axis=-3), np.broadcast_to(np.eye(f), S.shape))
+def _solved(S: Array, right: Array) -> Array:
+    """S^-1 times right sides (..., f, m)."""
+    if right.size == 0:
+        return np.zeros(right.shape)
+    scaled, scale = unit_diagonal(S)
+    usable = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
+    if usable.any():
+        usable[usable] = np.linalg.eigvalsh(scaled[usable])[..., 0] > _REGULAR
+    solved = np.full(right.shape, np.nan)
+    if usable.any():
+        scale = scale[..., None]
+        solved[usable] = scale[usable] * np.linalg.solve(scaled[usable], (scale * right)[usable])
+    return solved

@@ -27,13 +27,13 @@ Madsen, Nielsen, Tingleff, Methods for non-linear least squares problems, 2nd ed
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["DescentOptions", "LeastSquaresProblem", "LevenbergMarquardt", "Outcome", "Stop", "minimise"]
@@ -72,7 +72,7 @@ class LeastSquaresProblem(Protocol[Step, Trial]):
         ...
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class DescentOptions:
     """How to descend and when to stop.
 
@@ -136,7 +136,7 @@ _SENTENCES = {
 }
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Outcome:
     """How the descent of each group ended; the state itself is the problem's.
 

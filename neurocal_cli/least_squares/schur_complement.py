@@ -7,11 +7,10 @@ system, and the cost grows linearly with the blocks.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import NOTHING, inverse_scaled, solve_scaled
 
@@ -20,7 +19,7 @@ __all__ = ["SchurCovariance", "eliminate", "schur_covariance", "schur_step"]
 Columns = NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class SchurCovariance:
     """Blocks of the inverse of an arrowhead matrix.
 

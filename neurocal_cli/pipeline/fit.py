@@ -15,18 +15,13 @@ from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.camera.distortion import WIDE, WITH_PRISM
-from neurocal_cli.distortion.candidate_models import fit_candidates, supported
 from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_told
 from neurocal_cli.distortion.given_distortion import check_distortion
-from neurocal_cli.distortion.model_selection import select_model
 from neurocal_cli.distortion.multi_start import with_more_starts
-from neurocal_cli.distortion.similar_lens import similar_states, tilted_states
-from neurocal_cli.distortion.xi_profile import with_xi_held_if_flat
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirrored
 from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.initialisation.options import Options
-from neurocal_cli.initialisation.radial_networks import radial_start
 from neurocal_cli.points import Correspondences
 
 __all__ = ["fit", "fit_again"]
@@ -100,6 +95,8 @@ def _finished(solution: Solution, options: Options, only_from_here: bool = False
     """With its distortion model, and weights that the residuals bear out."""
     chosen = options.distortion == "auto"
     if chosen and only_from_here:
+        from neurocal_cli.distortion.model_selection import select_model
+
         solution = select_model(solution, preferred=options.preferred)
     elif chosen:
         solution = _with_selected_model(solution, options)
@@ -110,6 +107,8 @@ def _finished(solution: Solution, options: Options, only_from_here: bool = False
 
 
 def _with_selected_model(solution: Solution, options: Options) -> Solution:
+    from neurocal_cli.distortion.model_selection import select_model
+
     def more_starts() -> Iterator[CameraState]:
         return _distorted_starts(solution.problem, options)
 
@@ -146,6 +145,9 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
 
 def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
     """The best that the most similar lenses of the wanted model lead to."""
+    from neurocal_cli.distortion.similar_lens import similar_states, tilted_states
+    from neurocal_cli.distortion.xi_profile import with_xi_held_if_flat
+
     state, views = simpler.state, problem.views
     starts = similar_states(state, problem.distortion.model, farthest_angle(views, state))
     found = [problem.adjust(replace(simpler.adjusted, state=start)) for start in starts]
@@ -167,6 +169,9 @@ def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
 
 def _distorted_starts(problem: Problem, options: Options) -> Iterator[CameraState]:
     """Other cameras to begin with, that have a distortion from the beginning."""
+    from neurocal_cli.distortion.candidate_models import supported
+    from neurocal_cli.initialisation.radial_networks import radial_start
+
     found = radial_start(problem, options)
     if found is not None:
         yield found.state
@@ -181,6 +186,9 @@ def _through_distortion(problem: Problem, options: Options) -> Solution | None:
     wanted = problem.distortion.model
     if problem.type == 3 or (options.distortion != "auto" and not problem.free_distortion):
         return None
+    from neurocal_cli.distortion.candidate_models import fit_candidates
+    from neurocal_cli.initialisation.radial_networks import radial_start
+
     found = radial_start(problem, options)
     if found is None or options.distortion == "auto":
         return found

@@ -8,7 +8,7 @@ views. What none explains keeps the reason that it was left out for.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products
 from neurocal_cli.initialisation.options import options_for
@@ -103,7 +104,7 @@ def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondence
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Fit:
     rmse: float  # px
     entries: Array  # (5,) px

@@ -15,7 +15,7 @@ good data is the same with and without this. Otherwise
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,7 @@ from neurocal_cli.calibration import Rejected
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.consensus import Consensus, find_consensus, find_consensus_through_wide_lens
 from neurocal_cli.initialisation.options import Options
@@ -287,7 +288,7 @@ class _Search:
             self.wrong_views[name] = why_odd(plain, camera, rmse, reason)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Errors:
     """Errors of all points [px], weighted; infinite where the fit does not see the point.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
 from neurocal_cli.verdict.projection_uncertainty import image_grid
@@ -31,7 +32,7 @@ _FLAT = 1e-6  # of the target's size
 _LEAST_SIGMA = 1e-4  # px; a perfect fit has no noise to compare with
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Candidate:
     """A view that could be taken.
 
@@ -59,7 +60,7 @@ class Candidate:
     outline: Array
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Advice:
     """Views to take next, in this order.
 
@@ -120,7 +121,7 @@ def uncertainty_with(calibration: Calibration, views: Sequence[Candidate]) -> tu
     return known.worst(), known.worst(np.sum(told, axis=0))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Known:
     """What is known of a camera, by the views that were taken.
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.evaluation import CameraEvaluation, evaluate_camera
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.assessment import gather_evidence
 from neurocal_cli.verdict.evidence import Evidence
@@ -15,7 +15,7 @@ from neurocal_cli.verdict.evidence import Evidence
 __all__ = ["Subject"]
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Subject:
     """A camera, the points of a picture and their errors.
 

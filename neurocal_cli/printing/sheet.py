@@ -6,12 +6,12 @@ The square between vertices (0, 0) and (1, 1) is black. That is where detection,
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 
 import numpy as np
 
 from neurocal_cli.board import Board
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.printing.unfolding import Laid, unfolded
 
@@ -39,7 +39,7 @@ _LONGEST = 200.0  # ruler [mm]
 _COLS, _ROWS = 9, 6  # of the board that is made without being asked for: one count is odd, one even
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Line:
     """A thin line; ends in mm."""
 
@@ -49,7 +49,7 @@ class Line:
     dashed: bool = False
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Text:
     """A text whose base line begins, or whose middle is, at a place in mm."""
 
@@ -59,7 +59,7 @@ class Text:
     middle: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Sheet:
     """What is printed.
 

@@ -6,12 +6,11 @@ to the right and y downwards, in the board's unit.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Fold", "Laid", "unfolded"]
@@ -21,7 +20,7 @@ _FARTHEST = 3.0  # squares from a board to a fold; beyond, the planes do not bel
 _REACH = 1.0  # squares of the pattern beyond the outer vertices, one whole
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Laid:
     """A plane on the sheet.
 
@@ -58,7 +57,7 @@ class Laid:
         return self.at(np.array([low, [high[0], low[1]], high, [low[0], high[1]]]))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Fold:
     """A line along which the sheet is folded, from end to end of the pattern; (2,) arrays."""
 
@@ -66,7 +65,7 @@ class Fold:
     end: Array
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Map:
     """Where points of a plane come to lie on the sheet, ``B X + b``; B (2, 3), b (2,)."""
 

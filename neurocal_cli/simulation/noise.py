@@ -7,7 +7,7 @@ image centre, is told the truth, and has a bound of its own, with fewer unknowns
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.comparison.by_method import calibrate_with
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
@@ -36,7 +37,7 @@ _SINGULAR = 1e-13  # smallest eigenvalue of a normal matrix of unit diagonal tha
 Progress = Callable[[str, float], None]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class MethodErrors:
     """Errors of one method; P parameters, S standard deviations of the noise.
 
@@ -59,7 +60,7 @@ class MethodErrors:
     failed: NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class NoiseStudy:
     """What `study_noise` finds.
 
@@ -83,7 +84,7 @@ class NoiseStudy:
     apart: dict[tuple[str, str], float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Task:
     scene: SimulatedScene
     methods: tuple[str, ...]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.points import Correspondences
 from neurocal_cli.simulation.rendering import Scene, Sides, Target, render
 from neurocal_cli.simulation.scenes import SimulatedScene
@@ -18,7 +19,7 @@ __all__ = ["Picture", "pictures", "visible_points"]
 _MARGIN = 0.5  # squares of white paper around a board by itself
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Picture:
     """A rendered view.
 

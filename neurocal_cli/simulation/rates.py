@@ -14,7 +14,6 @@ finds, with all points on one side of the camera.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -22,6 +21,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.views import arrange
 from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.methods import calibrate
@@ -42,7 +42,7 @@ _SAME = 1.02  # times the best rms error (5), as for two starts of backprop
 Progress = Callable[[str, float], None]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class DataSet:
     """Noisy points of one view, and the camera that saw them."""
 
@@ -50,7 +50,7 @@ class DataSet:
     intrinsics: Intrinsics
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class RateStudy:
     """What `study_rates` finds.
 
@@ -80,7 +80,7 @@ class RateStudy:
     alpha_u: Array
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class _Cell:
     """One pair of rates on all data sets; none: `calibrate` on one data set."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +12,7 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -43,7 +43,7 @@ _FILLED = 0.55, 0.9  # share of the image that the target spans
 _TRIES = 1000
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class SimulatedScene:
     """A camera, a target and the poses of its views.
 

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import NeurocalError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products, candidate_intrinsics
 from neurocal_cli.initialisation.given_poses import solve_given_poses
@@ -52,7 +53,7 @@ _NOISE = 10**6  # of the seed; trials over noise have lower ones
 Progress = Callable[[str, float], None]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class StartStudy:
     """Outcomes of single starts of each kind.
 
@@ -81,7 +82,7 @@ def reached(rms: Array, best: float) -> NDArray[np.bool_]:
     return np.asarray(np.isfinite(rms) & (rms <= _SAME * best + _FLOOR))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Task:
     scene: SimulatedScene
     sigma: float

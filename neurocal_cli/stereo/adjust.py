@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import FLOOR, OPTIONS
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import minimise
 from neurocal_cli.least_squares.schur_complement import schur_step
@@ -18,7 +19,7 @@ __all__ = ["AdjustedRig", "adjust_rig"]
 _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class AdjustedRig:
     """Result of `adjust_rig`.
 

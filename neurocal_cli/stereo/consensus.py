@@ -7,12 +7,11 @@ images are exchanged, or they were not taken at the same moment.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation
 from neurocal_cli.stereo.problem import RigProblem
 
@@ -31,7 +30,7 @@ UNSYNCHRONISED = "does not fit the others (not taken at the same moment?)"
 _TURNS = (90, 270, 180)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class RigConsensus:
     """The rig that most pairs of views support.
 
@@ -49,7 +48,7 @@ class RigConsensus:
     reasons: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Poses:
     """Poses of the paired targets in each camera alone: rotations and centres, left and right."""
 

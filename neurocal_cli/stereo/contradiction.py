@@ -13,11 +13,11 @@ is luck.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
@@ -35,7 +35,7 @@ _LEFT = 0.3
 _LEAST_PAIRS = 2  # of each part; a single pair that differs is an odd one
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Contradiction:
     """How much the pairs contradict one rig, and why.
 
@@ -77,7 +77,7 @@ class Contradiction:
     shift: Array
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Explanation:
     """One explanation: its gain in the sum of squares, its unknowns and their values."""
 

@@ -7,7 +7,6 @@ All errors are in that frame, with z along the optical axis.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.assessment import assess_rig
@@ -28,7 +28,7 @@ from neurocal_cli.stereo.triangulation import triangulate
 __all__ = ["StereoEvaluation", "evaluate_rig", "evaluate_stereo"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class StereoEvaluation:
     """Errors of two cameras at points of known position.
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from neurocal_cli.calibration import Verdict
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.contradiction import Contradiction
 
 __all__ = ["RigEvidence"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class RigEvidence:
     """What was measured.
 

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import name_some
@@ -32,7 +32,7 @@ _LEAST_COMMON = 0.1  # share of the points; fewer common X, Y, Z are a coinciden
 _SAME_PLACE = 1e-6  # largest difference of one point's X, Y, Z in two files, as a share of the target's size
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class ViewPairs:
     """Names of paired and of single views.
 
@@ -48,7 +48,7 @@ class ViewPairs:
     right_only: tuple[str, ...]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Pairs:
     """Points of both cameras.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.evaluation import evaluate_camera
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.stereo.pairing import ViewPairs
@@ -31,7 +32,7 @@ _LEAST_NOISE = 1e-12
 _ENTRY_NAMES = ("alpha_u", "theta", "alpha_v", "u0", "v0")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class RigProblem:
     """Observations of both cameras in common frames, and the poses in each camera alone.
 

@@ -7,13 +7,12 @@ parallel to an axis, the one along its longer component.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.distortion.undistorted_view import plane_like
 from neurocal_cli.errors import UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
 from neurocal_cli.stereo.rig import Rig
 
@@ -23,7 +22,7 @@ _GRID = 9  # samples along each side of the image, as in OpenCV
 _WIDEST = 5.0  # tangent of 79 degrees: the widest angle that scales an image
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Rectification:
     """Rectified cameras.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.distortion.undistortion import map_points, shown
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.pairing import pair_points, pair_views
@@ -29,7 +30,7 @@ __all__ = [
 _ACROSS = 0.7  # least cosine of a measured direction to the one across the rows, 45 degrees
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class RectifiedPair:
     """The rectified cameras of a rig.
 
@@ -51,7 +52,7 @@ class RectifiedPair:
     axis: int
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class RowError:
     """By how much corresponding points miss each other's row, or column [px]."""
 

@@ -17,13 +17,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, rotation_vector
 from neurocal_cli.least_squares.leave_out import Quadratics
 from neurocal_cli.least_squares.normal_equations import solve_scaled
@@ -38,7 +38,7 @@ _MUCH_LARGER = 2.0  # times the variance of all views; of 50 equations of noise,
 _LEAST_NOISE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class RelativePoses:
     """Relative poses of P pairs of views, in order of their names, and what they depend on.
 

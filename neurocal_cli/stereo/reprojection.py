@@ -11,7 +11,7 @@ camera are transformed by the chain rule:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
 
 __all__ = ["Columns", "Frames", "Observations", "RigState", "rig_jacobian", "rig_normal_blocks"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Frames:
     """The views of both cameras, each with a normalised frame of its target.
 
@@ -45,7 +46,7 @@ class Frames:
     unit: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Observations:
     """Observations of one camera.
 
@@ -74,7 +75,7 @@ class Observations:
     n_equations: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class RigState:
     """Two cameras, the rig and the poses, normalised.
 
@@ -132,7 +133,7 @@ class RigState:
         return replace(self.cameras[side], R=R, t=t)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Columns:
     """Columns of the unknowns in the normal matrices.
 

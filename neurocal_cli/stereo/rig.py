@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cached_property
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix
 
 __all__ = ["Rig", "essential_matrix", "fundamental_matrix"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Rig:
     """Two calibrated cameras on one rig.
 

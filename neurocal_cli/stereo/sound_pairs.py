@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.median import median
 from neurocal_cli.stereo.consensus import UNSYNCHRONISED, find_consensus
@@ -29,7 +30,7 @@ _AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and pairs, that agree by 
 Pair = tuple[str, str]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class SoundPairs:
     """What the relative poses of the pairs say.
 

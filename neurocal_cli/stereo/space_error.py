@@ -7,12 +7,12 @@ line of sight with the size of a pixel at the depth of the point.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["DepthError", "SpaceError", "space_error"]
@@ -21,7 +21,7 @@ _MOST_DEPTHS = 5  # rows of the table of depths
 _POINTS_PER_DEPTH = 20
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class DepthError:
     """Errors of the points in an interval of depths.
 
@@ -41,7 +41,7 @@ class DepthError:
     relative: float
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class SpaceError:
     """Errors of triangulated points, in the left camera's frame.
 

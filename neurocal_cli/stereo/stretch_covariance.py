@@ -6,12 +6,11 @@ adjustment.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.schur_complement import eliminate
 from neurocal_cli.stereo.adjust import AdjustedRig
@@ -23,7 +22,7 @@ from neurocal_cli.target_shape.open_stretch import spread_of_stretch, stretched_
 __all__ = ["StretchedRig", "stretched_rig"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class StretchedRig:
     """What an open stretch adds to the covariance of a rig.
 

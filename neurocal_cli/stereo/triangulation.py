@@ -10,7 +10,6 @@ shortest segment between both rays. Both use undistorted pixels (Hartley and Stu
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.two_view_points import PointBatch
 from neurocal_cli.stereo.wide_points import WidePointBatch
@@ -32,7 +32,7 @@ _FARTHEST, _LEAST_DEPTH = 20, 0.17  # pixels looked at; the depth of a ray at 80
 _EPIPOLAR_SIGMAS = 5.0  # probability 6e-7 for Gaussian noise
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Triangulated:
     """Points in the left camera's frame.
 
@@ -142,7 +142,7 @@ def _pixels(values: Array) -> Array:
     return pixels
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Rigs:
     """R (V, 3, 3) and t (V, 3) of one or several rigs, and the rig of each point."""
 

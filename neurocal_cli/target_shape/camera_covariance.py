@@ -8,37 +8,33 @@ open (`open_coefficients`, `open_stretch`).
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.covariance import Covariance, covariance
 from neurocal_cli.bundle_adjustment.cross_validation import reduced
-from neurocal_cli.bundle_adjustment.open_coefficients import (
-    OpenCoefficients,
-    corner_radius,
-    open_coefficients,
-    radius,
-    spread_of_open,
-    wide_covariance,
-)
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
-from neurocal_cli.target_shape.open_stretch import open_stretch
 from neurocal_cli.target_shape.uncertainty import CovarianceBasis, covariance_basis
+
+if TYPE_CHECKING:
+    from neurocal_cli.bundle_adjustment.open_coefficients import OpenCoefficients
 
 __all__ = ["CameraCovariance", "CameraSeen", "WideCovariance", "camera_covariance"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CameraSeen:
     """A camera at its minimum with the points that it saw.
 
@@ -80,7 +76,7 @@ class CameraSeen:
     target_kept: bool = False
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class WideCovariance:
     """Of a camera with the coefficients that its distortion model was chosen without.
 
@@ -101,7 +97,7 @@ class WideCovariance:
     entries: Array
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CameraCovariance:
     """Covariance of a camera that was calibrated from points.
 
@@ -154,6 +150,8 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
 
 def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """With what the choice of the model leaves open."""
+    from neurocal_cli.bundle_adjustment.open_coefficients import corner_radius, open_coefficients, radius
+
     views, state = seen.views, seen.state
     reach = radius(views, state)
     corner = corner_radius(state.entries[0], views.pixel_centre, views.pixel_scale, seen.points.image_size)
@@ -164,6 +162,8 @@ def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> Camer
 def _opened(
     seen: CameraSeen, known: CameraCovariance, richer: OpenCoefficients, variance: float
 ) -> CameraCovariance:
+    from neurocal_cli.bundle_adjustment.open_coefficients import spread_of_open, wide_covariance
+
     state = richer.state(seen.state)
     normal, _ = normal_blocks(seen.views.batches, state)
     normal = _basis(seen, state, richer.free, normal).normal
@@ -185,6 +185,8 @@ def _opened(
 
 def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
     """With what the choice of the target leaves open."""
+    from neurocal_cli.target_shape.open_stretch import open_stretch
+
     added = open_stretch(seen.views, seen.state, seen.free, seen.points.world, variance)
     if added is None:
         return known

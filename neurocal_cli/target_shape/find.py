@@ -7,7 +7,7 @@ their minimum for the target as it is then believed to be.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels, normalised
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_similarity
 from neurocal_cli.median import median
 from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
@@ -43,7 +44,7 @@ LEAST_GAIN = 6.0
 4.4; tests/test_target_shape.py (slow) holds that clean sets keep the given target."""
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Found:
     """A target, and the problems with their minima for it.
 

@@ -8,7 +8,7 @@ each other only in c and d, and points meet each other only in c and q: both kin
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of, products
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Information", "Sight", "by_world", "information_of", "labelled", "point_terms"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Sight:
     """What one camera saw of the target.
 
@@ -44,7 +45,7 @@ class Sight:
     label: NDArray[np.intp]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Information:
     """Sums of products of derivatives and residuals [px], by blocks.
 
@@ -133,7 +134,7 @@ def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
     return px2 * float(normal[:, -1, -1].sum())
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class PointTerms:
     """Sums of products with the derivatives by the points of the target, of one camera, normalised.
 

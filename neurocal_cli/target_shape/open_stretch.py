@@ -9,8 +9,6 @@ over all four models, around the parameters for the given target, because those 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +17,7 @@ from neurocal_cli.bundle_adjustment.open_coefficients import OpenPrior, SpreadOf
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import solve_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
@@ -42,7 +41,7 @@ _NEGLIGIBLE = 1e-3  # a probability that leaves standard deviations as they are,
 _NO_PRINT = 5.0  # standard deviations of prints and pixels together: the points ask for something else
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class StretchedCovariance:
     """What an open stretch adds to the covariance of a camera.
 

@@ -16,10 +16,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 from neurocal_cli.target_shape.information import Information
@@ -37,7 +38,7 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Posterior:
     """The most probable offsets, and what is known of the rest.
 
@@ -215,7 +216,7 @@ def prior_covariance(prior: Prior, sizes: Mapping[str, float]) -> Array:
     return np.asarray((basis * weight) @ basis.T + np.diag(own))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Solution:
     """The quadratic solved for one set of sizes, in units of the noise's standard deviation."""
 

@@ -17,11 +17,10 @@ largest eigenfunctions stand for it. A target that is solid all through warps in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target, is_flat
 
@@ -33,7 +32,7 @@ _HELD = 1e-7  # of the target's size: a surveyed point that is exactly where it 
 _MOST = 150  # points that the eigenfunctions are found from
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Prior:
     """The parts that offsets are made of.
 

@@ -7,12 +7,12 @@ the cost grows linearly with the views, or with the points.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
@@ -233,7 +233,7 @@ class Rest(NamedTuple):
     poses: Array | None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Solved:
     """The minimum of the quadratic, and blocks of the inverse of its matrix.
 

@@ -10,7 +10,8 @@ of which sums over views have the information that is left.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,12 +19,13 @@ from numpy.typing import NDArray
 from neurocal_cli.bundle_adjustment.point_batches import products
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target
-from neurocal_cli.target_shape.information import Sight, by_world, information_of, labelled
-from neurocal_cli.target_shape.posterior import known_sizes
-from neurocal_cli.target_shape.prior import Prior, prior_of_target
-from neurocal_cli.target_shape.surveyed import noise_variance
+
+if TYPE_CHECKING:
+    from neurocal_cli.target_shape.information import Sight
+    from neurocal_cli.target_shape.prior import Prior
 
 __all__ = ["CovarianceBasis", "covariance_basis"]
 
@@ -33,7 +35,7 @@ _MOST_POSES = (
 )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CovarianceBasis:
     """What the covariance of a camera is computed from (`covariance`, `counting_views`).
 
@@ -99,7 +101,7 @@ def covariance_basis(
     )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _TargetUncertainty:
     """What a camera is known to be when its target is not quite known.
 
@@ -145,6 +147,9 @@ class _TargetUncertainty:
             return None
 
     def _step(self, kept: NDArray[np.intp]) -> Array:
+        from neurocal_cli.target_shape.information import information_of
+        from neurocal_cli.target_shape.posterior import known_sizes
+
         sight = self._sight
         state = replace(sight.state, R=sight.state.R[kept], t=sight.state.t[kept])
         label = sight.label[np.isin(sight.views.index, kept)]
@@ -159,6 +164,11 @@ def _target_uncertainty(
     target: Target, views: Views, state: CameraState, free: NDArray[np.bool_], free_poses: bool, world: Array
 ) -> _TargetUncertainty:
     """Of one camera; world (N, 3) in the order of `views`."""
+    from neurocal_cli.target_shape.information import Sight, information_of, labelled
+    from neurocal_cli.target_shape.posterior import known_sizes
+    from neurocal_cli.target_shape.prior import prior_of_target
+    from neurocal_cli.target_shape.surveyed import noise_variance
+
     label = target.rows_of(world)
     prior = prior_of_target(target)
     sight = Sight(views, state, free, free_poses, label)
@@ -183,6 +193,8 @@ def _target_uncertainty(
 def _efficient(
     views: Views, state: CameraState, free: NDArray[np.intp], label: NDArray[np.intp], followed: Array
 ) -> Array:
+    from neurocal_cli.target_shape.information import by_world
+
     batches, width = views.batches, 12 + len(state.k)
     columns = camera_columns(len(state.k))[free]
     by_batch = np.empty((len(batches.view), width, width))

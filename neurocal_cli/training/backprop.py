@@ -17,13 +17,14 @@ slower. tests/test_backprop.py trains on scenes of these kinds.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns, e_2d, e_orth, optimal_gamma, output
 from neurocal_cli.training.task import Task, Trained
@@ -43,7 +44,7 @@ _QUIET = 2
 _DIVERGED = 10.0
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class BackpropOptions:
     """Options of `train_backprop`.
 
@@ -89,7 +90,7 @@ class BackpropOptions:
             raise InputError("beta, tolerance, floor and halvings must not be negative")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class BackpropTrained(Trained):
     """Networks after training by back-propagation.
 

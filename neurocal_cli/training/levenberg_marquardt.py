@@ -17,13 +17,14 @@ problem. With mu = 0 the descent continues from there to the perspective camera.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt, Stop
 from neurocal_cli.network import Patterns, optimal_gamma
@@ -32,7 +33,7 @@ from neurocal_cli.training.task import Task, Trained
 __all__ = ["LMOptions", "train_lm"]
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class LMOptions:
     """Settings of `train_lm`.
 

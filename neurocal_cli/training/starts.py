@@ -6,11 +6,10 @@ points on the same side of the camera, have most probably found the global minim
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns, output, random_weights
 from neurocal_cli.training import Task, Trained, Trainer
@@ -18,7 +17,7 @@ from neurocal_cli.training import Task, Trained, Trainer
 __all__ = ["Agreement", "FixedWeights", "Learnt", "learn"]
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Agreement:
     """Tolerances within which two losses are the same.
 
@@ -34,7 +33,7 @@ class Agreement:
     absolute: float = 1e-10
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class FixedWeights:
     """Weights that are given; nan in W where they are not.
 
@@ -48,7 +47,7 @@ class FixedWeights:
     V: Array | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Learnt:
     """The best network of each view.
 

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns
 
 __all__ = ["Task", "Trained", "Trainer"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Task:
     """A stack of networks to train on E_2D from given initial weights.
 
@@ -37,7 +37,7 @@ class Task:
     free_V: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Trained:
     """Networks after training.
 

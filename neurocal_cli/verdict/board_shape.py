@@ -10,7 +10,7 @@ coefficients of displacements in the plane.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from neurocal_cli.bundle_adjustment.reprojection import (
     derivatives,
 )
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
@@ -41,7 +42,7 @@ _RIDGE = 1e-13  # as in cross-validation
 _ACROSS = 11  # points of a grid on the board
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class BoardShape:
     """How a target that is said to be flat seems to be bent, or stretched.
 
@@ -151,7 +152,7 @@ def _least(n: int) -> float:
     return n * float(exceeded_by_chance(n, _CHANCE))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Frame:
     """The board's own axes.
 

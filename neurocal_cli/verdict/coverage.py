@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -21,7 +20,7 @@ _THIRDS = (
 )
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Coverage:
     """What the points cover.
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.coverage import Coverage
 from neurocal_cli.verdict.findings import Finding
@@ -15,7 +14,7 @@ from neurocal_cli.verdict.view_groups import ViewGroups
 __all__ = ["Evidence"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Evidence:
     """What was measured.
 

@@ -6,14 +6,13 @@ too large is moved away. What the points themselves ask for is found with these 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 __all__ = ["AskedFor", "asked_for"]
 
@@ -24,7 +23,7 @@ _STEPS = 20
 _WELL_POSED = 1e-7  # smallest eigenvalue of a normal matrix of unit diagonal
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class AskedFor:
     """A given parameter as the points would have it.
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.verdict.assessment import gather_evidence
 from neurocal_cli.verdict.findings import WORDS, Finding, image_diagonal, pixel_spread
 from neurocal_cli.verdict.limits import Limit
@@ -21,7 +22,7 @@ _CHANCE = 3.0  # standard deviations of an rms error of so few points
 _ROUNDING = 1e-4  # of the pixels' spread: an error below is as good as none
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class GivenPoints:
     """The error of a calibration on points that were given.
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 __all__ = ["Limit"]
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Limit:
     """From where on a quantity is no longer good, and from where on it is poor."""
 

@@ -13,14 +13,13 @@ cov(e) of M B^-1 M^T, M turning a view's pose steps into motions.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.camera import Camera
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 
@@ -31,7 +30,7 @@ _ACROSS = 21  # points across the image
 _BEYOND, _LEAST = 1.1, 1.2
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class ProjectionUncertainty:
     """Standard deviation of projected pixels over the image.
 

@@ -16,13 +16,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
@@ -44,7 +44,7 @@ _FEWEST = 5  # views
 _MEAN, _TWO, _TWO_ROOT, _SHARE = 2.0 / np.pi, 6.5, 2.75, 1.06
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class ViewChange:
     """How the camera differs between views.
 
@@ -153,7 +153,7 @@ def _directions(views: Views, state: CameraState, free: NDArray[np.bool_]) -> It
         yield "image size", size
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _ScoreTest:
     """Scores of one parameter.
 

@@ -8,8 +8,6 @@ both are adjusted, as k-means does it with points. If two cameras leave hardly m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,6 +16,7 @@ from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics
 
@@ -37,7 +36,7 @@ _STEPS = 30
 _ADJUSTED = 4  # rounds with cameras that are adjusted, not only followed along the quadratic
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class ViewGroups:
     """What the views ask for.
 
@@ -129,7 +128,7 @@ def _differ(cameras: Array) -> bool:
     return bool((np.abs(cameras[0] - cameras[1])[[0, 2, 3, 4]] > _DIFFERENT * cameras[0, 0]).any())
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Split:
     member: NDArray[np.bool_]
     cameras: Array  # (2, 5), normalised

@@ -9,11 +9,12 @@ zoom lens in the networks only.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
 from neurocal_cli.zoom_lens.interpolation import (
@@ -96,7 +97,7 @@ def _polynomial(table: Tables, variance: float, scale: str, x: Array, powers: Ar
     return lambda to: (outputs_to_local(scale, monomials(to, powers) @ coefficients)[0], table.constants)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Polynomials:
     """A polynomial of the controls for each output: a `quadratic_error.LocalModel`.
 

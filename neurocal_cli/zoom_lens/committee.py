@@ -12,11 +12,12 @@ therefore consists of those of the best networks that agree most between the set
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.mlfn import Topology
@@ -39,7 +40,7 @@ _AGREEING_SHARE = 0.6  # of the best networks, which may be in the committee
 _GRID = 13  # values of each control at which networks are compared
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Budget:
     """Numbers of networks to train and to keep.
 
@@ -63,7 +64,7 @@ class Budget:
     schedule: Schedule = field(default_factory=Schedule)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Ranked:
     """Networks of one parameter, the best first, and the evidence of the best, in units of the targets."""
 

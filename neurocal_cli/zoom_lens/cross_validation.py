@@ -6,10 +6,9 @@ s, the error of its prediction from all others is (I - K_ss)^-1 e_s (the PRESS f
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.initialisation import CalibratedSettings
@@ -19,7 +18,7 @@ from neurocal_cli.zoom_lens.quadratic_error import inverse, with_scatter
 __all__ = ["LeftOutErrors", "left_out_errors"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class LeftOutErrors:
     """Errors at settings, each predicted from all others.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import Intrinsics, entries_of
 from neurocal_cli.camera.projection import image_points
 from neurocal_cli.errors import InputError, NeurocalError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.methods import calibrate
 from neurocal_cli.zoom_lens.baseline_models import baselines_of
@@ -23,7 +24,7 @@ from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 __all__ = ["LensEvaluation", "SettingError", "evaluate_lens"]
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class SettingError:
     """Reprojection error at one setting.
 
@@ -40,7 +41,7 @@ class SettingError:
     max_px: float
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class LensEvaluation:
     """Reprojection error of a lens at the settings of some points.
 

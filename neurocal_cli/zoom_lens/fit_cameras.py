@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.initialisation import check_settings
@@ -24,7 +24,7 @@ _MEMBERS = 4  # test_a_real_lens_of_42_zooms_left_out_one_by_one measures the er
 _LEAST_STD = 1e-6  # standard deviation of a parameter without scatter, as a share of the parameter
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class LensCameras:
     """Cameras that are known at some settings, with unknown errors.
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.committee import Budget
 from neurocal_cli.zoom_lens.outlier_settings import bad_pixels
@@ -35,7 +36,7 @@ __all__ = [
 Progress = Callable[[str, float], None]
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class FitOptions:
     """Options of `fit_lens`."""
 
@@ -46,7 +47,7 @@ class FitOptions:
     seed: int
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CalibratedSettings:
     """Result of step 1."""
 

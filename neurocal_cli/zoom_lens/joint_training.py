@@ -10,10 +10,11 @@ matrices are recomputed until nothing changes.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
 from neurocal_cli.zoom_lens.network_training import updated_precision
@@ -36,7 +37,7 @@ _OPTIONS = DescentOptions(
 _PRIOR_ROUNDS = 4  # the first rounds, which update the priors
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Joint:
     """Networks and constants after training.
 

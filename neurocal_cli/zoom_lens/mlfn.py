@@ -21,12 +21,12 @@ B networks of one topology are computed together: weights are (B, P).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Topology", "respond", "respond_with_jacobian"]
@@ -36,7 +36,7 @@ __all__ = ["Topology", "respond", "respond_with_jacobian"]
 _LARGEST_TILT = 0.99
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Topology:
     """Numbers of units of a network.
 

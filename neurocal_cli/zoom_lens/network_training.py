@@ -10,11 +10,10 @@ errors are larger than c_s explains. The evidence compares starts and topologies
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 from neurocal_cli.zoom_lens.mlfn import Topology, respond_with_jacobian
@@ -34,7 +33,7 @@ _OPTIONS = DescentOptions(
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Schedule:
     """Numbers of iterations.
 
@@ -55,7 +54,7 @@ class Schedule:
     period: int = 4
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class TrainedNets:
     """A stack of trained networks.
 

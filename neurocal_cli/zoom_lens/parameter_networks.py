@@ -8,10 +8,11 @@ the setting. u0, v0, t_z and the distortion coefficients are used as they are.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.mlfn import Topology, respond, respond_with_jacobian
 from neurocal_cli.zoom_lens.network_training import prior_precision
@@ -49,7 +50,7 @@ def from_scale(scale: str, y: Array) -> tuple[Array, Array]:
     return np.asarray(y, dtype=float), np.ones_like(y)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class ParameterNet:
     """One network with the scaling of its output.
 
@@ -87,7 +88,7 @@ class ParameterNet:
         return prior_precision(self.topology, self.precision)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class LensNets:
     """One network for each local parameter: alpha_u, alpha_v, u0, v0, and then t_z and distortion.
 

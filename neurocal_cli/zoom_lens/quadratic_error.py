@@ -9,12 +9,13 @@ points.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.normal_equations import ROUNDING, damped_step, solve_scaled
@@ -51,7 +52,7 @@ class LocalModel(Protocol):
         ...
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class QuadraticError:
     """2 E of a model.
 

@@ -11,7 +11,7 @@ the shared parameters. Residuals are in pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, normal_blocks
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
 from neurocal_cli.least_squares.schur_complement import eliminate
 from neurocal_cli.zoom_lens.settings import LensPoints
@@ -29,7 +30,7 @@ __all__ = ["Constants", "Normal", "PixelData", "Tables"]
 _POSE_STEPS = 12  # most steps of the poses, which start at those of the last normal matrices
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Constants:
     """Parameters that all settings share.
 
@@ -54,7 +55,7 @@ class Constants:
         return Constants(theta, orthonormalised(rotation_step(step[1:4]) @ self.R), self.t + step[4:6])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Normal:
     """Second-order model of the reprojection error of each setting.
 
@@ -83,7 +84,7 @@ class Normal:
         return np.concatenate([np.concatenate([self.H, g], axis=2), below], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Tables:
     """Local parameters at each setting and the constants that go with them.
 
@@ -102,7 +103,7 @@ class Tables:
     converged: bool = True
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class PixelData:
     """Points of all settings, ready for `linearise`.
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
@@ -17,7 +17,7 @@ __all__ = ["CONTROLS", "LensPoints", "describe", "scaled_controls"]
 CONTROLS = ("zoom", "focus")
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class LensPoints:
     """Known points and their images, with the setting of each.
 

@@ -8,13 +8,13 @@ smallest error that any model of the local parameters can reach at the settings.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import DegenerateGeometryError, NeurocalError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minimise
 from neurocal_cli.least_squares.schur_complement import schur_covariance, schur_step
@@ -29,7 +29,7 @@ __all__ = ["StaticFit", "calibrate_each", "common_tables", "fit_local", "local_c
 _OPTIONS = DescentOptions(damping=1e-3, largest_damping=1e12)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class StaticFit:
     """Independent calibrations.
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.target import Target
 from neurocal_cli.zoom_lens.joint_training import posterior
@@ -20,7 +20,7 @@ from neurocal_cli.zoom_lens.target_coupling import with_target_uncertain
 __all__ = ["Member", "Prediction", "RejectedSetting", "ZoomLens"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Member:
     """One member of the committee: its networks and constants."""
 
@@ -28,7 +28,7 @@ class Member:
     constants: Constants
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class RejectedSetting:
     """A setting that was left out, and the reason."""
 
@@ -36,7 +36,7 @@ class RejectedSetting:
     reason: str
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Prediction:
     """Predicted parameters at some settings.
 
@@ -58,7 +58,7 @@ class Prediction:
         return np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class ZoomLens:
     """A camera with a calibrated zoom lens.
 

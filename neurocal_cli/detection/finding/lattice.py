@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 
 import cv2
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.predict import PredictedVertices, predict_vertices
 from neurocal_cli.detection.medians import median
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -26,7 +27,7 @@ Index = NDArray[np.intp]
 LEAST_SIGMA = 0.75  # px, of the smoothing of derivatives; for the narrowest squares
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Lattice:
     """A grid that is being found.
 

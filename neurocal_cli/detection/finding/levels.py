@@ -5,13 +5,13 @@ Pixel (u, v) of a level is pixel (2 u, 2 v) of the level below it: `cv2.pyrDown`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Level", "interpolate", "levels_of", "pyramid"]
@@ -27,7 +27,7 @@ _ROWS = 32000  # rows of one call to cv2.remap, which counts them in 16 bits
 _LEAST_NOISE = 0.12  # DN/px^2; rounding to 8 bits leaves this much
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Level:
     """A level of the pyramid.
 

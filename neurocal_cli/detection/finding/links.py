@@ -7,7 +7,6 @@ precedes: along a line of the board, even and odd ports meet.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.saddles import Saddles
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Links", "find_links"]
@@ -28,7 +28,7 @@ _ASIDE = 2.0  # px; distance from the port's line that is always allowed
 _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Links:
     """Neighbours of saddles along their edges.
 

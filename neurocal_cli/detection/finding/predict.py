@@ -8,12 +8,12 @@ small, as perspective and distortion make them, so that few neighbours give a li
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["PredictedVertices", "predict_vertices"]
@@ -33,7 +33,7 @@ _RIGHT = _WEIGHT[:, None] * _BASIS
 _FIRST, _ONES = np.eye(6)[0], np.ones(len(_c))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class PredictedVertices:
     """Predicted vertices.
 

@@ -8,14 +8,13 @@ ports 1 and 3.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.subpixel import refine_saddles
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Saddles", "find_saddles"]
@@ -35,7 +34,7 @@ _NARROWEST = np.radians(14)  # least angle between two lines
 _PER_MEGAPIXEL, _LEAST, _MOST = 4000, 500, 1400  # saddles examined, at least examined, and kept; for time
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Saddles:
     """Candidates for vertices.
 

@@ -11,7 +11,7 @@ saddles as that view shows it, in the level's pixels.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -26,6 +26,7 @@ from neurocal_cli.detection.finding.seeds import whole_blocks
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.medians import median
 from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["PlaneView", "any_left", "find_bent", "refined_locally"]
@@ -45,7 +46,7 @@ _LARGEST = 1.5  # px; farthest that a vertex moves when it is refined in the ima
 _SIGMA = 0.15  # of a square's width; smoothing of derivatives, in steps of 0.25 px
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class PlaneView:
     """A plane seen from straight above, through the lens that shows it in the image.
 

@@ -5,12 +5,11 @@ In: the saddles of a level without grids. Out: a stretched part of the level, in
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
 from neurocal_cli.detection.finding.levels import Level
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Stretched", "stretch"]
@@ -24,7 +23,7 @@ _STRAY = 3.0  # times the median distance from the middle; farther saddles are i
 _LARGEST = 0.25  # share of the image that the saddles may cover
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Stretched:
     """A part of a level, stretched.
 

@@ -6,13 +6,12 @@ each point, from twelve samples: inside the four squares and on both sides of th
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.predict import PredictedVertices
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["VertexCheck", "check_vertices"]
@@ -25,7 +24,7 @@ _LEAST_EVENNESS = 0.6  # a visible vertex has 0.9 and more, even if blurred or n
 _LEAST_EDGE = 0.3  # of the contrast, across every edge
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class VertexCheck:
     """What the samples around points say.
 

@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -48,7 +49,7 @@ _FLOAT32 = 1e-6  # relative error of float32 sums
 _NOTHING = 1e-9  # information that keeps fits without pixels regular
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class LevelPrior:
     """Gaussian prior of mean level, half contrast and blur.
 
@@ -66,7 +67,7 @@ class LevelPrior:
         return LevelPrior(self.mean[which], self.precision[which])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class ProfileShape:
     """Shape of the edges' profiles; see `edge_profile`.
 
@@ -92,7 +93,7 @@ class ProfileShape:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Linearised:
     """A model linearised at some values.
 
@@ -138,7 +139,7 @@ def rows_for(count: int, values: int, pixels: int, kind: np.dtype[np.floating]) 
     return rows
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class BatchFit:
     """Fitted values.
 

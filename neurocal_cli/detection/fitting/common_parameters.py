@@ -5,7 +5,7 @@ In: the fits of all edges. Out: their common parameters, as weights, shape and p
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.smooth_map import Frame
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["BoardBlur", "FieldBlur", "PixelNoise", "level_prior", "profile_shape"]
@@ -54,7 +55,7 @@ _LEAST_SPREAD = 0.0002  # of the levels' variance, in variances of the noise
 _TINY = np.float32(1e-30)
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class PixelNoise:
     """Variance of the pixels [DN^2] on the dark side, at the edge, on the light side."""
 
@@ -152,7 +153,7 @@ def profile_shape(
     return replace(shape, tails=shape.tails + change[:2], nonlinearity=shape.nonlinearity + change[2:])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class BoardBlur:
     """Blur of all edges of a board: ``sigma^2 = n^T S n`` for an edge with the normal n.
 
@@ -191,7 +192,7 @@ class BoardBlur:
         return np.sqrt(np.maximum(square, LEAST_BLUR**2))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class FieldBlur:
     """Blur that grows towards the rim of a wide lens: log sigma by place and direction.
 

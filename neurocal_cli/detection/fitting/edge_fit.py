@@ -14,7 +14,7 @@ blurring sign(z) sign(t) gives erf erf + 4 rho phi phi + ... with rho the cosine
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ from neurocal_cli.detection.fitting.batched_newton import (
 from neurocal_cli.detection.fitting.edge_profile import erf_and_density, response
 from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.strips import Lines, Strips
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -55,7 +56,7 @@ _ALONE = 9.0  # sigma; a parallel line at this distance has no effect
 _BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class EdgeData:
     """The pixels as the fits need them, (E, N) float32 arrays.
 

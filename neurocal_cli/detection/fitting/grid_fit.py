@@ -6,7 +6,7 @@ common parameters, a last fit, and the map through it. In: `GridImage`. Out: `Gr
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertice
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["GridEdges", "GridFit", "GridImage", "fit_grid", "fit_grid_vertices"]
@@ -65,7 +66,7 @@ _LEAST_SCALE = 0.1  # of the noise by the final residuals, relative to the first
 _PRECISE = 0.003  # sigma; standard deviation of offsets below which the profile is estimated again
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class GridEdges:
     """The edges between neighbouring vertices of a grid, those along c first.
 
@@ -97,7 +98,7 @@ class GridEdges:
         return cls(index.astype(np.int64), vertical, centre, light)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class GridImage:
     """An image and a grid in it, prepared for the fits.
 
@@ -139,7 +140,7 @@ class GridImage:
         return edges.joined_with(anchors)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class GridFit:
     """Fitted edges and their common parameters.
 

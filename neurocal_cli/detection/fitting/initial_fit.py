@@ -6,8 +6,6 @@ edges have in common.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,6 +19,7 @@ from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["InitialFit", "fit_initial"]
@@ -35,7 +34,7 @@ _BLUR_OFF = 0.2  # relative error of the blur that makes the fits start again
 _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations of the prior
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class InitialFit:
     """Fits of edges with independent levels.
 

@@ -9,13 +9,14 @@ In: a start, observations. Out: the map with its covariance, residuals, weights 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.medians import upper_median
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = [
@@ -42,7 +43,7 @@ _ROBUST = 1.5  # standard deviation over the median absolute value, about 1.4826
 _TUKEY = 6.0  # standard deviations beyond which an observation is an outlier
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Observations:
     """Positions known along one direction each: ``direction . p = value``.
 
@@ -87,7 +88,7 @@ class Observations:
         return Observations(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class MapFit:
     """A map fitted to observations.
 
@@ -138,7 +139,7 @@ def fit_map(start: SmoothMap, observations: Observations, shift: Array, steps: i
     return with_covariance(solve_map(start, observations, shift, steps), observations)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class MapSolution:
     """A fitted map: shifts, residuals (N,) and derivatives (P, N) of the predictions."""
 

@@ -5,7 +5,7 @@ In: levels measured inside squares or by edge fits. Out: `Shading`, the levels a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_median
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Levels", "LocalShading", "Shading", "fit_shading", "square_levels"]
@@ -30,7 +31,7 @@ _NEAREST = 3  # levels that count most at a place
 _TERMS = (1, 3, 6)  # coefficients of polynomials of degree 0, 1, 2
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Levels:
     """Levels [DN] measured at places of the image.
 
@@ -48,7 +49,7 @@ class Levels:
     noise: Array = field(default_factory=lambda: np.zeros(0))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Shading:
     """Dark and light level as polynomials of the place.
 
@@ -83,7 +84,7 @@ class Shading:
         return 0.5 * (light + dark), 0.5 * (light - dark)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class LocalShading(Shading):
     """Levels that also follow the squares nearby: light falls fast towards the rim of a wide lens's image.
 

@@ -13,13 +13,14 @@ of at least 2.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Frame", "Places", "SmoothMap", "homography_start", "polynomial_orders", "polynomials"]
@@ -32,7 +33,7 @@ _FREE_LENS: tuple[tuple[int, ...], ...] = ((), (10,), (8, 9, 10, 11), (8, 9, 10,
 _CENTRE_PRIOR, _RADIAL_PRIOR, _REST_PRIOR = 0.1, 1.0, 0.1
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Frame:
     """Scales of grid and pixels.
 
@@ -59,7 +60,7 @@ class Frame:
         return cls(0.5 * (low + high), half, centre, float(0.5 * np.hypot(*size)))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Places:
     """Grid points, each with a direction in the image, prepared for maps of one model.
 
@@ -81,7 +82,7 @@ class Places:
     rest: Array | None
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class SmoothMap:
     """A map with its parameters, some of which may be fixed at 0.
 

@@ -5,12 +5,11 @@ In: a smooth map. Out: `Lines`, a local frame for each edge, and `Strips`, its p
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Lines", "Strips", "grid_lines", "strip_pixels"]
@@ -22,7 +21,7 @@ _CLOSEST = 0.5  # px, least distance of parallel lines, against division by 0; i
 _NEIGHBOURS = np.array([[0.0, -1.0], [0.0, 1.0]])
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Lines:
     """Pieces of grid lines in the image, one square long, each with a local frame.
 
@@ -112,7 +111,7 @@ def grid_lines(at: SmoothMap, centre: Array, vertical: NDArray[np.bool_], light:
     return Lines(middle, tangent, normal, curvature, ends, crossing, np.maximum(apart, _CLOSEST))
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Strips:
     """Pixels around lines, padded to the same number for all; float32.
 
@@ -225,7 +224,7 @@ def _column(x: Array) -> Single:
     return np.asarray(x[:, None], dtype=np.float32)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Window:
     """Parallelograms of pixels: `rows` of them from `top` on in each column.
 

@@ -14,7 +14,7 @@ that are nearer to its own line.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, r
 from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, packed, strip_pixels
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["FIRST", "SECOND", "VertexData", "fit_vertices", "linearised", "vertex_data", "vertex_lines"]
@@ -49,7 +50,7 @@ _TERMS, _MOST_TERMS = ((2, 0.1), (4, 0.35), (7, 0.65)), 12
 _ALONE = 9.0  # sigma; a parallel line at this distance has no effect
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class VertexData:
     """The pixels as the fits need them; (V, N) float32 arrays.
 

@@ -14,7 +14,7 @@ at any angle from the axis. `wide_start` gives the start; everything else is as 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 from typing import ClassVar
 
 import numpy as np
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.detection.fitting.smooth_map import Frame, Places, SmoothMap, polynomial_orders, polynomials
 from neurocal_cli.detection.wide_lens import fit_wide_lens
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["WideMap", "wide_start"]
@@ -45,7 +46,7 @@ _ROOM = 1.05  # of the profile beyond the board's outermost vertex
 _LEAST = 1e-9
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class WideMap(SmoothMap):
     """A map with its parameters h, c, a, m, n, b, some of which may be fixed at 0.
 

@@ -7,13 +7,13 @@ and it begins where the next vertices would be. An occluder or the image's borde
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.grid import Grid
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["DIRECTIONS", "End", "board_ends"]
@@ -39,7 +39,7 @@ class End(Enum):
     UNKNOWN = "hidden, blurred or outside the image"
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Side:
     """Profiles across the end of a grid, one for each square along it; 0 is dark and 1 light.
 

@@ -16,7 +16,6 @@ In: a board, the grids of an image, and the image. Out: `Located` grids. The cri
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +33,7 @@ from neurocal_cli.detection.identity.messages import (
 from neurocal_cli.detection.identity.placement import Placement, placements
 from neurocal_cli.detection.identity.trim import trimmed
 from neurocal_cli.detection.medians import median
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Identified", "Located", "NoBoardError", "identify"]
@@ -48,7 +48,7 @@ _MOST_TRIED = 5000  # arrangements that are tried, for time; small pieces of lar
 _KEPT = 200  # best arrangements that are extended by a further grid, for time
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Located:
     """A grid and its place on the board.
 
@@ -64,7 +64,7 @@ class Located:
     placement: Placement
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Identified:
     """The grids of an image that belong to the board.
 
@@ -111,7 +111,7 @@ def identify(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> 
     return Identified(tuple(sorted(located, key=lambda one: one.placement.plane)), warnings)
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class _Candidate:
     """A grid and all its possible placements on the board."""
 
@@ -121,7 +121,7 @@ class _Candidate:
     ends: Mapping[tuple[int, int], End]
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class _Arrangement:
     """Placements for all grids together, and the rms error of one camera for them [px]."""
 

@@ -6,10 +6,9 @@ with the squares by which wrong arrangements miss.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["CameraFit", "fit_camera", "is_flat", "rigid_motion"]
@@ -18,7 +17,7 @@ _FLAT = 1e-6  # ratio of smallest and largest extent of points in one plane: rou
 _WEAK = 3.0  # ratio by which an affine camera must fit worse for perspective to be certain
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class CameraFit:
     """A projective camera fitted to points.
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
@@ -12,6 +11,7 @@ from numpy.typing import ArrayLike
 from neurocal_cli.board import Plane
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Placement", "placements"]
@@ -22,7 +22,7 @@ _TURNS: tuple[Matrix, ...] = (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0,
 _MIRRORED: tuple[Matrix, ...] = tuple((second, first) for first, second in _TURNS)
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Placement:
     """A grid's coordinates on a plane: ``matrix @ (c, r) + offset``.
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import field, replace
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.stereo.rig import Rig
 
 __all__ = ["METRES", "CameraSet", "Format"]
@@ -16,7 +17,7 @@ __all__ = ["METRES", "CameraSet", "Format"]
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class CameraSet:
     """One camera, or several that are fixed to each other.
 
@@ -79,7 +80,7 @@ class CameraSet:
         )
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Format:
     """What the files of one program can hold, and how they are written.
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.distortion.nearest_camera import Distance, NearestCamera, nearest_camera, with_model
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 
@@ -21,7 +22,7 @@ _AS_NEAR, _NEARER = 1.1, 0.01  # times the loss of the nearest model, and px
 _Fitting = tuple[Camera, NearestCamera | None, str]  # None, "": nothing that matters is lost
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Fitted:
     """Cameras as a format can hold them.
 

@@ -8,12 +8,12 @@ from the mean is spread one pixel at a time.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Blur"]
@@ -23,7 +23,7 @@ _STRIP = 16  # rows at a time
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Blur:
     """Kernels of a blur.
 

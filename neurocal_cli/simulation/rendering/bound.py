@@ -5,12 +5,13 @@ Levels, shading and blur are taken as known; not knowing them costs 5 to 10 % mo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.pinhole import Intrinsics
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.light import enough_parts, image_light
@@ -25,7 +26,7 @@ _NOTHING = 1e-7  # of full scale per px
 _CROSSING_LOSS = 2.26
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Bound:
     """Least standard deviations for the points of one plane; infinite where nothing can be seen.
 

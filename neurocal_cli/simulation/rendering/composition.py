@@ -6,13 +6,12 @@ straight edge cuts off a known area; a cell with two edges or more is cut once a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.projection import Rays
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer, occluder_cover
 from neurocal_cli.simulation.rendering.scene import Occluder, Scene
@@ -24,7 +23,7 @@ _FINEST = 8  # parts of a cell's side where edges meet in it
 _PIXEL_SLACK = 0.1  # px by which an edge may bend between a pixel's centre and its corner
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Composition:
     """The layers of a scene, ready to be looked at.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import DegenerateGeometryError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.coverage import half_plane
 from neurocal_cli.simulation.rendering.scene import Disc, Occluder, Rectangle, Scene, Target
@@ -42,7 +42,7 @@ class Cover(NamedTuple):
     edges: NDArray[np.int8]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class BoardLayer:
     """A target as the camera sees it.
 

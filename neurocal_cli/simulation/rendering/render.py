@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.light import image_light
 from neurocal_cli.simulation.rendering.scene import Scene
@@ -15,7 +14,7 @@ from neurocal_cli.simulation.rendering.truth import Truth, ground_truth
 __all__ = ["Rendered", "noise_free", "render"]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Rendered:
     """A picture.
 

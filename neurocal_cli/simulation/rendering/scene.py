@@ -6,7 +6,7 @@ package's convention: the centre of the top-left pixel is (0, 0).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from typing import Literal
 
 import numpy as np
@@ -15,6 +15,7 @@ from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.wide import WideCamera
 
@@ -35,7 +36,7 @@ ClutterKind = Literal["blocks", "lines", "gradients", "discs", "decoys"]
 CLUTTER_KINDS: tuple[ClutterKind, ...] = ("blocks", "lines", "gradients", "discs", "decoys")
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Sides:
     """A length on each side of a board, in squares; low and high along x_axis and y_axis."""
 
@@ -50,7 +51,7 @@ class Sides:
         return cls(length, length, length, length)
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Target:
     """A printed chessboard.
 
@@ -95,7 +96,7 @@ class Target:
         return x_low - margin.x_low, x_high + margin.x_high, y_low - margin.y_low, y_high + margin.y_high
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Rectangle:
     """Something rectangular in front of everything, in image coordinates.
 
@@ -115,7 +116,7 @@ class Rectangle:
     level: float = 0.35
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Disc:
     """Something round in front of everything, in image coordinates [px]."""
 
@@ -127,7 +128,7 @@ class Disc:
 Occluder = Rectangle | Disc
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Background:
     """What stands behind the boards, constant within each pixel before the blur.
 
@@ -157,7 +158,7 @@ class Background:
             raise InputError(f"there is no clutter {sorted(unknown)}; there are {list(CLUTTER_KINDS)}")
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Illumination:
     """Light that falls on the whole scene, ``level (1 + gradient . ((u - uc) / W, (v - vc) / H))``.
 
@@ -174,7 +175,7 @@ class Illumination:
             raise InputError("illumination must stay positive: level > 0 and |gx| + |gy| < 2")
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class ImageCircle:
     """The round image of a fisheye that does not fill the picture; it is dark outside.
 
@@ -201,7 +202,7 @@ class ImageCircle:
             raise InputError("an image circle needs a radius, a soft rim, and vignetting from 0 to 1")
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Sensor:
     """From light to numbers.
 
@@ -239,7 +240,7 @@ class Sensor:
         return (1 << self.bits) - 1
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class Scene:
     """Everything that decides a picture but its noise.
 

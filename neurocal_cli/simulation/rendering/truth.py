@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.board import Plane
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer, occluder_cover
 from neurocal_cli.simulation.rendering.scene import Scene, Target
@@ -21,7 +21,7 @@ _TINY_CELL = 1e-6  # px; a point
 _STEP = 1e-4  # squares; for directions in the image
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class PlaneTruth:
     """A plane's points in the picture.
 
@@ -68,7 +68,7 @@ class PlaneTruth:
     polarity: NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
+@frozen_dataclass(eq=False)
 class Truth:
     """What a detector should find.
 

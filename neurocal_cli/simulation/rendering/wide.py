@@ -9,13 +9,14 @@ or one of the classic laws: 2 sin(t / 2) keeps areas, 2 tan(t / 2) keeps shapes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.errors import InputError
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = ["Law", "WideCamera", "WideRays"]
@@ -42,7 +43,7 @@ class WideRays(NamedTuple):
     zv: Array
 
 
-@dataclass(frozen=True)
+@frozen_dataclass
 class WideCamera:
     """A camera with a fisheye lens.
 

@@ -1,0 +1,155 @@
+"""A class made by `frozen_dataclass` is what `dataclasses.dataclass(frozen=True)` makes of it."""
+
+from __future__ import annotations
+
+import copy
+import inspect
+import pickle
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError, asdict, astuple, dataclass, field, fields, is_dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import pytest
+
+from neurocal_cli.frozen_dataclass import frozen_dataclass
+
+Decorator = Callable[[type], Any]
+
+
+def classes(frozen: Decorator, unequal: Decorator) -> tuple[Any, Any, Any, Any]:
+    @frozen
+    class Point:
+        """A point."""
+
+        x: float
+        y: float = 2.0
+        names: list[str] = field(default_factory=list, compare=False)
+        length: float = field(init=False)
+        count: int = field(default=3, init=False, repr=False)
+        memory: dict[int, int] = field(default_factory=dict, init=False, repr=False, compare=False)
+        unit: ClassVar[str] = "mm"
+
+        def __post_init__(self) -> None:
+            object.__setattr__(self, "length", abs(self.x))
+
+        @cached_property
+        def double(self) -> float:
+            return 2.0 * self.x
+
+    @frozen
+    class Named(Point):
+        name: str = field(default="", kw_only=True)
+
+    class Bare(Point):
+        pass
+
+    @unequal
+    class Identity:
+        value: int
+
+        def __repr__(self) -> str:
+            return "one"
+
+    return Point, Named, Bare, Identity
+
+
+OURS = classes(frozen_dataclass, frozen_dataclass(eq=False))
+THEIRS = classes(dataclass(frozen=True), dataclass(frozen=True, eq=False))
+PAIRS = list(zip(OURS, THEIRS, strict=True))
+
+
+@frozen_dataclass
+class Kept:
+    """Can be found by pickle."""
+
+    a: int
+    b: tuple[int, ...] = ()
+
+
+@pytest.mark.parametrize(("ours", "theirs"), PAIRS)
+def test_signature_and_fields_are_those_of_a_dataclass(ours: Any, theirs: Any) -> None:
+    assert str(inspect.signature(ours)) == str(inspect.signature(theirs))
+    assert str(inspect.signature(ours.__init__)) == str(inspect.signature(theirs.__init__))
+    assert ours.__init__.__qualname__ == theirs.__init__.__qualname__
+    assert ours.__match_args__ == theirs.__match_args__
+    assert is_dataclass(ours)
+    assert [repr(f) for f in fields(ours)] == [repr(f) for f in fields(theirs)]
+
+
+@pytest.mark.parametrize(("ours", "theirs"), PAIRS[:3])
+def test_objects_are_those_of_a_dataclass(ours: Any, theirs: Any) -> None:
+    mine, other = ours(1.0, names=["a"]), theirs(1.0, names=["a"])
+    assert vars(mine) == vars(other)
+    assert repr(mine) == repr(other)
+    assert hash(mine) == hash(other)
+    assert asdict(mine) == asdict(other)
+    assert astuple(mine) == astuple(other)
+    assert vars(replace(mine, x=-5.0)) == vars(replace(other, x=-5.0))
+    assert vars(copy.deepcopy(mine)) == vars(mine)
+    assert mine.double == other.double == 2.0
+    assert ours(1.0).names is not ours(1.0).names
+
+
+@pytest.mark.parametrize("cls", OURS[:3])
+def test_objects_compare_by_their_fields(cls: Any) -> None:
+    assert cls(1.0, names=["a"]) == cls(1.0, names=["b"])
+    assert hash(cls(1.0, names=["a"])) == hash(cls(1.0, names=["b"]))
+    assert cls(1.0) != cls(2.0)
+    assert cls(1.0).__eq__(1.0) is NotImplemented
+
+
+def test_objects_of_two_classes_differ() -> None:
+    Point, Named, *_ = OURS
+    assert Point(1.0) != Named(1.0)
+
+
+@pytest.mark.parametrize("identity", [OURS[3], THEIRS[3]])
+def test_without_eq_an_object_equals_itself_alone(identity: Any) -> None:
+    one = identity(1)
+    assert one == one
+    assert one != identity(1)
+    assert {one: 2}[one] == 2
+    assert repr(one) == "one"
+
+
+@pytest.mark.parametrize("cls", [*OURS[:2], *THEIRS[:2]])
+@pytest.mark.parametrize("name", ["x", "anything"])
+def test_nothing_is_assigned_or_deleted(cls: Any, name: str) -> None:
+    value = cls(1.0)
+    with pytest.raises(FrozenInstanceError, match=f"cannot assign to field '{name}'"):
+        setattr(value, name, 2.0)
+    with pytest.raises(FrozenInstanceError, match=f"cannot delete field '{name}'"):
+        delattr(value, name)
+
+
+@pytest.mark.parametrize("bare", [OURS[2], THEIRS[2]])
+def test_a_plain_subclass_is_frozen_in_the_fields_that_it_inherits(bare: Any) -> None:
+    value = bare(1.0)
+    value.other = 2
+    del value.other
+    with pytest.raises(FrozenInstanceError):
+        value.x = 2.0
+
+
+@pytest.mark.parametrize("arguments", [(), (1.0, 2.0, [], 4.0), (1.0, 2.0, [], "name")])
+def test_wrong_arguments_are_refused_in_the_same_words(arguments: tuple[Any, ...]) -> None:
+    with pytest.raises(TypeError) as theirs:
+        THEIRS[1](*arguments)
+    with pytest.raises(TypeError) as ours:
+        OURS[1](*arguments)
+    assert str(ours.value) == str(theirs.value)
+
+
+def test_objects_are_pickled() -> None:
+    assert pickle.loads(pickle.dumps(Kept(1, (2, 3)))) == Kept(1, (2, 3))
+
+
+def test_init_is_compiled_when_it_is_first_looked_up() -> None:
+    @frozen_dataclass
+    class Late:
+        value: int
+
+    assert not inspect.isfunction(vars(Late)["__init__"])
+    assert Late(1).value == 1
+    assert inspect.isfunction(vars(Late)["__init__"])
