@@ -26,7 +26,7 @@ from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
 
-__all__ = ["why_odd"]
+__all__ = ["may_be_bent", "why_odd"]
 
 _HOLDS = 2.0  # times the rms error of the other views
 _STEPS = 40
@@ -86,6 +86,11 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
             "blurred, or bent"
         )
     return "its points do not lie as in the other views: another target, a bent one, or another lens"
+
+
+def may_be_bent(reason: str) -> bool:
+    """Whether a reason of `why_odd` leaves it open that all views show a target of another shape."""
+    return "bent" in reason
 
 
 def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondences]]:

@@ -41,7 +41,7 @@ from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import why_odd
 from neurocal_cli.points import Correspondences
 
-__all__ = ["fit_robustly", "judged_again"]
+__all__ = ["NO_WORSE", "fit_robustly", "judged_again", "rms"]
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view; clean data are the same to the last bit with and without) and
@@ -52,7 +52,7 @@ _ROUGH = 0.005  # an rms error of this share of the image's spread may hide anyt
 _WORST_VIEW = 3.0  # standard deviations of a view, in those of all: more does not excuse its points
 _ENOUGH = 12  # points of a view that tell its standard deviation
 _PASSES = 12
-_NO_WORSE = 1.05  # times the rms error with a view that is taken back
+NO_WORSE = 1.05  # times the rms error with a view that is taken back
 _MAJORITY = 0.5  # share of the points that must be left
 _ORDINARY = 6.0  # times the median error: the points that tell whether stated sigmas hold
 _LOOKS = 2  # through a wide lens: the first may still be drawn away by wrong points
@@ -226,7 +226,7 @@ class _Search:
             kept = self.kept | (self.points.view_index == self.points.view_names.index(name))
             with suppress(DegenerateGeometryError):
                 solution = self._fit(kept, self.options)
-                if not solution.refusal and _rms(solution) <= _NO_WORSE * _rms(self.solution):
+                if not solution.refusal and rms(solution) <= NO_WORSE * rms(self.solution):
                     self.solution, self.kept = solution, kept
                     del self.wrong_views[name]
 
@@ -281,7 +281,7 @@ class _Search:
             return
         matrix = self.solution.problem.matrix(self.solution.state.entries[0])
         camera = Camera(Intrinsics.from_matrix(matrix), self.solution.state.distortion)
-        rmse = _rms(self.solution)
+        rmse = rms(self.solution)
         for name, reason in self.wrong_views.items():
             rows = self.points.view_index == self.points.view_names.index(name)
             plain = replace(self.points.select(rows), covariance=None, across=None)
@@ -405,7 +405,7 @@ def _limits(errors: _Errors, kept: NDArray[np.bool_], points: Correspondences) -
     return np.asarray(sigma * np.sqrt(2 * np.log(len(errors.length) / _CHANCE)))
 
 
-def _rms(solution: Solution) -> float:
+def rms(solution: Solution) -> float:
     """Error [px], weighted."""
     return float(np.sqrt((_errors(solution, solution.problem.points).length ** 2).mean()))
 

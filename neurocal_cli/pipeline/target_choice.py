@@ -19,8 +19,9 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Rejected
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.initialisation.options import Options
-from neurocal_cli.pipeline.fit import fit_again
-from neurocal_cli.pipeline.outlier_rejection import fit_robustly
+from neurocal_cli.pipeline.fit import fit, fit_again
+from neurocal_cli.pipeline.odd_views import may_be_bent
+from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly, rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
@@ -61,6 +62,28 @@ def with_target(
     rich = solution.state.model == "rich"  # it bends as a target does
     if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected
+    known = _searched(problem, solution, rejected, options, choice)
+    if known[0].target is None and rejected.views and all(map(may_be_bent, rejected.views.values())):
+        return _taking_views_back(problem, known, options, choice)
+    return known
+
+
+def _taking_views_back(
+    problem: Problem, known: tuple[Solution, Rejected], options: Options, choice: str
+) -> tuple[Solution, Rejected]:
+    """With a target that explains all views, where some contradict only the given one."""
+    try:
+        found = _searched(problem, fit(problem, options), known[1], options, choice)
+    except DegenerateGeometryError:
+        return known
+    explained = found[0].target is not None and not found[1].views
+    return found if explained and rms(found[0]) <= NO_WORSE * rms(known[0]) else known
+
+
+def _searched(
+    problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
+) -> tuple[Solution, Rejected]:
+    """As `with_target`, beginning with the views of one solution."""
     if not _can_tell(solution, choice, None):
         return solution, rejected
     found = _found(solution, choice, None)

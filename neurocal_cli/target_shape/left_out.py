@@ -2,7 +2,10 @@
 
 The evidence takes errors for independent noise of the stated size. Where they are not, as with a view whose
 stated sigma is far too small, offsets of the target can follow the errors of a few views. Views left out
-tell: the offsets that the other views give must lower their squared error.
+tell: the offsets that the other views give must lower their squared error, alone or together with the
+cameras that the other views give. Alone, beside cameras of their own: those of one or two views of a board
+take in its stretch or its bend, and then this tells nothing. Together, by what the views left out add to the
+squared error of the others: where a few views tell cameras and offsets only as a whole, this tells less.
 """
 
 from __future__ import annotations
@@ -50,17 +53,18 @@ def holds_for_views_left_out(
         return information_of(some, len(offsets)).turned(prior.axes).around_given(offsets)
 
     n_folds = min(n_views, _FOLDS)
-    found = given = 0.0
-    for fold in range(n_folds):
-        others = information(np.delete(np.arange(n_folds), fold))
-        out = information(np.array([fold]))
+    everything = np.arange(n_folds)
+    whole, nothing = information(everything), np.zeros_like(offsets)
+    alone, together = 0.0, -n_folds * cost_at(whole, nothing)
+    for fold in everything:
+        out, others = information(everything[fold : fold + 1]), information(np.delete(everything, fold))
         try:
             told = known_sizes(others, prior, sizes, variance).offsets
         except np.linalg.LinAlgError:
             return True
-        found += cost_at(out, told)
-        given += cost_at(out, np.zeros_like(told))
-    return found < given
+        alone += cost_at(out, told) - cost_at(out, nothing)
+        together += cost_at(whole, told) - cost_at(others, told) + cost_at(others, nothing)
+    return alone < 0 or together < 0
 
 
 def _of(sight: Sight, some: NDArray[np.bool_]) -> Sight:

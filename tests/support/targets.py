@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +14,7 @@ from neurocal_cli.points import Correspondences
 SHAPES = ("flat", "parabola", "twist", "waves", "stretch", "in_plane", "out_of_plane", "both", "flexing")
 COLS, ROWS, SQUARE = 9, 7, 25.0  # 200 mm long
 SIZE = (1280, 960)
+Lens = Callable[[float], tuple[float, ...]]  # coefficients for the radius of the image's corner
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +25,10 @@ class Truth:
     k: Array
     given: Array
     found: Array
+    model: str
+    R: Array  # (V, 3, 3)
+    t: Array  # (V, 3)
+    bent: Array  # (V, 63, 3), offsets in each view
 
 
 def board() -> Array:
@@ -80,9 +86,10 @@ def photographed(
     n_views: int = 15,
     amount: float = 0.5,
     sigma: float = 0.1,
-    k: tuple[float, ...] = (-0.2, 0.08),
+    k: tuple[float, ...] | Lens = (-0.2, 0.08),
+    model: str = "k1k2",
 ) -> tuple[Correspondences, Truth]:
-    """Views of a board of some shape; k1 and k2 in the camera."""
+    """Views of a board of some shape; k1 and k2 in the camera, or any lens drawn for its focal length."""
     rng = np.random.default_rng([seed, SHAPES.index(shape)])
     f = rng.uniform(900, 1500)
     K = np.array(
@@ -90,24 +97,45 @@ def photographed(
     )
     given = board()
     d = offsets(shape, amount, rng)
-    rows = []
+    lens = np.array(k(np.hypot(*SIZE) / 2 / f) if callable(k) else k)
+
+    def bent() -> Array:
+        return offsets("parabola", amount * rng.standard_normal(), rng) if shape == "flexing" else d
+
+    points, *poses = views_of(K, lens, model, bent, n_views, sigma, rng)
+    return points, Truth(K, lens, given, given + d, model, *poses)
+
+
+def views_of(
+    K: Array,
+    lens: Array,
+    model: str,
+    bent: Callable[[], Array],
+    n_views: int,
+    sigma: float,
+    rng: np.random.Generator,
+) -> tuple[Correspondences, Array, Array, Array]:
+    """Views of the board with offsets (63, 3), asked for anew for each; R, t and offsets of each."""
+    given, f = board(), K[0, 0]
+    rows, poses = [], []
     while len(rows) < n_views:
-        bend = d
-        if shape == "flexing":
-            bend = offsets("parabola", amount * rng.standard_normal(), rng)
+        bend = bent()
         R = rotation_step(np.append(rng.uniform(-0.7, 0.7, 2), rng.uniform(-3, 3))[None])[0]
         depth = f * 200 / rng.uniform(500, 1000)
         aim = rng.uniform(-0.3, 0.3, 2) * np.array(SIZE) / f * depth
-        X = (given + bend - given.mean(axis=0)) @ R.T + np.append(aim, depth)
-        x, y = distort("k1k2", np.array(k), X[:, 0] / X[:, 2], X[:, 1] / X[:, 2])
+        t = np.append(aim, depth) - R @ given.mean(axis=0)
+        X = (given + bend) @ R.T + t
+        x, y = distort(model, lens, X[:, 0] / X[:, 2], X[:, 1] / X[:, 2])
         uv = np.column_stack([K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]])
         if (uv < 5).any() or (uv > np.array(SIZE) - 5).any():
             continue
         rows.append(uv + sigma * rng.standard_normal(uv.shape))
+        poses.append((R, t, bend))
     points = Correspondences(
         np.tile(given, (n_views, 1)),
         np.concatenate(rows),
         np.repeat([f"v{n:02d}" for n in range(n_views)], len(given)),
         SIZE,
     )
-    return points, Truth(K, np.array(k), given, given + d)
+    R, t, offset = (np.stack(parts) for parts in zip(*poses, strict=True))
+    return points, R, t, offset

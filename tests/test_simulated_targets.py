@@ -1,0 +1,56 @@
+"""Targets of all kinds, found with the camera: standard deviations that hold, and accuracy at its bound.
+
+Per kind, 200 draws of boards that are off by 0.02 to 1 mm on 200 mm, of 5, 8, 15 and 40 views and six lenses.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from support.simulated_targets import KINDS, cost_on_new_views, draw, figures, outcome
+
+from neurocal_cli import calibrate
+
+DRAWS = 200
+# Rms error over that of who knows the prior that the offsets come from. Who meets a board does not know that
+# it is only twisted, or stretched along one side by a known size; few views make that dear.
+BOUND = dict.fromkeys(KINDS, 1.05) | {"twist": 1.1, "stretch": 1.2}
+
+
+def test_who_knows_the_prior_of_a_flat_board_knows_what_a_calibration_says() -> None:
+    one = outcome(draw("flat", 6))
+    np.testing.assert_allclose(one.bound, one.std, rtol=0.15)
+    np.testing.assert_allclose(one.best, one.error, atol=0.2 * one.bound.min())
+
+
+@pytest.mark.parametrize("seed", [96, 12])
+def test_a_stretched_print_is_found_from_five_views(seed: int) -> None:
+    """In the second set, one of the views contradicts the given board so much that it was set aside."""
+    points = draw("stretch", seed).points
+    found = calibrate(points, distortion=draw("stretch", seed).truth.model)
+    assert found.target is not None
+    assert found.target.stretch() == pytest.approx(0.003, abs=0.001)
+    assert found.n_rejected == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_standard_deviations_hold_and_accuracy_is_at_its_bound(kind: str) -> None:
+    outcomes = [outcome(draw(kind, seed)) for seed in range(DRAWS)]
+    of_all = figures(outcomes)
+    assert 0.9 < of_all.z < 1.1, of_all
+    assert 0.9 < of_all.pixels < 1.1, of_all
+    if kind == "flat":
+        costs = [cost_on_new_views(one) for one in outcomes]
+        assert np.mean([cost > 0 for cost in costs]) < 0.03, of_all
+        assert max(costs) < 0.015
+        assert np.mean(costs) < 0.001
+    if kind != "flexing":  # no model has a board that bends anew in each view
+        assert of_all.bound < BOUND[kind], of_all
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_standard_deviations_hold_where_the_lens_is_chosen_with_the_target(kind: str) -> None:
+    of_all = figures([outcome(draw(kind, seed), "auto") for seed in range(48)])
+    assert 0.8 < of_all.z < 1.2, of_all
