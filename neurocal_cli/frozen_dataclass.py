@@ -2,7 +2,7 @@
 
 ``dataclasses.dataclass(frozen=True)`` compiles up to six functions for each class while the package is
 imported. Five of them can be the same for all classes, and are written here once. The sixth, ``__init__``,
-is compiled when it is first called: most classes that a command imports never get an object.
+is compiled where a class gets many objects: most that a command imports get none or a few.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import MISSING, Field, FrozenInstanceError, dataclass, field, fields
-from functools import cache
+from functools import cache, partial
 from reprlib import recursive_repr
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
@@ -24,6 +24,7 @@ else:
 
 
 T = TypeVar("T")
+_FEW = 20  # objects, which take as long as compiling
 
 
 class _NotGiven:
@@ -68,15 +69,40 @@ def _frozen(cls: type, eq: bool) -> type:
 
 
 class _Init:
-    """An ``__init__`` that compiles itself, and takes its own place, when it is first looked up."""
+    """``__init__`` of the first objects, which needs no compiling; then a compiled one takes its place."""
 
-    def __init__(self, cls: type) -> None:
-        self.cls = cls
+    def __init__(self, cls: Any) -> None:
+        self.cls, self.calls = cls, 0
 
     def __get__(self, instance: object, owner: type) -> Any:
-        init = _compiled_init(self.cls)
-        setattr(self.cls, "__init__", init)  # noqa: B010 - mypy forbids to assign a method
-        return init.__get__(instance, owner)
+        if instance is None or self.calls >= _FEW:
+            return self._compiled().__get__(instance, owner)
+        self.calls += 1
+        return partial(self._assign, instance)
+
+    def _compiled(self) -> Any:
+        self.cls.__init__ = init = _compiled_init(self.cls)
+        return init
+
+    def _assign(self, instance: Any, /, *args: object, **named: object) -> None:
+        members = fields(self.cls)
+        given = dict(zip((f.name for f in members if f.init and not f.kw_only), args, strict=False)) | named
+        wrong = len(given) < len(args) + len(named)
+        for f in members:
+            if f.init and f.name in given:
+                value = given.pop(f.name)
+            elif f.default_factory is not MISSING:
+                value = f.default_factory()
+            elif f.init:
+                value = f.default
+                wrong |= value is MISSING
+            else:
+                continue
+            object.__setattr__(instance, f.name, value)
+        if wrong or given:
+            self._compiled()(instance, *args, **named)  # which says what is wrong
+        elif hasattr(instance, "__post_init__"):
+            instance.__post_init__()
 
 
 def _compiled_init(cls: Any) -> Any:

@@ -132,24 +132,30 @@ def test_a_plain_subclass_is_frozen_in_the_fields_that_it_inherits(bare: Any) ->
         value.x = 2.0
 
 
-@pytest.mark.parametrize("arguments", [(), (1.0, 2.0, [], 4.0), (1.0, 2.0, [], "name")])
-def test_wrong_arguments_are_refused_in_the_same_words(arguments: tuple[Any, ...]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [((), {}), ((1.0, 2.0, [], "name"), {}), ((1.0,), {"x": 2.0}), ((1.0,), {"count": 2}), ((), {"z": 1})],
+)
+def test_wrong_arguments_are_refused_in_the_same_words(
+    arguments: tuple[Any, ...], named: dict[str, Any]
+) -> None:
+    _, ours, *_ = classes(frozen_dataclass, frozen_dataclass(eq=False))
     with pytest.raises(TypeError) as theirs:
-        THEIRS[1](*arguments)
-    with pytest.raises(TypeError) as ours:
-        OURS[1](*arguments)
-    assert str(ours.value) == str(theirs.value)
+        THEIRS[1](*arguments, **named)
+    for _ in range(2):  # not compiled, and compiled
+        with pytest.raises(TypeError) as error:
+            ours(*arguments, **named)
+        assert str(error.value) == str(theirs.value)
 
 
 def test_objects_are_pickled() -> None:
     assert pickle.loads(pickle.dumps(Kept(1, (2, 3)))) == Kept(1, (2, 3))
 
 
-def test_init_is_compiled_when_it_is_first_looked_up() -> None:
-    @frozen_dataclass
-    class Late:
-        value: int
-
-    assert not inspect.isfunction(vars(Late)["__init__"])
-    assert Late(1).value == 1
-    assert inspect.isfunction(vars(Late)["__init__"])
+def test_all_objects_are_alike_before_and_after_init_is_compiled() -> None:
+    Point, Named, *_ = classes(frozen_dataclass, frozen_dataclass(eq=False))
+    for cls in (Point, Named):
+        assert not inspect.isfunction(vars(cls)["__init__"])
+        objects = [cls(-1.0, 3.0) for _ in range(100)]
+        assert inspect.isfunction(vars(cls)["__init__"])
+        assert all(one == objects[0] and vars(one) == vars(objects[0]) for one in objects)
