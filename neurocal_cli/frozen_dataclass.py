@@ -75,7 +75,7 @@ class _Init:
         self.cls, self.calls = cls, 0
 
     def __get__(self, instance: object, owner: type) -> Any:
-        if instance is None or self.calls >= _FEW:
+        if self.calls >= _FEW or not isinstance(instance, self.cls):  # a signature is asked for
             return self._compiled().__get__(instance, owner)
         self.calls += 1
         return partial(self._assign, instance)
