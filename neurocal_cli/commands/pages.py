@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -36,6 +35,7 @@ def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None)
     if html is None:
         return
     import hashlib
+    import shlex
 
     from neurocal_cli.html_report.origin import Origin, versions
     from neurocal_cli.html_report.reports import calibration_page, rig_page

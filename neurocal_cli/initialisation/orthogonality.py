@@ -166,18 +166,18 @@ def _conic(p: Array) -> tuple[Array, Array]:
     _, s, _, u, v = p.T
     a, b = np.exp(-p[:, 0]), np.exp(-p[:, 2])
     ab = a * b
-    inverse, change = np.zeros((len(p), 3, 3)), np.zeros((len(p), 5, 3, 3))
-    inverse[:, 0] = np.stack([a, -s * ab, s * v * ab - u * a], axis=1)
-    inverse[:, 1, 1], inverse[:, 1, 2], inverse[:, 2, 2] = b, -v * b, 1.0
-    skew = inverse[:, 0, 1]
-    change[:, 0, 0] = -inverse[:, 0]
-    change[:, 1, 0, 1], change[:, 1, 0, 2] = -ab, v * ab
-    change[:, 2, 0, 1], change[:, 2, 0, 2], change[:, 2, 1] = -skew, v * skew, -inverse[:, 1]
-    change[:, 3, 0, 2] = -a
-    change[:, 4, 0, 2], change[:, 4, 1, 2] = -skew, -b
-    half = np.swapaxes(inverse, 1, 2)[:, None] @ change
-    by_p = half + np.swapaxes(half, 2, 3)
-    return (np.swapaxes(inverse, 1, 2) @ inverse).reshape(-1, 9), by_p.reshape(-1, 5, 9)
+    skew = s * ab
+    # W^-1, behind its derivatives, whose sign is changed at the end.
+    by = np.zeros((6, 3, 3, len(p)))
+    inverse = by[5]
+    inverse[0, 0], inverse[0, 1], inverse[0, 2] = a, -skew, skew * v - u * a
+    inverse[1, 1], inverse[1, 2], inverse[2, 2] = b, -v * b, 1.0
+    by[0, 0], by[1, 0, 1], by[1, 0, 2] = inverse[0], ab, -v * ab
+    by[2, 0, 1], by[2, 0, 2], by[2, 1] = -skew, v * skew, inverse[1]
+    by[3, 0, 2], by[4, 0, 2], by[4, 1, 2] = a, -skew, b
+    half = by.transpose(3, 0, 2, 1) @ inverse.transpose(2, 0, 1)[:, None]
+    by_p = -(half[:, :5] + np.swapaxes(half[:, :5], 2, 3))
+    return half[:, 5].reshape(-1, 9), by_p.reshape(-1, 5, 9)
 
 
 _Trial = tuple[Array, Array, Array]  # parameters, their residuals and derivatives

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import platform
 import re
-import zlib
+from binascii import crc32
 from contextlib import suppress
 
 __all__ = ["remove_stale", "temporary_name"]
@@ -39,7 +39,7 @@ def remove_stale(folder: str) -> None:
 
 
 def _computer() -> str:
-    return f"{zlib.crc32(platform.node().encode()):08x}"
+    return f"{crc32(platform.node().encode()):08x}"
 
 
 def _runs(pid: int) -> bool:

@@ -106,8 +106,9 @@ def projection_uncertainty(
         moved = np.concatenate([-cross_matrix(p), np.broadcast_to(np.eye(3), (len(p), 3, 3))], axis=2)
         by_motion = by_point / depth @ moved  # (G, 2, 6)
         J = by_camera + by_motion @ gain
-        of_motion = variance * by_motion @ motion @ np.swapaxes(by_motion, 1, 2)
-        std[k] = np.sqrt(np.trace(J @ shared @ np.swapaxes(J, 1, 2) + of_motion, axis1=1, axis2=2))
+        # The traces of J cov J^T.
+        of_camera = (J @ shared * J).sum(axis=(1, 2))
+        std[k] = np.sqrt(of_camera + variance * (by_motion @ motion * by_motion).sum(axis=(1, 2)))
     return ProjectionUncertainty(pixels, depths, std)
 
 
