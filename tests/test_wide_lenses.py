@@ -44,6 +44,14 @@ def test_a_wide_lens_in_a_wrong_minimum_is_reached_through_another_fisheye() -> 
     assert found(scene).rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
 
 
+def test_an_image_that_ends_within_the_picture_need_not_grow_up_to_its_corners() -> None:
+    scene = wide_set(327, "fisheye")  # its image turns back at 78 degrees, half as far out as the corners
+    one = found(scene)
+    assert one.rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
+    error = (one.distortion - scene.camera.distortion.coefficients) / [one.std[f"k{n}"] for n in (1, 2, 3, 4)]
+    assert (np.abs(error) < 3).all()
+
+
 def test_auto_takes_a_fisheye_for_one_and_says_so() -> None:
     scene = wide_set(3, "fisheye", 190.0, n_views=10, sigma=0.1)
     one = found(scene, "auto")
