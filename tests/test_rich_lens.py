@@ -269,4 +269,5 @@ def test_errors_of_random_lenses_are_true_where_no_point_is(part: str) -> None:
             found.append(standardised(calibrated(points, "rich"), lens, points.pixels))
     seen, unseen = np.sqrt(np.nanmean(found, axis=0))
     assert 0.85 < seen < 1.2
-    assert 0.8 < unseen < 1.3
+    # Where a profile goes on to swing that a polynomial follows among the points, the band may be too narrow.
+    assert 0.8 < unseen < (1.3 if part == "half" else 1.6)
