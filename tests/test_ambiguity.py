@@ -15,7 +15,7 @@ def along_a_line(covariance: np.ndarray, xi: np.ndarray, excess: np.ndarray) -> 
     """Everything else follows xi as the covariance has it."""
     offsets = np.zeros((len(xi), len(FREE)))
     offsets[:, FREE] = xi[:, None] * covariance[XI] / covariance[XI, XI]
-    return Ambiguity(xi, offsets, excess)
+    return Ambiguity(xi, offsets, excess, np.zeros(len(xi)))
 
 
 @pytest.fixture
@@ -41,6 +41,13 @@ def test_two_minima_that_are_as_low_are_half_the_truth_each(covariance: np.ndarr
     assert told.widened(covariance, FREE)[XI, XI] == pytest.approx(s**2 * (1 + 30**2 / 2), rel=1e-3)
     assert told.range[0] < 0
     assert told.range[1] > 30 * s
+
+
+def test_an_xi_of_which_more_cameras_are_as_good_is_the_more_probable() -> None:
+    xi, volume = np.array([0.0, 1.0]), np.log([1.0, 3.0])
+    told = Ambiguity(xi, np.zeros((2, len(FREE))), np.zeros(2), volume)
+    np.testing.assert_allclose(told.weights(), [0.25, 0.75])
+    np.testing.assert_allclose(told.weights(4.0), [0.25, 0.75])
 
 
 def test_an_xi_that_was_held_gets_a_variance(covariance: np.ndarray) -> None:

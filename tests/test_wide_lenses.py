@@ -12,9 +12,11 @@ from support.wide_scenes import WideScene, wide_set
 
 from neurocal_cli import Calibration, calibrate
 from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.evaluation import evaluate_camera
+from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.triangulation import METHODS, triangulate
 from neurocal_cli.verdict.assessment import gather_evidence
 
@@ -42,6 +44,13 @@ def test_the_minimum_is_found_without_a_guess(model: str, field: float) -> None:
 def test_a_wide_lens_in_a_wrong_minimum_is_reached_through_another_fisheye() -> None:
     scene = wide_set(193, "eucm")  # the first minimum is not monotonic inside the points
     assert found(scene).rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
+
+
+def test_an_image_that_ends_within_the_picture_need_not_grow_up_to_its_corners() -> None:
+    scene = wide_set(327, "fisheye")  # its image turns back at 78 degrees, half as far out as the corners
+    one = found(scene)
+    assert one.rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
+    assert (np.abs(coefficient_errors_over_std(scene, one)) < 3).all()
 
 
 def test_auto_takes_a_fisheye_for_one_and_says_so() -> None:
@@ -152,6 +161,11 @@ def errors_over_std(scene: WideScene, one: Calibration) -> list[float]:
     ]
 
 
+def coefficient_errors_over_std(scene: WideScene, one: Calibration) -> Array:
+    names = coefficient_names(one.distortion_model)
+    return np.asarray((one.distortion - scene.camera.distortion.coefficients) / [one.std[n] for n in names])
+
+
 def projected_over_std(scene: WideScene, one: Calibration) -> float:
     """Errors of projected pixels over their reported std, rms over the field that is seen."""
     told = gather_evidence(one).projection
@@ -182,3 +196,23 @@ def test_a_thousand_wide_cameras_all_reach_the_minimum(model: str, part: int) ->
     z = np.array(list(errors_of_many(model, range(50 * part, 50 * part + 50))))
     rms = np.sqrt((z**2).mean(axis=0))
     assert (np.abs(rms - 1) < 3 / np.sqrt(2 * len(z))).all(), rms
+
+
+def test_a_valley_that_leaves_the_range_of_xi_is_followed_to_its_border() -> None:
+    scene = wide_set(1085, "omnidir", published=True)  # the lowest minimum within the range is higher by 16 %
+    one = found(scene)
+    assert one.distortion[0] == 3.0
+    assert one.rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
+
+
+@pytest.mark.slow
+def test_coefficients_are_as_far_off_as_told_if_they_are_as_in_published_cameras() -> None:
+    z = []
+    for seed in range(1000, 1250):
+        scene = wide_set(seed, "omnidir", published=True)
+        one = found(scene)
+        assert one.rmse_px <= AT_THE_MINIMUM * scene.least_rmse(), seed
+        z.append([*errors_over_std(scene, one), *coefficient_errors_over_std(scene, one)])
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    # A few of k1 and k2, which follow xi in powers, are far off: 1.01 to 1.2 from draw to draw.
+    assert (np.abs(rms - 1) < 0.2).all(), rms

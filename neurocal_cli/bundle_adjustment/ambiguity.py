@@ -2,8 +2,9 @@
 
 A unified or double-sphere lens may have several minima that are nearly as low, or a valley without a lowest
 place: xi and the scale make up for each other. The covariance of one minimum knows nothing of the others.
-With a weight of exp(-chi^2 / 2) for each value of xi, all others being where they fit best, the mean square
-of what a parameter is off is
+A value of xi is as probable as all cameras that have it: with the volume V of those that are about as good as
+the best one among them, weighed by what is known of lenses beforehand, w = V exp(-chi^2 / 2) to second order
+(MacKay 1992). The mean square of what a parameter is off is
 
     E (p - p0)^2 = var(p | xi) + sum_j w_j (p_j - p0)^2.
 
@@ -33,16 +34,20 @@ class Ambiguity:
         Of A's entries and the coefficients from those of the best camera.
     excess : (m,) array
         chi^2 above that of the best camera.
+    volume : (m,) array
+        Logarithm of V, but for a constant.
     """
 
     xi: Array
     offsets: Array
     excess: Array
+    volume: Array
 
     def weights(self, inflation: float = 1.0) -> Array:
         """(m,) how probable each camera is, for a variance that is larger than that of the residuals."""
         step = np.diff(self.xi)
-        weight = (np.append(step, 0.0) + np.insert(step, 0, 0.0)) * np.exp(-0.5 * self.excess / inflation)
+        logarithm = self.volume - 0.5 * self.excess / inflation
+        weight = (np.append(step, 0.0) + np.insert(step, 0, 0.0)) * np.exp(logarithm - logarithm.max())
         return np.asarray(weight / weight.sum())
 
     @property

@@ -148,7 +148,9 @@ def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted]
     """
     views, cost = problem.views, float(found.cost.sum())
     effective = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))
-    most = cost * (1 + max(2 * _TIE, _CHANCE / effective))
+    # The image of a wide lens may end within the picture, and its corners show nothing.
+    tie = 0.0 if found.state.distortion.wide else 2 * _TIE
+    most = cost * (1 + max(tie, _CHANCE / effective))
     for least_slope in _LEAST:
         result = _with_slope(problem, found, most, least_slope)
         if result is not None:

@@ -4,7 +4,8 @@ The image of a unified or double-sphere lens depends on xi and on the other para
 several values of xi may explain the points about as well: around xi = 0 a double sphere's image depends on
 the square of xi only. So every xi of a grid is tried, from the most similar lens that has it, everything else
 being adjusted; the lowest minimum is the answer, and where others are nearly as low, more values of xi are
-looked at until the weight of each is known (`Ambiguity`).
+looked at until the weight of each is known (`Ambiguity`). Beforehand all scales are as probable; xi, and what
+omnidir's k1, k2, p1 and p2 do to the radius, are spread as in published cameras.
 """
 
 from __future__ import annotations
@@ -17,12 +18,14 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.bundle_adjustment.cross_validation import reduced
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.directions import WITH_XI, xi_is_flat
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import ROUNDING, unit_diagonal
 
 __all__ = ["with_all_minima", "with_xi_held_if_flat"]
 
@@ -36,6 +39,11 @@ _POSSIBLE = 25.0  # chi^2 above the best: what may be true
 _AS_A_PARABOLA = 0.6  # standard deviations
 _LARGEST_MASS = 0.08  # of one interval
 _MOST = 60  # values of xi
+# A dozen published omnidirs have xi from 0.7 to 2.6: all values of the grid are as probable. There k1, k2, p1
+# and p2 change the farthest radius by shares of -0.19 to 0.05, -0.04 to 0.22 and up to 0.0013; of these the
+# powers of the radius, and the std. Seven published double spheres have xi from -0.27 to 0.18.
+_POWERS, _SHARES = np.array([2, 4, 1, 1]), np.array([0.15, 0.1, 0.0015, 0.0015])
+_SIZE_OF_XI = 0.25  # of a double sphere
 _VIEWS_THAT_TELL = 40  # of what is possible; 1000 views take as long as these
 
 
@@ -100,7 +108,7 @@ class _Profile:
     def _descend(self) -> None:
         """From the lowest places of the grid to the minima."""
         tried = list(self.tried)
-        costs = [np.inf, *(float(a.cost.sum()) for a in tried), np.inf]
+        costs = [np.inf, *map(_cost, tried), np.inf]
         minima = []
         for n, start in enumerate(tried):
             if costs[n + 1] > min(costs[n], costs[n + 2]) or self._excess(start) > _NEAR:
@@ -110,10 +118,11 @@ class _Profile:
                 minima.append(found)
         if _is_lens(self.best):
             minima.append(self.best)
-        # Where the valley leads out of the model's range, the last camera within it.
-        self.at_the_end = [] if minima else tried
-        minima = minima or tried or [self.best]
-        self.best = min(minima, key=lambda a: float(a.cost.sum()))
+        lowest = min((_cost(a) for a in minima), default=np.inf)
+        # Where the lowest valley leads out of the model's range, the last cameras within it.
+        self.at_the_end = [a for a in tried if _cost(a) < (1 - _SAME) * lowest]
+        minima = [*minima, *self.at_the_end] or [self.best]
+        self.best = min(minima, key=_cost)
         self._add(minima)
 
     def _add(self, more: list[Adjusted]) -> None:
@@ -125,7 +134,8 @@ class _Profile:
         if self._is_parabola():
             return None
         while len(self.tried) < _MOST:
-            weights = np.exp(-0.5 * np.array([self._excess(a) for a in self.tried]))
+            logarithm = np.array([self._volume(a) - 0.5 * self._excess(a) for a in self.tried])
+            weights = np.exp(logarithm - logarithm.max())
             xi = np.array([_xi(a) for a in self.tried])
             mass = np.diff(xi) * np.maximum(weights[1:], weights[:-1])
             n = int(np.argmax(mass))
@@ -138,7 +148,18 @@ class _Profile:
             np.array([_xi(a) for a in self.tried]),
             np.array([_camera(a.state) - centre for a in self.tried]),
             np.array([self._excess(a) for a in self.tried]),
+            np.array([self._volume(a) for a in self.tried]),
         )
+
+    def _volume(self, adjusted: Adjusted) -> float:
+        """Logarithm of the prior's share that is as good as a camera, of all with its xi."""
+        state, free = adjusted.state, self.held.free_camera
+        S = reduced(adjusted.normal, free, self.held.free_poses).S.sum(axis=0) / self.variance
+        known = _known(state, farthest_angle(self.held.views, state))
+        share = 0.5 * (np.log(known[known > 0]).sum() - (known * state.k**2).sum())
+        scaled, scale = unit_diagonal(S + np.diag(np.concatenate([np.zeros(5), known])[free]))
+        width = np.log(scale).sum() - 0.5 * np.linalg.slogdet(scaled + ROUNDING * np.eye(len(S)))[1]
+        return float(share + width - free[:3].sum() * np.log(state.entries[0, 0]))
 
     def _is_parabola(self) -> bool:
         """Whether all that is possible is as the covariance of the best minimum has it."""
@@ -159,11 +180,23 @@ class _Profile:
         return True
 
 
+def _known(state: CameraState, farthest: float) -> Array:
+    """(K,) inverse variances of the coefficients; 0 where all values are as probable."""
+    if state.model == "double_sphere":
+        return np.array([_SIZE_OF_XI**-2, 0.0])
+    radius = np.sin(farthest) / (np.cos(farthest) + state.k[0])
+    return np.concatenate([[0.0], (radius**_POWERS / _SHARES) ** 2])
+
+
 def _is_lens(adjusted: Adjusted) -> bool:
     """Whether coefficients are of the model's range: a double sphere beyond alpha = 0 is none."""
     state = adjusted.state
     low, high = _GRID[state.model][[0, -1]]
     return bool(low <= state.k[0] <= high and (state.model != "double_sphere" or 0 <= state.k[1] <= 1))
+
+
+def _cost(adjusted: Adjusted) -> float:
+    return float(adjusted.cost.sum())
 
 
 def _xi(adjusted: Adjusted) -> float:

@@ -20,6 +20,7 @@ __all__ = ["WideScene", "wide_set"]
 
 SIZE = (1000, 800)
 SQUARE = 30.0  # mm
+_SHARES, _POWERS = np.array([0.15, 0.1, 0.0015, 0.0015]), np.array([2, 4, 1, 1])  # as `xi_profile` has them
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +50,12 @@ class WideScene:
 
 
 def wide_set(
-    seed: int, model: str, field: float | None = None, n_views: int | None = None, sigma: float | None = None
+    seed: int,
+    model: str,
+    field: float | None = None,
+    n_views: int | None = None,
+    sigma: float | None = None,
+    published: bool = False,
 ) -> WideScene:
     """A random camera of a model and random views.
 
@@ -57,9 +63,11 @@ def wide_set(
     ----------
     field : float, optional
         Angle that the camera sees [degrees]; at random from 60 to 220.
+    published : bool
+        Whether an omnidir's xi, and what its coefficients do, are spread as those of published cameras.
     """
     rng = np.random.default_rng([seed, 16])
-    camera, half = _camera(rng, model, field)
+    camera, half = _camera(rng, model, field, published)
     sigma = float(rng.choice([0.1, 0.3])) if sigma is None else sigma
     n_views = int(rng.integers(5, 31)) if n_views is None else n_views
     cols, rows = [(9, 6), (11, 8)][int(rng.integers(2))]
@@ -84,11 +92,17 @@ def wide_set(
     )
 
 
-def _camera(rng: np.random.Generator, model: str, field: float | None) -> tuple[Camera, float]:
+def _camera(
+    rng: np.random.Generator, model: str, field: float | None, published: bool
+) -> tuple[Camera, float]:
     while True:
         half = np.radians(rng.uniform(60, 220) if field is None else field) / 2
         if model == "fisheye":
             k = rng.normal(size=4) * [0.05, 0.02, 0.006, 0.002]
+        elif published:
+            xi = rng.uniform(0.0, 3.0)
+            radius = np.sin(half) / max(np.cos(half) + xi, 1e-9)
+            k = np.array([xi, *(rng.normal(size=4) * _SHARES / radius**_POWERS)])
         elif model == "omnidir":
             k = np.array([rng.uniform(0.5, 1.8), *(rng.normal(size=4) * [0.1, 0.03, 0.001, 0.001])])
         elif model == "double_sphere":
