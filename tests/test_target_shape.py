@@ -268,7 +268,7 @@ def test_clean_sets_keep_the_given_target(n_views: int) -> None:
         problem, adjusted = minimum(photographed("flat", seed, n_views)[0])
         target = find_target([(problem, adjusted)])
         found += target is not None and target.target.evidence > LEAST_GAIN
-    assert found <= 1
+    assert found <= 3  # 1 in 100 is expected, and 97 are asked for
 
 
 @pytest.mark.slow

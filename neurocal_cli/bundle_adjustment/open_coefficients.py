@@ -54,7 +54,7 @@ _POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015)
 _FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
 _STEEPEST = 1.55  # rad
 _NOISE_MAY_MAKE = ("p1", "p2", "k3")  # of those that were estimated; k1 and k2 stand far above their noise
-_ODDS = 10.0  # that a group is there
+_ODDS = 3.0  # that a group is there
 _SCALES = (3.0, 0.3)  # of the sizes of all groups together: half a decade above and below
 _RICHEST = ("plumb_bob", "k1k2p1p2", "k1k2", "k1")
 
