@@ -54,11 +54,12 @@ def test_the_choice_predicts_new_views_as_well_as_any_model(model: str) -> None:
 def test_the_choice_is_right_for_200_lenses(model: str) -> None:
     right, few, well, everywhere = np.mean([judged(model, seed) for seed in range(200)], axis=0)
     assert few == 1.0
-    # Whether k3 is there cannot be told where points stay near the axis, but new views may go far out. So may
-    # those of a fisheye, which is not taken near the axis lest ordinary lenses become fisheyes.
+    # Whether k3 is there cannot be told where points stay near the axis, but new views may go far out.
     assert right >= (0.85 if model == "plumb_bob" else 0.95)
     assert well >= 0.975
-    assert everywhere >= {"plumb_bob": 0.925, "fisheye": 0.925}.get(model, 0.975)
+    if model == "fisheye" and 0.925 <= everywhere < 0.96:
+        pytest.xfail("0.935: near the axis no fisheye is taken, lest ordinary lenses become fisheyes")
+    assert everywhere >= {"plumb_bob": 0.925, "fisheye": 0.96}.get(model, 0.975)
 
 
 @pytest.mark.parametrize("seed", range(12))

@@ -259,7 +259,13 @@ def test_errors_are_as_large_as_their_standard_deviations(half: bool) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("part", ["half", "outside"])
+@pytest.mark.parametrize(
+    "part",
+    [
+        "half",
+        pytest.param("outside", marks=pytest.mark.xfail(reason="unseen 1.32: profiles swing on farther out")),
+    ],
+)
 def test_errors_of_random_lenses_are_true_where_no_point_is(part: str) -> None:
     found = []
     for kind in KINDS:
@@ -269,5 +275,4 @@ def test_errors_of_random_lenses_are_true_where_no_point_is(part: str) -> None:
             found.append(standardised(calibrated(points, "rich"), lens, points.pixels))
     seen, unseen = np.sqrt(np.nanmean(found, axis=0))
     assert 0.85 < seen < 1.2
-    # Where a profile goes on to swing that a polynomial follows among the points, the band may be too narrow.
-    assert 0.8 < unseen < (1.3 if part == "half" else 1.6)
+    assert 0.8 < unseen < 1.3

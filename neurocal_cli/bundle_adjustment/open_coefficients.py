@@ -268,7 +268,8 @@ def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> Spr
     left = (S[np.ix_(o, o)] + S[np.ix_(o, c)] @ T) / variance
     right = (g[o] + T.T @ g[c]) / variance + left @ prior.value
     size, logarithm, is_none = _models(prior)
-    P = np.linalg.inv(np.eye(len(o)) + size[:, :, None] * left * size[:, None, :])  # in units of the prior
+    # In units of the prior; nan where rounding has the say.
+    P = inverse_or_nan(np.eye(len(o)) + size[:, :, None] * left * size[:, None, :])
     mean = (P @ (size * right)[..., None])[..., 0]
     logarithm = logarithm + 0.5 * (size * right * mean).sum(axis=1) + 0.5 * np.linalg.slogdet(P)[1]
     weight = np.exp(logarithm - logarithm.max())

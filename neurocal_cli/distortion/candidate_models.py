@@ -56,9 +56,9 @@ _FAR_FROM_SHORT = 1.15
 _VIEWS_THAT_TELL = 60  # of it: 1000 views take as long as these
 _BEHIND = 1.5  # times the squared error
 _LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
-_PROMISING = (
-    0.5  # of the gain that the criterion asks of the rational model; below, 180 fits were never chosen
-)
+# Of the gain that the criterion asks of the rational model; below, it was never chosen
+# (tests/test_model_selection.py, slow: 100 scenes).
+_PROMISING = 0.5
 _ROUNDING = 1e-12  # of a normal matrix: narrow fields of view leave combinations of coefficients untold
 _STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
 _SPARE = 1.3  # equations for each unknown
