@@ -11,13 +11,14 @@ C = sum_j s_j^2 C_j, and the covariance S of w that the points leave,
 
     gamma_j = s_j^2 tr(C_j (P - P S P)),    s_j^2 <- s_j^4 (w^T P C_j P w) / gamma_j.
 
-A wide lognormal prior keeps those in bounds that no point tells. The prior is a part of the covariance.
+A wide lognormal prior keeps those in bounds that no point tells. The prior is a part of the covariance, which
+is averaged over the profile's sizes (see `profile_sizes`).
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.camera.rich_lens import FIRST_NODE, GRID, NODES, RADII, REACHES
+from neurocal_cli.distortion.profile_sizes import averaged_over_sizes
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
@@ -49,6 +51,7 @@ _TINY, _NOTHING, _NEWTON = 1e-300, 1e-17, 8
 # standard deviations.
 _OF_PROFILE, _OF_FIELD = (0.1, 0.25), (0.25, 0.5, 1.0)
 _LARGEST, _SMALLEST, _SPREAD = 10.0, 1e-3, 1.5  # the last one is a std of logarithms
+_LIKE_NOTHING, _SIZES = 1e-2, 10  # the sizes that are averaged over: the first one, and how many
 _ROUGH = 2e-3  # size of a process without length, likewise
 _LONGEST = 1.0  # of a step, in logarithms of the sizes
 _AT_FIRST, _EASED = 4, 0.7  # passes with whole steps; later shares of them, because lengths take turns
@@ -167,9 +170,22 @@ def _by_evidence(solution: Solution) -> Solution:
         found = _sizes(problem, adjusted.state, normal, processes, before)
         if (found.gamma * np.abs(np.log(found.sizes / before))).max() < _NEARLY:
             break
+    shared = _averaged(processes, found, adjusted.state.k[_UNKNOWNS])
     return replace(
-        solution, problem=problem, adjusted=adjusted, shared=found.covariance, by_prior=_N - found.determined
+        solution, problem=problem, adjusted=adjusted, shared=shared, by_prior=_N - found.determined
     )
+
+
+def _averaged(processes: _Processes, found: _Found, x: Array) -> Array:
+    """Covariance of the free shared parameters, whatever the sizes of the profile's processes are."""
+    held = found.precision.copy()
+    held[_PROFILE, _PROFILE] = 0.0
+    first = len(found.g) - len(x)
+    H = found.S + np.pad(held, (first, 0))
+    right = found.g - np.pad(held @ x, (first, 0))
+    profile = slice(first + _PROFILE.start, first + _PROFILE.stop)
+    H, right = H / found.variance, right / found.variance
+    return averaged_over_sizes(found.covariance, H, right, profile, x[_PROFILE], processes.profiles())
 
 
 def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Processes, Array]:
@@ -207,6 +223,13 @@ class _Processes:
         sums = [np.tensordot(s, C, axes=1) + rough * np.eye(C.shape[1]) for C, s in both]
         return _inverse(sums[0]), _inverse(sums[1])
 
+    def profiles(self) -> tuple[Array, Array]:
+        """Covariances of the profile for all pairs of sizes, and the logarithms of their prior."""
+        some = np.geomspace(_LIKE_NOTHING, _LARGEST, _SIZES)
+        sizes = np.array(list(product(some, repeat=len(self.profile))))
+        sums = np.tensordot(sizes**2, self.profile, axes=1) + _ROUGH**2 * np.eye(self.profile.shape[1])
+        return self.scale**2 * sums, -0.5 * (np.log(sizes) ** 2).sum(axis=1) / _SPREAD**2
+
 
 def _processes(reaches: Array, scale: float) -> _Processes:
     reach, *sides = reaches
@@ -238,6 +261,10 @@ class _Found:
         Of the free shared parameters.
     determined : float
         How many of the nodes' unknowns the points determine.
+    variance : float
+        Of the residuals.
+    S, g : (f, f) and (f,) arrays
+        The residuals' quadratic around the state, poses eliminated.
     """
 
     sizes: Array
@@ -245,6 +272,9 @@ class _Found:
     precision: Array
     covariance: Array
     determined: float
+    variance: float
+    S: Array
+    g: Array
 
 
 def _sizes(
@@ -286,7 +316,7 @@ def _sizes(
         if (den * np.abs(change)).max() < _NO_GAIN and abs(np.log(variance / last)) < _SETTLED:
             break
         sizes = np.clip(sizes * np.exp(change), _SMALLEST * scale, _LARGEST * scale)
-    return _Found(sizes, den, last * P, last * inverse, determined)
+    return _Found(sizes, den, last * P, last * inverse, determined, last, S, g)
 
 
 def _evidence(

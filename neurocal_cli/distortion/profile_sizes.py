@@ -1,0 +1,66 @@
+"""What a rich lens is uncertain by because the sizes of its profile's processes are not known.
+
+Among the points they tell the profile g themselves. Farther out its prior has the say, whose sizes they may
+tell badly: where a polynomial follows the profile among the points, the most probable sizes are small, and
+larger ones are not much less probable. So the covariance is averaged over the sizes. The m-th of them have a
+weight w_m by their evidence and their prior. With P_m and g_m the posterior covariance and mean of g
+for them, g the reported profile, and T = dc/dg how all other unknowns c follow it,
+
+    E = sum_m w_m (P_m + (g_m - g) (g_m - g)^T),    cov(c, g) = cov(c, g | g) + [T; 1] E [T; 1]^T,
+
+which is what model averaging gives (Hoeting et al. 1999) around the parameters that are reported.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import solve_scaled
+
+__all__ = ["averaged_over_sizes"]
+
+
+def averaged_over_sizes(
+    covariance: Array, H: Array, right: Array, profile: slice, value: Array, priors: tuple[Array, Array]
+) -> Array:
+    """Covariance of all that is shared, averaged over what the profile's prior may be.
+
+    Parameters
+    ----------
+    covariance : (f, f) array
+        For one of the priors.
+    H, right : (f, f) and (f,) arrays
+        Precision, and the gradient at the reported values, by all but the profile's prior.
+    profile : slice
+        Of the f.
+    value : (n,) array
+        The reported profile.
+    priors : (m, n, n) and (m,) arrays
+        Covariances, and the logarithms of how probable they are before any point is seen.
+    """
+    is_profile = np.zeros(len(H), dtype=bool)
+    is_profile[profile] = True
+    T = -solve_scaled(H[np.ix_(~is_profile, ~is_profile)], H[~is_profile, profile])
+    told = H[profile, profile] + H[profile, ~is_profile] @ T
+    information = right[profile] + T.T @ right[~is_profile] + told @ value
+    follow = np.zeros((len(H), len(value)))
+    follow[profile], follow[~is_profile] = np.eye(len(value)), T
+    E = _second_moment(told, information, value, *priors)
+    return np.asarray(covariance + follow @ (E - covariance[profile, profile]) @ follow.T)
+
+
+def _second_moment(
+    told: Array, information: Array, value: Array, covariances: Array, logarithm: Array
+) -> Array:
+    """E, from J^T J and J^T r at 0."""
+    root = np.linalg.cholesky(covariances)
+    turned = np.swapaxes(root, 1, 2)
+    G = np.eye(len(told)) + turned @ told @ root
+    P = root @ np.linalg.inv(G) @ turned
+    mean = P @ information
+    logarithm = logarithm + 0.5 * (mean @ information - np.linalg.slogdet(G)[1])
+    weight = np.exp(logarithm - logarithm.max())
+    away = mean - value
+    second = P + away[:, :, None] * away[:, None, :]
+    return np.asarray(np.tensordot(weight / weight.sum(), second, axes=1))
