@@ -5,12 +5,16 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import cv2
 import numpy as np
 import pytest
 from support.command_line import run
+from support.real_data import RealFiles
 from support.rendered import condition
 
-from neurocal_cli.detection.detect import Detection, detect_points
+from neurocal_cli import calibrate
+from neurocal_cli.board import Board
+from neurocal_cli.detection.detect import Detection, detect_points, gather
 from neurocal_cli.io.board_yaml import format_board, parse_board
 from neurocal_cli.simulation.rendering import Scene, Sides, render
 from neurocal_cli.target import Target, board_of
@@ -103,3 +107,18 @@ def test_the_command_measures_them() -> None:
     printed = run("detect", *given, "--points", "edges").stdout
     assert "\nboard01,h:-1:0,-12.5,0.0,0.0," in printed
     assert printed.count("\nboard01,") == 123
+
+
+@pytest.mark.slow
+def test_paper_that_bends_anew_at_its_rim_is_not_taken_for_two_cameras(real_files: RealFiles) -> None:
+    paths = sorted(
+        real_files("fisheye_stereo/left*.jpg"), key=lambda path: int(path.stem.removeprefix("left"))
+    )
+    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in paths]
+    board = Board.single(9, 6, 24.23)
+    found = {f"{k}": detect_points(image, board, "edges") for k, image in enumerate(images)}
+    points = gather(found)
+    for part in (0, 1):
+        half = calibrate(points.select(points.view_index % 2 == part))
+        assert half.target is not None
+        assert half.rmse_px < 0.15  # along the edges it is not measured
