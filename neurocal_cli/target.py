@@ -204,7 +204,8 @@ def _place(label: str) -> tuple[str, tuple[float, float]]:
     name, _, place = label.rpartition("/")
     *kind, c, r = place.split(":") if place.count(":") in (1, 2) else ("?", "", "")
     half = {(): (0.0, 0.0), ("h",): (0.5, 0.0), ("v",): (0.0, 0.5)}.get(tuple(kind))
-    if half is None or not (c.isdecimal() and r.isdecimal()):
+    # -1 names the edges to the rim before the first vertices.
+    if half is None or not (c.removeprefix("-").isdecimal() and r.removeprefix("-").isdecimal()):
         raise InputError(f"the point {label!r} has no id of a chessboard; calibrate from points of detect")
     return name, (int(c) + half[0], int(r) + half[1])
 
@@ -215,10 +216,16 @@ def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> P
     unknowns = np.linalg.lstsq(np.column_stack([np.ones(len(grid)), grid]), given, rcond=None)[0]
     square = float(np.linalg.norm(unknowns[1]))
     x_axis, y_axis = unknowns[1:] / np.linalg.norm(unknowns[1:], axis=1)[:, None]
-    cols, rows_ = (np.ceil(grid.max(axis=0)) + 1).astype(int).tolist()
+    cols, rows_ = (_size(places) for places in grid.T)
     origin, x, y = (tuple((np.round(v, _DIGITS) + 0.0).tolist()) for v in (unknowns[0], x_axis, y_axis))
     measured = tuple(map(tuple, np.column_stack([grid, found]).tolist()))
     return Plane(name, cols, rows_, round(square, _DIGITS), origin, x, y, measured)
+
+
+def _size(places: Array) -> int:
+    """Number of vertices in a row, by the places of points; those between two vertices may be at the rim."""
+    whole = places[places == np.rint(places)]
+    return int(whole.max() if len(whole) else np.ceil(places.max())) + 1
 
 
 def distinct_points(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import click
 
@@ -46,9 +46,10 @@ _SECOND = 2  # images of another size, from which on it is no single one that st
 @board_options("Unit of --square. A board file names its own unit.")
 @click.option(
     "--points",
-    type=click.Choice(["midpoints", "vertices"]),
+    type=click.Choice(["midpoints", "edges", "vertices"]),
     default="midpoints",
-    help="Points to measure: the mid-points of the squares' edges, or the inner vertices.",
+    help="Points to measure: midpoints of the edges between inner vertices; edges, which adds those of the "
+    "edges to the board's rim, for stiff boards with whole outer squares; or the inner vertices.",
 )
 @click.option(
     "--gamma",
@@ -180,7 +181,7 @@ def _wanted(
     from neurocal_cli.detection.memory import Memory
     from neurocal_cli.io.board_yaml import format_board
 
-    kind: Points = "vertices" if points == "vertices" else "midpoints"
+    kind = cast("Points", points)
     memory = None
     if cache is not None:
         _check_folder("--cache", cache)

@@ -33,7 +33,7 @@ class DetectionOptions:
     Attributes
     ----------
     board : Board
-    points : {"midpoints", "vertices"}
+    points : {"midpoints", "edges", "vertices"}
     gamma : float, optional
     overlay : bool
         Whether to draw what was found.

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +16,7 @@ from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.identity.identify import Identified, Located, identify
 from neurocal_cli.detection.identity.messages import NoBoardError
-from neurocal_cli.detection.measuring import measure
+from neurocal_cli.detection.measuring import Points, measure
 from neurocal_cli.detection.other_targets import other_target
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -25,8 +24,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
 __all__ = ["Detection", "Labels", "Points", "detect_points", "gather", "label", "wanted_sizes"]
-
-Points = Literal["midpoints", "vertices"]
 
 _FEWEST = 8  # points; fewer determine hardly more than the pose
 _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: from a point's index to the other end of its edge
@@ -123,8 +120,9 @@ def detect_points(
     image : (height, width) array
         Grey, of 8 or 16 bits.
     board : Board
-    points : {"midpoints", "vertices"}
-        Mid-points of the squares' edges, or the inner vertices.
+    points : {"midpoints", "edges", "vertices"}
+        Mid-points of the edges between inner vertices, those of the edges to the rim as well, or the inner
+        vertices.
     gamma : float, optional
         Of the camera, if known: pixels are ``light^(1 / gamma)``.
     grids : list of Grid, optional

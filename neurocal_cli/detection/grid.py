@@ -7,13 +7,16 @@ here; `identity` finds those of the board.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["EDGE_H", "EDGE_V", "VERTEX", "Grid", "Measured"]
+__all__ = ["EDGE_H", "EDGE_V", "VERTEX", "Grid", "Measured", "joined"]
 
 # Kinds of points: the mid-point of the edge from (c, r) to (c + 1, r), from (c, r) to (c, r + 1),
 # and the vertex (c, r) itself.
@@ -79,3 +82,20 @@ class Measured:
     vertices: Array
     rejected: int
     polarity: float
+
+
+def joined(first: Measured, second: Measured) -> Measured:
+    """Mid-points of the same grid from two sets of edges."""
+
+    def both(name: str) -> Any:
+        return np.concatenate([getattr(first, name), getattr(second, name)])
+
+    return replace(
+        first,
+        kind=both("kind"),
+        index=both("index"),
+        pixels=both("pixels"),
+        covariance=both("covariance"),
+        across=both("across"),
+        rejected=first.rejected + second.rejected,
+    )

@@ -9,7 +9,7 @@ light side: an alternating shift between edges and map, which is estimated and r
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +17,23 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.fitting.batched_newton import BLUR
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, TILT
 from neurocal_cli.detection.fitting.edge_profile import response
-from neurocal_cli.detection.fitting.grid_fit import GridFit, GridImage, fit_grid, fit_grid_vertices
+from neurocal_cli.detection.fitting.grid_fit import (
+    GridEdges,
+    GridFit,
+    GridImage,
+    fit_grid,
+    fit_grid_vertices,
+    fit_rim,
+)
 from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND
-from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
+from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured, joined
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
-__all__ = ["measure"]
+__all__ = ["Points", "measure"]
+
+Points: TypeAlias = Literal["midpoints", "edges", "vertices"]
 
 _ROUNDING = 1 / 12  # DN^2
 _EXACT, _TINY = 1e-5, 1e-30  # relative standard deviation and least variance of images without noise
@@ -34,10 +43,10 @@ _FAR, _PLACES = 3.0, 601  # sigma on both sides of an edge and samples, to find 
 def measure(
     image: NDArray[np.generic],
     grid: Grid,
-    points: Literal["midpoints", "vertices"] = "midpoints",
+    points: Points = "midpoints",
     gamma: float | None = None,
 ) -> Measured:
-    """Measure the mid-points of all edges between known vertices, or the vertices.
+    """Measure the mid-points of edges, or the vertices.
 
     Parameters
     ----------
@@ -45,7 +54,8 @@ def measure(
         Grey.
     grid : Grid
         Vertices known to about half a pixel.
-    points : {"midpoints", "vertices"}
+    points : {"midpoints", "edges", "vertices"}
+        Mid-points of the edges between known vertices, those of the edges to the rim as well, or vertices.
     gamma : float, optional
         The image is ``light^(1 / gamma)``, which is inverted first. Without it, the effect of the response
         on the edges is estimated.
@@ -67,18 +77,10 @@ def measure(
     vertices[seen] = fitted.map.map.at(np.argwhere(seen)[:, ::-1].astype(float))
     if points == "vertices":
         return _vertices(grid_image, fitted, vertices)
-    pixels, covariance = _midpoints(grid_image, fitted)
-    good = fitted.good
-    return Measured(
-        kind=np.where(grid_image.edges.vertical, EDGE_V, EDGE_H)[good].astype(np.int64),
-        index=grid_image.edges.index[good],
-        pixels=pixels[good],
-        covariance=covariance[good],
-        across=fitted.lines.normal[good],
-        vertices=vertices,
-        rejected=int((~good).sum()),
-        polarity=_polarity(fitted),
-    )
+    inner = _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices)
+    if points == "midpoints":
+        return inner
+    return joined(inner, _midpoints(*fit_rim(grid_image, fitted), fitted.unevenness, vertices))
 
 
 def _nothing(grid: Grid) -> Measured:
@@ -88,17 +90,17 @@ def _nothing(grid: Grid) -> Measured:
     return Measured(index[:, 0], index, none.reshape(0, 2), none.reshape(0, 3), None, vertices, 0, 0.0)
 
 
-def _midpoints(grid_image: GridImage, fitted: GridFit) -> tuple[Array, Array]:
-    """Pixels (E, 2) and covariances (E, 3): along the edges from the map, across from the edges."""
+def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: Array) -> Measured:
+    """Mid-points: along the edges from the map, across from the edges; unevenness in px^2."""
     lines, fit, mapped = fitted.lines, fitted.fit, fitted.map
-    centre = grid_image.edges.centre
+    centre, good = edges.centre, fitted.good
     s = ((mapped.map.at(centre) - lines.middle) * lines.tangent).sum(axis=1)
     d = fit.values[:, OFFSET] + fit.values[:, TILT] * s / (0.5 * lines.length)
     d += 0.5 * lines.curvature * s * s - mapped.shift[0]
     pixels = lines.middle + s[:, None] * lines.tangent + d[:, None] * lines.normal
     along = mapped.map.variance(centre, lines.tangent) * mapped.excess
     across = fit.covariance[:, OFFSET, OFFSET] * fit.variance_growth * min(mapped.excess, 1.0)
-    across += mapped.shift_variance[0] + fitted.unevenness
+    across += mapped.shift_variance[0] + unevenness
     (tu, tv), (nu, nv) = lines.tangent.T, lines.normal.T
     covariance = np.stack(
         [
@@ -108,7 +110,16 @@ def _midpoints(grid_image: GridImage, fitted: GridFit) -> tuple[Array, Array]:
         ],
         axis=-1,
     )
-    return pixels, covariance
+    return Measured(
+        kind=np.where(edges.vertical, EDGE_V, EDGE_H)[good].astype(np.int64),
+        index=edges.index[good],
+        pixels=pixels[good],
+        covariance=covariance[good],
+        across=lines.normal[good],
+        vertices=vertices,
+        rejected=int((~good).sum()),
+        polarity=_polarity(fitted),
+    )
 
 
 def _polarity(fitted: GridFit) -> float:

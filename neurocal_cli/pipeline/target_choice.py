@@ -135,10 +135,7 @@ def lines_that_are_bent(solution: Solution, unit: str) -> str:
 
 
 def _other_reason(solution: Solution, found: Found) -> bool:
-    """Whether stated sigmas, given parameters, two cameras or a zoom that moves are why, not the target.
-
-    Two cameras still contradict each other where the target was found; a bent board looks like two before.
-    """
+    """Whether stated sigmas, given parameters, two cameras or a zoom that moves are why, not the target."""
     problem, points = solution.problem, solution.problem.points
     place = np.array([problem.views.names.index(name) for name in points.view_names])
     predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
@@ -149,9 +146,24 @@ def _other_reason(solution: Solution, found: Found) -> bool:
     asked = asked_for(problem.views, solution.state, problem.fixed, problem.free_poses)
     if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
         return True
-    new, adjusted = found.fits[0]
-    groups = view_groups(new.views, adjusted.state, adjusted.normal, new.free_camera)
-    return bool(problem.free.any()) and groups is not None
+    return bool(problem.free.any()) and _are_two_cameras(solution, found)
+
+
+def _are_two_cameras(solution: Solution, found: Found) -> bool:
+    """Whether two cameras, or a zoom that moves, explain more with the given target than one with the found.
+
+    They still contradict each other where the target was found; a bent board looks like two before. One that
+    is bent anew in some views looks like two afterwards, too, but these explain less.
+    """
+    (new, adjusted), *_ = found.fits
+    if view_groups(new.views, adjusted.state, adjusted.normal, new.free_camera) is None:
+        return False
+    problem, before = solution.problem, solution.adjusted
+    groups = view_groups(problem.views, before.state, before.normal, problem.free_camera)
+    if groups is None:
+        return False
+    left = (1.0 - groups.explained) * before.normal[:, -1, -1].sum()
+    return bool(left < adjusted.normal[:, -1, -1].sum())
 
 
 def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:

@@ -22,6 +22,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import solve_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.target import is_flat
+from neurocal_cli.target_shape.prior import STRETCH
 
 __all__ = [
     "StretchedCovariance",
@@ -31,9 +32,6 @@ __all__ = [
     "stretches",
 ]
 
-# Std of a stretch, half of the relative difference of two sides: prints are off by a few thousandths. Of two
-# boards in photographs (tests/test_target.py), one is by 0.13 % and one by 1.5 to 2 %.
-_SIZE = 1.5e-3
 # That there is one, each. Larger odds make clean data less certain; with these, the std of few views grow by
 # less than 1 % in the median. Repeated by tests/test_open_stretch.py and tests/test_campaign.py (slow).
 _ODDS = 0.2
@@ -115,12 +113,12 @@ def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfOpen | Non
     """
     is_open = np.arange(len(g)) >= len(g) - 2
     groups = (np.array([0]), np.array([1]))
-    prior = OpenPrior(is_open, is_open, np.zeros(2), np.full(2, _SIZE), groups, _ODDS, scales=(1.0,))
+    prior = OpenPrior(is_open, is_open, np.zeros(2), np.full(2, STRETCH), groups, _ODDS, scales=(1.0,))
     found = spread_of_open(S, g, variance, prior)
     T = found.follow[:-2]
     left = (S[-2:, -2:] + S[-2:, :-2] @ T) / variance
     right = (g[-2:] + T.T @ g[:-2]) / variance
-    beyond = float(right @ solve_or_nan(left + _SIZE**2 * left @ left, right))
+    beyond = float(right @ solve_or_nan(left + STRETCH**2 * left @ left, right))
     return found if found.probability > _NEGLIGIBLE and not beyond > _NO_PRINT**2 else None
 
 

@@ -9,6 +9,9 @@ of the n_g coefficients of a part, the data determine
 
     gamma_g = n_g - lambda_g tr (H^-1)_gg,    lambda_g <- gamma_g sigma^2 / |w_g|^2.
 
+The two coefficients of a stretch hardly tell its size. It is at least that of prints, or nothing, whichever
+has more evidence.
+
 The evidence, with the noise's variance marginalised too, tells whether there are offsets at all.
 """
 
@@ -24,7 +27,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 from neurocal_cli.target_shape.information import Information
-from neurocal_cli.target_shape.prior import Prior
+from neurocal_cli.target_shape.prior import STRETCH, Prior
 from neurocal_cli.target_shape.system import Solved, System
 
 __all__ = [
@@ -83,14 +86,12 @@ _OUT_OF_PLANE = ("bend", "height")
 _START = {
     "fold": 3e-3,
     "bend": 3e-3,
-    "stretch": 1e-3,
+    "stretch": STRETCH,
     "warp": 5e-4,
     "place": 3e-4,
     "height": 3e-4,
 }  # of the target's size
-# Two coefficients tell no size, and a skew of the image axes looks like a shear of the target: prints are
-# stretched by a few thousandths.
-_MOST = {"stretch": 2e-3}
+_MOST = 2e-3  # of its size, of a stretch: a skew of the image axes looks like one
 _NOTHING = 1e-7  # of its size
 _SETTLED = 0.03  # relative change of the sizes
 _NO_GAIN = 0.02  # of the logarithm of the evidence
@@ -156,17 +157,10 @@ def posterior(
     parts = _Parts(info, prior, flat)
     noise = np.sqrt(info.cost / parts.spare)
     start = parts.start() if sizes is None else parts.allowed(sizes)
-    now = parts.at({name: size / noise for name, size in start.items()})
-    for _ in range(_PASSES):
-        wanted = parts.renewed(now)
-        if parts.change(now.ratios, wanted) < _SETTLED:
-            break
-        better = next(parts.better(now, wanted), None)
-        if better is None:
-            break
-        gain, now = better.evidence - now.evidence, better
-        if gain < _NO_GAIN:
-            break
+    now = parts.climbed(parts.at({name: size / noise for name, size in start.items()}))
+    if "stretch" in now.ratios:
+        other = parts.climbed(parts.at(parts.with_stretch_changed(now)))
+        now = other if other.evidence > now.evidence else now
     return parts.posterior(now)
 
 
@@ -231,7 +225,7 @@ class _Parts:
 
     def __init__(self, info: Information, prior: Prior, flat: bool) -> None:
         self.system, self.prior, self.flat = System(info, prior), prior, flat
-        self.least = _NOTHING * prior.size
+        self.least, self.stretch = _NOTHING * prior.size, STRETCH * prior.size
         self.spare = info.equations - self.system.f - 6 * self.system.P
 
     def start(self) -> dict[str, float]:
@@ -277,12 +271,35 @@ class _Parts:
             w, var, unit = self._coefficients(now, name)
             share = float(np.clip(1.0 - (unit / ratio) ** 2 * var.mean(), 1e-6, 1.0))
             change = float((w**2).mean()) * (unit / ratio / noise) ** 2 / share
-            most = _MOST.get(name, 1.0) * self.prior.size
-            new[name] = float(
-                np.clip(ratio * change ** (1.0 - 0.5 * share), self.least / noise, most / noise)
-            )
+            least, most = self.least, self.prior.size
+            if name == "stretch":
+                least, most = (self.stretch, _MOST * most) if self.is_stretched(now) else (least, least)
+            new[name] = float(np.clip(ratio * change ** (1.0 - 0.5 * share), least / noise, most / noise))
         allowed = self.allowed({name: ratio * noise for name, ratio in new.items()})
         return {name: size / noise for name, size in allowed.items()}
+
+    def is_stretched(self, now: _Solution) -> bool:
+        """Whether the stretch has the size of prints."""
+        return now.ratios["stretch"] * float(np.sqrt(now.variance)) > np.sqrt(self.stretch * self.least)
+
+    def with_stretch_changed(self, now: _Solution) -> dict[str, float]:
+        """The sizes with a stretch instead of none, or none instead of one."""
+        size = self.least if self.is_stretched(now) else self.stretch
+        return now.ratios | {"stretch": size / float(np.sqrt(now.variance))}
+
+    def climbed(self, now: _Solution) -> _Solution:
+        """Steps to the most probable sizes."""
+        for _ in range(_PASSES):
+            wanted = self.renewed(now)
+            if self.change(now.ratios, wanted) < _SETTLED:
+                break
+            better = next(self.better(now, wanted), None)
+            if better is None:
+                break
+            gain, now = better.evidence - now.evidence, better
+            if gain < _NO_GAIN:
+                break
+        return now
 
     def better(self, now: _Solution, wanted: dict[str, float]) -> Iterator[_Solution]:
         """Sizes on the way to the wanted ones, ever nearer, that raise the evidence."""

@@ -125,7 +125,13 @@ def moments(strips: Strips, half_width: Array, mean: Array, contrast: Array) -> 
 
 
 def edge_data(
-    strips: Strips, lines: Lines, sigma: Array, slopes: tuple[Array, Array], contrast: Array, nearest: Array
+    strips: Strips,
+    lines: Lines,
+    sigma: Array,
+    slopes: tuple[Array, Array],
+    contrast: Array,
+    nearest: Array,
+    crossed: NDArray[np.bool_],
 ) -> EdgeData:
     """Prepare pixels for fits.
 
@@ -141,6 +147,8 @@ def edge_data(
         B where the slopes hold.
     nearest : (E,) array
         Least distance of a pixel from the crossing lines, in sigma.
+    crossed : (E, 2) bool array
+        Whether another line crosses the edge at its ends.
     """
     Q = np.ones_like(strips.s)
     R = np.zeros_like(strips.s)
@@ -152,6 +160,7 @@ def edge_data(
         start = end * lines.tangent + 0.5 * lines.curvature[:, None] * end**2 * lines.normal
         shift = (start * lines.crossing[:, k]).sum(axis=1).astype(np.float32)
         t = (strips.u * crossing[:, :1] + strips.v * crossing[:, 1:] - shift[:, None]) * per_sigma
+        t[~crossed[:, k]] = _ALONE
         used &= t > nearest.astype(np.float32)[:, None]
         fade, density = erf_and_density(t)
         Q *= fade

@@ -20,11 +20,18 @@ SHARP = 0.45  # px; below this blur the box of the pixel is modelled exactly
 _NEAREST = 0.5  # sigma from the crossing lines
 _NEAREST_FIRST, _ENDS = 2.0, 0.12  # before the last fit: sigma, at most this share of the length
 _NEAREST_SHARP = 0.75  # px from the crossing lines; no nearer pixel is cut by them
+_RIM, _RIM_BLUR = 0.1, 3.0  # of the length, and sigma, left out where the board ends: it may be cut
 _COLUMNS = 40  # columns of pixels along an edge before the last fit
 
 
 def edge_pixels(
-    image: NDArray[np.generic], lines: Lines, sigma: Array, shading: Shading, reach: Array, stride: int
+    image: NDArray[np.generic],
+    lines: Lines,
+    sigma: Array,
+    shading: Shading,
+    reach: Array,
+    stride: int,
+    crossed: NDArray[np.bool_] | None = None,
 ) -> EdgeData:
     """The pixels around edges.
 
@@ -39,14 +46,19 @@ def edge_pixels(
         On both sides of the edges.
     stride : int
         Use every n-th column only; 1 for the last fit, when the crossing lines are well known.
+    crossed : (E, 2) bool array, optional
+        Whether another line crosses the edge at its ends, as at all ends if not given. At the others the
+        board may end, and a part of the edge is left out.
     """
     half = np.minimum(reach, 0.5 * lines.width)
-    strips = strip_pixels(image, lines, half, np.zeros((len(half), 1)), stride)
+    crossed = np.ones((len(half), 2), dtype=np.bool_) if crossed is None else crossed
+    trim = (_RIM * lines.length + _RIM_BLUR * sigma)[:, None] * ~crossed
+    strips = strip_pixels(image, lines, half, trim, stride)
     contrast = shading.at(lines.middle)[1]
     nearest = np.where(sigma < SHARP, _NEAREST_SHARP / sigma, _NEAREST)
     if stride > 1:
         nearest = np.maximum(nearest, np.minimum(_NEAREST_FIRST, _ENDS * lines.length / sigma))
-    return edge_data(strips, lines, sigma, shading.slopes(lines.middle), contrast, nearest)
+    return edge_data(strips, lines, sigma, shading.slopes(lines.middle), contrast, nearest, crossed)
 
 
 def usual_stride(lines: Lines) -> int:

@@ -43,7 +43,7 @@ from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["GridEdges", "GridFit", "GridImage", "fit_grid", "fit_grid_vertices"]
+__all__ = ["GridEdges", "GridFit", "GridImage", "fit_grid", "fit_grid_vertices", "fit_rim"]
 
 Image = NDArray[np.generic]
 
@@ -78,24 +78,47 @@ class GridEdges:
     centre : (E, 2) array [squares]
     light : (E,) array
         +1 where the light side is that of growing r (c for vertical ones), else -1.
+    known : (E, 2) bool array
+        Whether the vertices at both ends are known.
     """
 
     index: NDArray[np.int64]
     vertical: NDArray[np.bool_]
     centre: Array
     light: Array
+    known: NDArray[np.bool_]
 
     @classmethod
     def of(cls, grid: Grid) -> GridEdges:
         """All edges between two known vertices."""
-        seen = grid.seen
-        along_c = np.argwhere(seen[:, :-1] & seen[:, 1:])[:, ::-1]
-        along_r = np.argwhere(seen[:-1] & seen[1:])[:, ::-1]
+        return cls._with_known_ends(grid, 2)
+
+    @classmethod
+    def to_rim(cls, grid: Grid) -> GridEdges:
+        """All edges with one known vertex: those to the board's rim, and to vertices that were not found."""
+        return cls._with_known_ends(grid, 1)
+
+    @classmethod
+    def _with_known_ends(cls, grid: Grid, count: int) -> GridEdges:
+        seen = np.pad(grid.seen, 1)
+        ends = (
+            np.stack([seen[1:-1, :-1], seen[1:-1, 1:]], axis=-1),
+            np.stack([seen[:-1, 1:-1], seen[1:, 1:-1]], axis=-1),
+        )
+        wanted = [known.sum(axis=2) == count for known in ends]
+        along_c, along_r = (
+            np.argwhere(which)[:, ::-1] - first for which, first in zip(wanted, ([1, 0], [0, 1]), strict=True)
+        )
         index = np.concatenate([along_c, along_r])
         vertical = np.arange(len(index)) >= len(along_c)
         centre = index + np.where(vertical[:, None], [0.0, 0.5], [0.5, 0.0])
         light = np.where((index.sum(axis=1) + grid.dark) % 2 == 1, 1.0, -1.0)
-        return cls(index.astype(np.int64), vertical, centre, light)
+        known = np.concatenate([both[which] for both, which in zip(ends, wanted, strict=True)])
+        return cls(index.astype(np.int64), vertical, centre, light, known)
+
+    def lines(self, at: SmoothMap) -> Lines:
+        """The edges in the image, by a map."""
+        return grid_lines(at, self.centre, self.vertical, self.light)
 
 
 @frozen_dataclass(eq=False)
@@ -128,7 +151,7 @@ class GridImage:
 
     def lines(self, at: SmoothMap) -> Lines:
         """The edges in the image, by a map."""
-        return grid_lines(at, self.edges.centre, self.edges.vertical, self.edges.light)
+        return self.edges.lines(at)
 
     def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
         """Edges as observations of a map, with an unknown common shift to the light side."""
@@ -317,6 +340,28 @@ def _fine_fit(
         data = with_weight(data, noise.weights(fit.linear.x))
         fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
     return fit, data, shape, noise
+
+
+def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]:
+    """Fits of the edges to the board's rim, after those of all others, whose common parameters they have."""
+    edges = GridEdges.to_rim(grid_image.grid)
+    lines = edges.lines(fitted.map.map)
+    sigma, spread = _blur(fitted, fitted.lines, lines)
+    shift = fitted.map.shift[0]
+    data = edge_pixels(grid_image.image, lines, sigma, fitted.shading, REACH * sigma, 1, crossed=edges.known)
+    prior = level_prior(fitted.shading, lines.middle, sigma, spread, fitted.noise.edge)
+    n = len(sigma)
+    shape = ProfileShape(np.tile(fitted.shape.tails.mean(axis=0), (n, 1)), fitted.shape.nonlinearity)
+    if fitted.shape.half is not None:
+        shape = replace(shape, half=half_widths(lines.normal))
+    start = np.concatenate([np.full((n, 1), shift), np.zeros((n, 1)), prior.mean], axis=1)
+    data = with_weight(data, fitted.noise.weights(light_at(data, start)))
+    fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, _STEPS)
+    fit = fit.scaled(max(upper_median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
+    variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
+    departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
+    good = is_reliable(fit, departure, data.beyond)
+    return edges, replace(fitted, lines=lines, fit=fit, data=data, shape=shape, good=good)
 
 
 def fit_grid_vertices(

@@ -19,7 +19,7 @@ from neurocal_cli.simulation.rendering.scene import Scene
 from neurocal_cli.simulation.rendering.sensor import noise_variance, response, signal
 from neurocal_cli.simulation.rendering.wide import WideCamera
 
-__all__ = ["Bound", "edge_bound", "scene_bound", "vertex_bound"]
+__all__ = ["Bound", "edge_bound", "scene_bound", "shift_gradients", "vertex_bound"]
 
 _NOTHING = 1e-7  # of full scale per px
 # Two lines that cross blur each other: together they tell as much as if shorter by this many sigma_t.
@@ -78,7 +78,7 @@ def scene_bound(scene: Scene) -> tuple[Bound, ...]:
     bounds : tuple of Bound
         In the order of the scene's targets.
     """
-    gradient_u, gradient_v, linear = _gradients(scene)
+    gradient_u, gradient_v, linear = shift_gradients(scene)
     weight = 1 / noise_variance(scene.sensor, linear)
     width, height = scene.size
     v, u = np.mgrid[0:height, 0:width].reshape(2, -1).astype(float)
@@ -96,7 +96,7 @@ def scene_bound(scene: Scene) -> tuple[Bound, ...]:
     return tuple(bounds)
 
 
-def _gradients(scene: Scene) -> tuple[Array, Array, Array]:
+def shift_gradients(scene: Scene) -> tuple[Array, Array, Array]:
     """Derivatives of the picture by a shift of the boards along u and v [DN / px], and its signal.
 
     The boards are moved below the pixels by the principal point; differences between neighbouring
