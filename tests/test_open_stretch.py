@@ -100,7 +100,7 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
 
 def test_the_spread_is_that_of_all_four_models() -> None:
     """By quadrature, for a stretch that camera and pixels tell apart from the other."""
-    odds, size = open_stretch_module._ODDS, open_stretch_module._SIZE
+    odds, size = open_stretch_module._ODDS, open_stretch_module.STRETCH
     variance, told, off = 0.25, np.array([1.2e-3, 0.8e-3]), np.array([2e-3, -0.3e-3])
     S = np.diag([1.0, *(variance / told**2)])
     found = spread_of_stretch(S, np.append(0.0, off * variance / told**2), variance)
