@@ -39,8 +39,8 @@ _ROUNDS = 3
 _WORTH = 0.8  # of the views' number, where some repeat a pose
 _OF_LINES = "k1k2p1p2"  # as `plumb-line` finds
 _TOLD_APART = 5.0  # standard deviations, as for the verdict
-# Of the variance by which views contradict each other, bends explain most, or leave but a little.
-_SHARE, _NOISE = 0.8, 1.1
+# Of the variance by which views contradict each other, bends explain nine tenths, or leave but a little.
+_SHARE, _NOISE = 0.9, 1.1
 
 
 def with_target(
