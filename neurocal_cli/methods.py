@@ -122,7 +122,7 @@ def calibrate(
     InputError, DegenerateGeometryError
         Points that cannot give an answer, with the reason.
     """
-    known_target = target if isinstance(target, Target) else None
+    known_target = replace(target, bends=None) if isinstance(target, Target) else None
     choice = "given" if isinstance(target, Target) else target
     _check_options(method, trainer, distortion, outliers, choice, starts, seed)
     if known_target is not None:

@@ -100,18 +100,23 @@ def calibration_report(calibration: Calibration) -> str:
 
 
 def target_lines(target: Target | None, unit: str) -> list[str]:
-    """The target that was found, in a line; none where it was taken as given."""
+    """The target that was found, in a line or two; none where it was taken as given."""
     if target is None:
         return []
     unit = "units" if unit == "unknown" else printable(unit)
     if target.stated is not None:
         return [_surveyed_line(target, unit)]
-    parts = [f"bent by {target.bend():.2g} {unit}"] if not target.flat else []
-    parts.append(f"stretched by {100 * target.stretch():.2g} %")
-    found = np.sqrt((target.offsets**2).sum(axis=1).mean())
-    return [
-        f"target: {' and '.join(parts)}; its points lie {found:.2g} {unit} rms from where they were given"
-    ]
+    lines = []
+    if not target.only_bends:
+        parts = [f"bent by {target.bend():.2g} {unit}"] if not target.flat else []
+        parts.append(f"stretched by {100 * target.stretch():.2g} %")
+        found = np.sqrt((target.offsets**2).sum(axis=1).mean())
+        lines.append(
+            f"target: {' and '.join(parts)}; its points lie {found:.2g} {unit} rms from where they were given"
+        )
+    if target.bends is not None:
+        lines.append(f"target: bends anew in each view, by {target.bend_of_views():.2g} {unit} rms")
+    return lines
 
 
 def _scale_lines(calibration: Calibration) -> list[str]:
@@ -223,6 +228,7 @@ def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
         "offset_rms": float(np.sqrt((target.offsets**2).sum(axis=1).mean())),
         "std_rms": number_or_none(float(np.sqrt((target.std**2).mean()))),
         "n_points": len(target.found),
+        **({} if target.bends is None else {"bend_of_views_rms": target.bend_of_views()}),
         **({} if target.stated is None else {"stated_std_factor": float(target.sizes["stated"])}),
     }
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bends import Bends, surface_of
 from neurocal_cli.board import Board, Plane, smooth_between
 from neurocal_cli.distances import NO_SCALE, Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.errors import InputError
@@ -57,6 +58,8 @@ class Target:
     stated : (n, 3) array, optional [world unit]
         Standard deviations of the given points, where a survey states them. The found ones are then nearest
         to the given ones by these, and `sizes` has the factor that they are taken with.
+    bends : Bends, optional
+        In each view beside what is found, of a board that bends anew each time.
     """
 
     given: Array
@@ -68,11 +71,17 @@ class Target:
     evidence: float
     point: NDArray[np.str_] | None = None
     stated: Array | None = None
+    bends: Bends | None = None
 
     @property
     def offsets(self) -> Array:
         """(n, 3) found less given [world unit]."""
         return self.found - self.given
+
+    @property
+    def only_bends(self) -> bool:
+        """Whether the points are where they are given, but for the bends of each view."""
+        return self.bends is not None and not self.offsets.any()
 
     def places(self, world: Array) -> NDArray[np.intp]:
         """(N,) which of the target's points some world points are, by their given coordinates; -1: none."""
@@ -83,16 +92,44 @@ class Target:
         return _places(self.found, world)
 
     def applied(self, points: Correspondences) -> Correspondences:
-        """Points with the coordinates that were found, where they are points of this target."""
+        """Points with the coordinates that all views share, where they are points of this target."""
         place = self.places(points.world)
         world = np.where((place >= 0)[:, None], self.found[place], points.world)
         return points if (place < 0).all() else replace(points, world=world)
 
+    def seen(self, points: Correspondences) -> Correspondences:
+        """The same, as they were in each view from which the target was found."""
+        found = self.applied(points)
+        bent = (self.places(points.world) >= 0)[:, None] * self._bend(found)
+        return found if self.bends is None else replace(found, world=found.world + bent)
+
+    def straightened(self, points: Correspondences) -> Correspondences:
+        """Points as they were in each view, with the coordinates that all views share."""
+        if self.bends is None:
+            return points
+        world = points.world - self._bend(points)
+        return replace(points, world=np.where((self.rows_of(world) >= 0)[:, None], world, points.world))
+
     def as_given(self, points: Correspondences) -> Correspondences:
-        """The inverse of `applied`."""
-        place = self.rows_of(points.world)
+        """The inverse of `seen`."""
+        place = self.rows_of(self.straightened(points).world)
         world = np.where((place >= 0)[:, None], self.given[place], points.world)
         return points if (place < 0).all() else replace(points, world=world)
+
+    def _bend(self, points: Correspondences) -> Array:
+        """(N, 3) offsets of points by the bends of their views [world unit]."""
+        if self.bends is None:
+            return np.zeros_like(points.world)
+        by_view = self.bends.of_views(points.view_names)[points.view_index]
+        offsets = surface_of(self.given).offsets(points.world)
+        return np.asarray((offsets @ by_view[..., None])[..., 0])
+
+    def bend_of_views(self) -> float:
+        """Rms height over points and views by which the board is bent anew [world unit]; 0: not at all."""
+        if self.bends is None:
+            return 0.0
+        heights = surface_of(self.given).offsets(self.found) @ self.bends.coefficients.T  # (n, 3, V)
+        return float(np.sqrt((heights**2).sum(axis=1).mean()))
 
     def joined(self, other: Target) -> Target:
         """One target from two that were found apart: their mean where both have a point."""

@@ -42,7 +42,7 @@ HOMES = {
 LEVELS = (
     {"errors", "frozen_dataclass", "geometry"},
     {"distances", "processes"},
-    {"board", "camera", "least_squares", "median", "network", "points"},
+    {"bends", "board", "camera", "least_squares", "median", "network", "points"},
     {"target"},
     {"calibration", "printing", "training"},
     {"bundle_adjustment"},

@@ -144,6 +144,15 @@ class Views:
         """Only these views, normalised as before."""
         rows = np.concatenate([np.arange(self.first[v], self.first[v] + self.counts[v]) for v in views])
         counts = self.counts[views]
+        return self._only(views, rows, counts)
+
+    def of_points(self, kept: NDArray[np.bool_]) -> Views:
+        """Only these points, in the order of the views, normalised as before."""
+        counts = np.bincount(self.index[kept], minlength=self.n_views)
+        views = np.flatnonzero(counts)
+        return self._only(views, np.flatnonzero(kept), counts[views])
+
+    def _only(self, views: NDArray[np.intp], rows: NDArray[np.intp], counts: NDArray[np.intp]) -> Views:
         return replace(
             self,
             names=tuple(self.names[v] for v in views),

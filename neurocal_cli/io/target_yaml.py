@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bends import Bends
 from neurocal_cli.io.text_columns import read_table, table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import mapping, number
@@ -17,6 +18,7 @@ __all__ = ["read_target", "target_lines"]
 
 _NUMBERS = ("X", "Y", "Z", "X_given", "Y_given", "Z_given", "sX", "sY", "sZ")
 _STATED = ("sX_stated", "sY_stated", "sZ_stated")
+_SHAPES = ("bowl", "saddle", "twist")
 
 
 def target_lines(target: Target | None, long: bool) -> Iterator[str]:
@@ -36,6 +38,15 @@ def target_lines(target: Target | None, long: bool) -> Iterator[str]:
     if target.stated is not None:
         columns |= {name: target.stated[:, k] for k, name in enumerate(_STATED)}
     yield from (f"  {line}" for line in table_lines(columns, long, indent=2))
+    if target.bends is not None:
+        yield from (f"  {line}" for line in _bends_lines(target.bends, long))
+
+
+def _bends_lines(bends: Bends, long: bool) -> Iterator[str]:
+    yield "bends:  # of each view, from the points above"
+    yield f"  size: {number(bends.size)}"
+    columns = dict(zip(_SHAPES, bends.coefficients.T, strict=True))
+    yield from (f"  {line}" for line in table_lines({"view": list(bends.names), **columns}, long, indent=2))
 
 
 def read_target(field: Field | None) -> Target | None:
@@ -65,4 +76,16 @@ def read_target(field: Field | None) -> Target | None:
         evidence=field["evidence"].number(),
         point=np.array([cell.text() for cell in columns["point"].items()]) if "point" in columns else None,
         stated=std,
+        bends=_read_bends(field.get("bends")),
     )
+
+
+def _read_bends(field: Field | None) -> Bends | None:
+    if field is None:
+        return None
+    columns = read_table(field, frozenset(("view",)))
+    if set(columns) != {"view", *_SHAPES}:
+        field.fail(f"a table with view, {', '.join(_SHAPES)}")
+    names = tuple(cell.text() for cell in columns["view"].items())
+    coefficients = np.array([columns[name].array(-1) for name in _SHAPES]).T
+    return Bends(field["size"].number(), names, coefficients)

@@ -82,14 +82,15 @@ def _surveyed(cameras: Sequence[Calibration]) -> Target | None:
 def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, Calibration]:
     """Two cameras that were calibrated apart, with the points of both on one target.
 
-    Each may have found the target by itself. Then the mean of both is that of both.
+    Each may have found the target by itself. Then the mean of both is that of both. Bends of each view, which
+    a camera alone may have found, are left out.
     """
-    if left.target is right.target:
+    if left.target is right.target and (left.target is None or left.target.bends is None):
         return left, right
     first, second = left.target or right.target, right.target or left.target
     assert first is not None
     assert second is not None
-    target = first if first is second else first.joined(second)
+    target = replace(first if first is second else first.joined(second), bends=None)
 
     def on_it(camera: Calibration) -> Calibration:
         points = camera.points if camera.target is None else camera.target.as_given(camera.points)

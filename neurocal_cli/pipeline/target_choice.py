@@ -11,6 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.outlier_views import conditions_on_views, free_networks
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import predicted_pixels
@@ -24,11 +26,12 @@ from neurocal_cli.pipeline.odd_views import may_be_bent
 from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly, rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points, planes_of
+from neurocal_cli.target_shape.bent_anew import find_bends
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 from neurocal_cli.verdict.given_parameters import asked_for
 from neurocal_cli.verdict.stated_noise import stated_noise
-from neurocal_cli.verdict.view_groups import view_groups
+from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
 __all__ = ["lines_that_are_bent", "with_target"]
 
@@ -36,6 +39,8 @@ _ROUNDS = 3
 _WORTH = 0.8  # of the views' number, where some repeat a pose
 _OF_LINES = "k1k2p1p2"  # as `plumb-line` finds
 _TOLD_APART = 5.0  # standard deviations, as for the verdict
+# Of the variance by which views contradict each other, bends explain nine tenths, or leave but a little.
+_SHARE, _NOISE = 0.9, 1.1
 
 
 def with_target(
@@ -63,7 +68,9 @@ def with_target(
     if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected
     known = _searched(problem, solution, rejected, options, choice)
-    if known[0].target is None and rejected.views and all(map(may_be_bent, rejected.views.values())):
+    target, views = known[0].target, known[1].views
+    unexplained = target is None or target.bends is not None
+    if unexplained and views and all(map(may_be_bent, views.values())):
         return _taking_views_back(problem, known, options, choice)
     return known
 
@@ -87,6 +94,8 @@ def _searched(
     if not _can_tell(solution, choice, None):
         return solution, rejected
     found = _found(solution, choice, None)
+    if choice != "flat":
+        found = _with_bends(solution, found)
     if found is not None and choice == "auto" and _other_reason(solution, found):
         return solution, rejected
     kept = replace(solution, target_kept=choice == "auto")
@@ -146,7 +155,7 @@ def _other_reason(solution: Solution, found: Found) -> bool:
     asked = asked_for(problem.views, solution.state, problem.fixed, problem.free_poses)
     if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
         return True
-    return bool(problem.free.any()) and _are_two_cameras(solution, found)
+    return _are_two_cameras(solution, found)
 
 
 def _are_two_cameras(solution: Solution, found: Found) -> bool:
@@ -155,21 +164,58 @@ def _are_two_cameras(solution: Solution, found: Found) -> bool:
     They still contradict each other where the target was found; a bent board looks like two before. One that
     is bent anew in some views looks like two afterwards, too, but these explain less.
     """
-    (new, adjusted), *_ = found.fits
-    if view_groups(new.views, adjusted.state, adjusted.normal, new.free_camera) is None:
+    if _groups(*found.fits[0]) is None:
         return False
-    problem, before = solution.problem, solution.adjusted
-    groups = view_groups(problem.views, before.state, before.normal, problem.free_camera)
-    if groups is None:
-        return False
-    left = (1.0 - groups.explained) * before.normal[:, -1, -1].sum()
-    return bool(left < adjusted.normal[:, -1, -1].sum())
+    before, (_, after) = solution.adjusted, found.fits[0]
+    groups = _groups(solution.problem, before)
+    return groups is not None and bool((1.0 - groups.explained) * before.cost.sum() < after.cost.sum())
+
+
+def _groups(problem: Problem, adjusted: Adjusted) -> ViewGroups | None:
+    """Two cameras among the views, or a zoom that moves."""
+    if not problem.free.any():
+        return None
+    return view_groups(problem.views, adjusted.state, adjusted.normal, problem.free_camera)
+
+
+def _with_bends(solution: Solution, common: Found | None) -> Found | None:
+    """With bends of each view, if these explain why the views contradict each other.
+
+    Of two cameras, or of a rolling shutter, they explain a part.
+    """
+    fit = solution.problem, solution.adjusted
+    found = find_bends(fit, common)
+    if found is None or found.target.bends is None:
+        return found
+    before, after = fit if common is None else common.fits[0], found.fits[0]
+    least = _noise_of_views(*after)
+    given = _noise(*before, 0.0)
+    bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
+    if bent > _NOISE * least and given - bent < _SHARE * (given - least):
+        return common
+    groups = _groups(*before)
+    explained = 1.0 - float(after[1].cost.sum() / before[1].cost.sum())
+    return found if groups is None or groups.explained < explained else common
+
+
+def _noise(problem: Problem, adjusted: Adjusted, determined: float) -> float:
+    """Variance of the residuals, normalised."""
+    unknowns = int(problem.free_camera.sum()) + 6 * problem.views.n_views + determined
+    return float(adjusted.cost.sum()) / max(problem.views.n_equations - unknowns, 1.0)
+
+
+def _noise_of_views(problem: Problem, adjusted: Adjusted) -> float:
+    """The same where every view has a camera of its own."""
+    unknowns = 6 + conditions_on_views(problem.views, adjusted.state)
+    own = float(free_networks(problem.views, adjusted.state).sum())
+    return own / max(problem.views.n_equations - float(unknowns.sum()), 1.0)
 
 
 def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
     """Whether there are enough different views of the target."""
     problem, views = solution.problem, solution.problem.views
-    given, label, point = distinct_points([problem.points])
+    points = problem.points if known is None else known.straightened(problem.points)
+    given, label, point = distinct_points([points])
     repeated = repeated_poses(views, solution.state, point_residuals(views, solution.state))
     plane = planes_of(given, point) if known is None else known.plane
     if not enough_views(label, repeated.n_poses, int(plane.max()) + 1):
@@ -192,9 +238,9 @@ def _fitted_to(
     solution, rejected = before
     try:
         if len(rejected) or rejected.views:
-            again, rejected = fit_robustly(problem.with_points(target.applied(problem.points)), options)
+            again, rejected = fit_robustly(problem.with_points(target.seen(problem.points)), options)
         else:
-            points = target.applied(problem.points)
+            points = target.seen(problem.points)
             again = fit_again(solution, points, options, only_from_here=True)
     except DegenerateGeometryError:
         return None

@@ -191,7 +191,10 @@ def _free(calibration: Calibration) -> NDArray[np.bool_]:
 
 def _target(calibration: Calibration) -> Array:
     """(n, 3) the target's points, once each."""
-    return np.asarray(np.unique(calibration.points.world, axis=0))
+    points = calibration.points
+    if calibration.target is not None:
+        points = calibration.target.straightened(points)
+    return np.asarray(np.unique(points.world, axis=0))
 
 
 def candidates(calibration: Calibration) -> list[Candidate]:

@@ -213,5 +213,5 @@ def _basis(
     seen: CameraSeen, state: CameraState, free: NDArray[np.bool_], normal: Array, shared: Array | None = None
 ) -> CovarianceBasis:
     return covariance_basis(
-        seen.target, seen.views, state, free, seen.free_poses, seen.points.world, normal, shared
+        seen.target, seen.views, state, free, seen.free_poses, seen.points, normal, shared
     )

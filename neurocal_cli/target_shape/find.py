@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bends import N_SHAPES, Bends, surface_of
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
@@ -20,12 +21,23 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_similarity
 from neurocal_cli.median import median
 from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
+from neurocal_cli.target_shape.bend_size import bends_of, most_probable_precision
+from neurocal_cli.target_shape.bends_left_out import bends_hold
 from neurocal_cli.target_shape.information import Information, Sight, information_of
 from neurocal_cli.target_shape.left_out import holds_for_views_left_out
-from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, posterior
+from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, given_posterior, posterior
 from neurocal_cli.target_shape.prior import prior_of
 
-__all__ = ["LEAST_GAIN", "Found", "at_world", "enough_views", "find_target", "sight_of"]
+__all__ = [
+    "LEAST_GAIN",
+    "Found",
+    "Search",
+    "at_world",
+    "enough_views",
+    "find_target",
+    "searched",
+    "sight_of",
+]
 
 _STEPS = 10
 # Unknowns of the dense system. From more on some views are taken; of far more no target is looked for.
@@ -95,18 +107,24 @@ def find_target(
     Found or None
         None where the points do not determine a target, or ask for one that is no print of the given one.
     """
-    n_points = len(distinct_points([problem.points for problem, _ in fits])[0])
+    points = [problem.points if known is None else known.straightened(problem.points) for problem, _ in fits]
+    n_points = len(distinct_points(points)[0])
     n_views = sum(problem.views.n_views for problem, _ in fits)
     many = min(3 * n_points, 6 * n_views) > _DENSE
     if many and min(3 * n_points, 6 * n_views) > _MOST_DENSE:
         return None
     some = [_some_views(*fit, _DENSE // (6 * len(fits))) for fit in fits] if many else fits
+    found = searched(Search(some, flat, known), least_gain)
+    return found if found is None or not many else _of_all_views(found, fits, known)
+
+
+def searched(search: Search, least_gain: float) -> Found | None:
+    """What a search ends with; None also where the points do not determine it."""
     try:
         with np.errstate(all="ignore"):
-            found = _Search(some, flat, known).run(least_gain)
+            return search.run(least_gain)
     except np.linalg.LinAlgError:
         return None
-    return found if found is None or not many else _of_all_views(found, fits, known)
 
 
 def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Problem, Adjusted]:
@@ -134,11 +152,29 @@ def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known:
     return replace(found, fits=tuple(moved))
 
 
-class _Search:
-    """The fits as they move."""
+class Search:
+    """The fits as they move.
 
-    def __init__(self, fits: Sequence[tuple[Problem, Adjusted]], flat: bool, known: Target | None) -> None:
+    Parameters
+    ----------
+    fits, flat, known
+        As for `find_target`.
+    bending : bool
+        Whether the target bends anew in each view; always where a known one does. Of one camera.
+    still : bool
+        Whether its points are where they are given, but for that.
+    """
+
+    def __init__(
+        self,
+        fits: Sequence[tuple[Problem, Adjusted]],
+        flat: bool,
+        known: Target | None,
+        bending: bool = False,
+        still: bool = False,
+    ) -> None:
         self.fits, self.flat = list(fits), flat
+        self.still = still or (known is not None and known.only_bends)
         worlds = [problem.points.world for problem, _ in fits]
         self.most_stretched = _STRETCHED if known is None else _STRETCHED_AGAIN
         if known is None:
@@ -147,53 +183,98 @@ class _Search:
             self.sizes = None
         else:
             self.given, self.ids, self.plane = known.given, known.point, known.plane
+            worlds = [known.straightened(problem.points).world for problem, _ in fits]
             label = known.rows_of(np.concatenate(worlds))
             self.sizes = dict(known.sizes)
         self.label = np.split(label, np.cumsum([len(world) for world in worlds])[:-1])
         self.prior = prior_of(self.given, self.plane)
         found = np.zeros_like(self.given) if known is None else known.offsets
         self.offsets = self.prior.along_axes(found)
+        bends = None if known is None else known.bends
+        names = self.fits[0][0].views.names
+        self.surface = surface_of(self.given) if bending or bends is not None else None
+        self.bends = np.zeros((len(names), N_SHAPES)) if bends is None else bends.of_views(names)
+        self.precision = 1.0
 
     def run(self, least_gain: float) -> Found | None:
+        """Linearise, solve and move; None where the target gains too little, or is no print of the given."""
         for step in range(_STEPS):
-            info = self._information().around_given(self.offsets)
-            spare = info.equations - len(info.camera) - 6 * len(info.pose)
-            if not (spare > _FEWEST_SPARE and info.cost > spare * _EXACT**2):
+            info = self._around_given(self.information())
+            if not (info.spare > _FEWEST_SPARE and info.cost > info.spare * _EXACT**2):
                 return None
-            found = posterior(info, self.prior, self.sizes, self.flat)
-            if step == 0 and found.evidence - evidence_of_given(info) < _EARLY * least_gain:
+            if self.still:
+                found = given_posterior(info, self.prior)
+            else:
+                found = posterior(info, self.prior, self.sizes, self.flat)
+            if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
             std = np.sqrt(found.variance * np.diagonal(found.camera))
             settled = bool((np.abs(found.camera_step) < _SETTLED * std).all())
-            if not self._move(found):
+            if not self._move(found, info):
                 return None
             if settled:
                 break
-        gain = found.evidence - evidence_of_given(info)
-        if gain < least_gain or not holds_for_views_left_out(
-            self._sights(), self.prior, self.offsets, found.sizes, found.variance
-        ):
+        if found.evidence - self._without(info) < least_gain or not self._holds(found):
             return None
         self._align()
-        target = self._target(found, gain)
+        target = self._target(found, found.evidence - evidence_of_given(info.straight()))
         if not target.stretch() < self.most_stretched:
             return None
         return Found(target, tuple(self.fits), found.evidence)
 
-    def _sights(self) -> list[Sight]:
-        return [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
+    def _without(self, info: Information) -> float:
+        """Evidence without what is looked for: the offsets, or bends alone."""
+        return evidence_of_given(info.straight() if self.still else info)
 
-    def _information(self) -> Information:
+    def _holds(self, found: Posterior) -> bool:
+        sights = self._sights()
+        if self.surface is not None and not bends_hold(sights[0], self.bends, self.precision):
+            return False
+        return self.still or holds_for_views_left_out(
+            sights, self.prior, self.offsets, found.sizes, found.variance, self.precision
+        )
+
+    def _around_given(self, info: Information) -> Information:
+        """Around the given points; where they bend, with the bends' most probable size."""
+        if self.surface is None:
+            return info.around_given(self.offsets)
+        self.precision = most_probable_precision(info, self.prior.size)
+        return info.around_given(self.offsets).held(self.precision)
+
+    def _sights(self) -> list[Sight]:
+        sights = [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
+        if self.surface is None:
+            return sights
+        shapes = self.surface.offsets(self._common())
+        return [replace(sight, shapes=shapes, bends=self.bends) for sight in sights]
+
+    def information(self) -> Information:
+        """Around the target as it is by now."""
         return information_of(self._sights(), len(self.given)).turned(self.prior.axes)
 
-    def _move(self, found: Posterior) -> bool:
+    def _common(self) -> Array:
+        """(n, 3) the points that all views share."""
+        return self.given + self.prior.in_world(self.offsets)
+
+    def _world(self, k: int) -> Array:
+        """(N, 3) the points of one of the fits, in each of its views."""
+        common, points = self._common(), self.fits[k][0].points
+        if self.surface is None:
+            return common[self.label[k]]
+        shapes = self.surface.offsets(common)[self.label[k]]
+        return common[self.label[k]] + (shapes @ self.bends[points.view_index][..., None])[..., 0]
+
+    def _move(self, found: Posterior, info: Information) -> bool:
         if not np.abs(found.offsets).max() < _LARGEST * self.prior.size:
             return False
+        if self.surface is not None:
+            self.bends = bends_of(info, found.camera_step, found.offsets)
+            bent = self.surface.offsets(self._common()) @ self.bends.T
+            if not np.abs(bent).max() < _LARGEST * self.prior.size:
+                return False
         self.offsets, self.sizes = found.offsets, found.sizes
-        world = self.given + self.prior.in_world(self.offsets)
         self.fits = [
-            at_world(*fit, in_pixels(fit[0], fit[1].state), world[label])
-            for fit, label in zip(self.fits, self.label, strict=True)
+            at_world(*fit, in_pixels(fit[0], fit[1].state), self._world(k)) for k, fit in enumerate(self.fits)
         ]
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
 
@@ -202,33 +283,37 @@ class _Search:
 
         Where distances were measured, they hold the scale.
         """
-        if not all(problem.free_poses for problem, _ in self.fits):
+        if self.still or not all(problem.free_poses for problem, _ in self.fits):
             return
-        world = self.given + self.prior.in_world(self.offsets)
+        world = self._common()
         s, R, t = nearest_similarity(world, self.given)
         held = scale_of_points(s * world @ R.T + t, self.ids, self.fits[0][0].points.distances).factor
         s, t = held * s, held * t
         world = s * world @ R.T + t
         self.offsets = self.prior.along_axes(world - self.given)
-        for k, label in enumerate(self.label):
-            problem, adjusted = self.fits[k]
+        for k, (problem, adjusted) in enumerate(self.fits):
             state = in_pixels(problem, adjusted.state)
             turned = state.R @ R.T
             state = replace(state, R=turned, t=s * state.t - turned @ t)
-            self.fits[k] = at_world(problem, adjusted, state, world[label])
+            self.fits[k] = at_world(problem, adjusted, state, self._world(k))
 
     def _target(self, found: Posterior, gain: float) -> Target:
         axes = self.prior.axes
         variance = np.einsum("nij,nj->ni", axes**2, found.std**2)
+        bends = None
+        if self.surface is not None:
+            size = float(np.sqrt(found.variance / self.precision))
+            bends = Bends(size, self.fits[0][0].views.names, self.bends)
         return Target(
             self.given,
-            self.given + self.prior.in_world(self.offsets),
+            self._common(),
             np.sqrt(variance),
             self.plane,
             found.sizes,
             self.flat,
             gain,
             self.ids,
+            bends=bends,
         )
 
 

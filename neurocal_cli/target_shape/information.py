@@ -13,13 +13,23 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bends import N_SHAPES
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches, batches_of, products
 from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Information", "Sight", "by_world", "information_of", "labelled", "point_terms"]
+__all__ = [
+    "Information",
+    "Sight",
+    "by_world",
+    "information_of",
+    "labelled",
+    "point_terms",
+    "pose_columns",
+    "with_bends",
+]
 
 
 @frozen_dataclass(eq=False)
@@ -36,6 +46,10 @@ class Sight:
     free_poses : bool
     label : (N,) int array
         The target's point in each row, in the order of `views`.
+    shapes : (n, 3, 3) array, optional
+        Of a target that bends anew in each view: each point's offsets for a coefficient of 1.
+    bends : (V, 3) array, optional [world unit]
+        Coefficients that the views are believed to have.
     """
 
     views: Views
@@ -43,23 +57,43 @@ class Sight:
     free: NDArray[np.bool_]
     free_poses: bool
     label: NDArray[np.intp]
+    shapes: Array | None = None
+    bends: Array | None = None
+
+    def of_views(self, which: NDArray[np.intp]) -> Sight:
+        """Of some views."""
+        return self._of(which, self.views.subset(which), np.isin(self.views.index, which))
+
+    def of_points(self, kept: NDArray[np.bool_]) -> Sight:
+        """Of some points (N,), in the order of `views`."""
+        return self._of(np.unique(self.views.index[kept]), self.views.of_points(kept), kept)
+
+    def _of(self, which: NDArray[np.intp], views: Views, kept: NDArray[np.bool_]) -> Sight:
+        state = replace(self.state, R=self.state.R[which], t=self.state.t[which])
+        bends = None if self.bends is None else self.bends[which]
+        return replace(self, views=views, state=state, label=self.label[kept], bends=bends)
 
 
 @frozen_dataclass(eq=False)
 class Information:
     """Sums of products of derivatives and residuals [px], by blocks.
 
+    Where the target bends anew in each view, a pose has p = 9 unknowns: its six and the coefficients of the
+    view's bend, counted from 0. Else p = 6.
+
     Attributes
     ----------
     camera, camera_right : (f, f), (f,) array
         Of the free parameters of all cameras, one after the other, in each one's normalised units.
-    pose, pose_camera, pose_right : (P, 6, 6), (P, 6, f), (P, 6) array
+    pose, pose_camera, pose_right : (P, p, p), (P, p, f), (P, p) array
     point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
         Offsets in the world's axes and unit.
-    pose_point : (P, 6, n, 3) array
+    pose_point : (P, p, n, 3) array
     cost : float
         Sum of squares.
     equations : float
+    log_precision : float
+        Sum of the logarithms of the precisions that the bends have a priori; see `held`.
     """
 
     camera: Array
@@ -73,6 +107,41 @@ class Information:
     pose_point: Array
     cost: float
     equations: float
+    log_precision: float = 0.0
+
+    @property
+    def spare(self) -> float:
+        """Equations beyond the unknowns of the cameras and the poses."""
+        return self.equations - len(self.camera) - 6 * len(self.pose)
+
+    def held(self, precision: float) -> Information:
+        """With a priori Gaussian bends of this precision, in units of the noise's."""
+        pose, bends = self.pose.copy(), np.arange(6, self.pose.shape[1])
+        pose[:, bends, bends] += precision
+        return replace(self, pose=pose, log_precision=len(pose) * len(bends) * np.log(precision))
+
+    def around_straight(self, bends: Array) -> Information:
+        """The same quadratic in the whole bends (P, 3), not in what they change by."""
+        by_pose = (self.pose[:, :, 6:] @ bends[..., None])[..., 0]
+        cost = 2 * self.pose_right[:, 6:] + by_pose[:, 6:]
+        return replace(
+            self,
+            camera_right=self.camera_right + np.einsum("pkf,pk->f", self.pose_camera[:, 6:], bends),
+            pose_right=self.pose_right + by_pose,
+            point_right=self.point_right + np.einsum("pkni,pk->ni", self.pose_point[:, 6:], bends),
+            cost=self.cost + float((bends * cost).sum()),
+        )
+
+    def straight(self) -> Information:
+        """Without bends."""
+        return replace(
+            self,
+            pose=self.pose[:, :6, :6],
+            pose_camera=self.pose_camera[:, :6],
+            pose_right=self.pose_right[:, :6],
+            pose_point=self.pose_point[:, :6],
+            log_precision=0.0,
+        )
 
     def turned(self, axes: Array) -> Information:
         """With each point's offset along its own axes, the columns of (n, 3, 3)."""
@@ -102,16 +171,19 @@ def information_of(sights: Sequence[Sight], n_points: int) -> Information:
     widths = [int(sight.free.sum()) for sight in sights]
     poses = [sight.views.n_views if sight.free_poses else 0 for sight in sights]
     f, P = sum(widths), sum(poses)
+    p = 6 if sights[0].shapes is None else 6 + N_SHAPES
     found = Information(
-        np.zeros((f, f)), np.zeros(f), np.zeros((P, 6, 6)), np.zeros((P, 6, f)), np.zeros((P, 6)),
+        np.zeros((f, f)), np.zeros(f), np.zeros((P, p, p)), np.zeros((P, p, f)), np.zeros((P, p)),
         np.zeros((n_points, 3, 3)), np.zeros((n_points, 3, f)), np.zeros((n_points, 3)),
-        np.zeros((P, 6, n_points, 3)), 0.0, sum(sight.views.n_equations for sight in sights),
+        np.zeros((P, p, n_points, 3)), 0.0, sum(sight.views.n_equations for sight in sights),
     )  # fmt: skip
     cost = 0.0
     ends = zip(np.cumsum(widths).tolist(), np.cumsum(poses).tolist(), strict=True)
     for sight, width, count, (end, last) in zip(sights, widths, poses, ends, strict=True):
         cost += _add(found, sight, slice(end - width, end), slice(last - count, last))
-    return replace(found, cost=cost)
+    found = replace(found, cost=cost)
+    bends = [sight.bends for sight in sights if sight.bends is not None]
+    return found.around_straight(np.concatenate(bends)) if bends else found
 
 
 def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
@@ -119,19 +191,23 @@ def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
     views = sight.views
     columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
     label = labelled(views, sight.label)
-    terms = point_terms(views.batches, sight.state, views.scale, label, columns, len(found.point))
+    terms = point_terms(
+        views.batches, sight.state, views.scale, label, columns, len(found.point), sight.shapes
+    )
     normal, px2 = terms.normal, views.pixel_scale**2
     found.camera[own, own] += px2 * normal[:, columns[:, None], columns].sum(axis=0)
     found.camera_right[own] += px2 * normal[:, columns, -1].sum(axis=0)
     found.point[...] += px2 * terms.point
     found.point_camera[:, :, own] += px2 * terms.point_camera
     found.point_right[...] += px2 * terms.point_right
+    cost = float(normal[:, -1, -1].sum())
     if sight.free_poses:
-        found.pose[poses] = px2 * normal[:, POSE, POSE]
-        found.pose_camera[poses, :, own] = px2 * normal[:, POSE, columns]
-        found.pose_right[poses] = px2 * normal[:, POSE, -1]
+        of_pose = pose_columns(normal.shape[1], sight.shapes is not None)
+        found.pose[poses] = px2 * normal[:, of_pose[:, None], of_pose]
+        found.pose_camera[poses, :, own] = px2 * normal[:, of_pose[:, None], columns]
+        found.pose_right[poses] = px2 * normal[:, of_pose, -1]
         found.pose_point[poses] = px2 * terms.pose_point
-    return px2 * float(normal[:, -1, -1].sum())
+    return px2 * cost
 
 
 @frozen_dataclass(eq=False)
@@ -141,10 +217,10 @@ class PointTerms:
     Attributes
     ----------
     normal : (V, 12 + K, 12 + K) array
-        As from `normal_blocks`.
+        As from `normal_blocks`; with columns of three bends before the residual, where the target has some.
     point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
         Points in the world's axes and unit.
-    pose_point : (V, 6, n, 3) array
+    pose_point : (V, p, n, 3) array
     """
 
     normal: Array
@@ -161,6 +237,7 @@ def point_terms(
     label: NDArray[np.intp],
     columns: NDArray[np.intp],
     n_points: int,
+    shapes: Array | None = None,
 ) -> PointTerms:
     """Sum up what one camera saw of the points.
 
@@ -176,22 +253,29 @@ def point_terms(
         Of the camera's parameters that count.
     n_points : int
         Points of the target.
+    shapes : (n, 3, 3) array, optional
+        Offsets of these for a coefficient of 1 of each view's bend.
     """
     width, f, V = 12 + len(state.k), len(columns), batches.n_views
-    used = np.concatenate([columns, np.arange(POSE.start, POSE.stop), [width - 1]])
-    by_batch = np.empty((len(batches.view), width, width))
-    summed, cross = np.zeros((n_points, 3, f + 10)), np.zeros((V * n_points, 6, 3))
+    whole = width if shapes is None else width + N_SHAPES
+    of_pose = pose_columns(whole, shapes is not None)
+    p = len(of_pose)
+    used = np.concatenate([columns, of_pose, [whole - 1]])
+    by_batch = np.empty((len(batches.view), whole, whole))
+    summed, cross = np.zeros((n_points, 3, f + p + 4)), np.zeros((V * n_points, p, 3))
     buffer = batches.memory(width)
     for chunk in batches.chunks():
         view = batches.view[chunk]
         part = buffer[: len(view)]
         derivatives(batches, chunk, state, part[:, :-1])
-        products(part, by_batch[chunk])
         by_point = by_world(part, state, scale, view)
+        if shapes is not None:
+            part = with_bends(part, by_point, shapes[label[chunk]])
+        products(part, by_batch[chunk])
         rows = np.concatenate([by_point, part[:, used]], axis=1)
         real = label[chunk] >= 0
         every = np.moveaxis(by_point, 3, 1) @ np.moveaxis(rows, 3, 1).swapaxes(2, 3)
-        point, flat = every[real], label[chunk][real]  # (.., 3, f + 10), (..,)
+        point, flat = every[real], label[chunk][real]  # (.., 3, f + p + 4), (..,)
         summed += _summed_by(flat, point.reshape(len(flat), -1), n_points).reshape(summed.shape)
         place = np.broadcast_to(view[:, None] * n_points, real.shape)[real] + flat
         np.add.at(cross, place, np.swapaxes(point[:, :, 3 + f : -1], 1, 2))
@@ -200,8 +284,30 @@ def point_terms(
         summed[:, :, :3],
         summed[:, :, 3 : 3 + f],
         summed[:, :, -1],
-        np.swapaxes(cross.reshape(V, n_points, 6, 3), 1, 2),
+        np.swapaxes(cross.reshape(V, n_points, p, 3), 1, 2),
     )
+
+
+def pose_columns(width: int, bends: bool) -> NDArray[np.intp]:
+    """Of a pose's own unknowns in normal matrices of so many columns: omega, tau, and bends if any."""
+    last = np.arange(width - 1 - N_SHAPES, width - 1) if bends else np.arange(0)
+    return np.concatenate([np.arange(POSE.start, POSE.stop), last])
+
+
+def with_bends(part: Array, by_point: Array, shapes: Array) -> Array:
+    """(T, width + 4, 2, n) derivatives with those by the view's bend before the residual.
+
+    Parameters
+    ----------
+    part : (T, width + 1, 2, n) array
+        A part of `PointBatches.memory`.
+    by_point : (T, 3, 2, n) array
+        From `by_world`.
+    shapes : (T, n, 3, 3) array
+        Offsets of the points for a coefficient of 1.
+    """
+    by_bend = np.einsum("tipn,tnik->tkpn", by_point, shapes)
+    return np.concatenate([part[:, :-2], by_bend, part[:, -2:]], axis=1)
 
 
 def by_world(part: Array, state: CameraState, scale: Array, view: NDArray[np.intp]) -> Array:

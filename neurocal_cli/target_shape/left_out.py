@@ -11,7 +11,6 @@ squared error of the others: where a few views tell cameras and offsets only as 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +27,12 @@ _FOLDS = 5
 
 
 def holds_for_views_left_out(
-    sights: Sequence[Sight], prior: Prior, offsets: Array, sizes: Mapping[str, float], variance: float
+    sights: Sequence[Sight],
+    prior: Prior,
+    offsets: Array,
+    sizes: Mapping[str, float],
+    variance: float,
+    precision: float = 1.0,
 ) -> bool:
     """See whether the offsets of the other views suit those left out; True where nobody can tell.
 
@@ -42,6 +46,8 @@ def holds_for_views_left_out(
     sizes : dict of float by name [world unit]
     variance : float [px^2]
         Of the noise.
+    precision : float
+        Of bends of each view, in units of the noise's, where the target has some.
     """
     n_views = max(sight.views.n_views for sight in sights)
     if sum(sight.views.n_views for sight in sights) < _FEWEST:
@@ -49,8 +55,9 @@ def holds_for_views_left_out(
 
     def information(folds: NDArray[np.intp]) -> Information:
         which = [np.isin(np.arange(sight.views.n_views) % n_folds, folds) for sight in sights]
-        some = [_of(sight, w) for sight, w in zip(sights, which, strict=True) if w.any()]
-        return information_of(some, len(offsets)).turned(prior.axes).around_given(offsets)
+        some = [sight.of_views(np.flatnonzero(w)) for sight, w in zip(sights, which, strict=True) if w.any()]
+        info = information_of(some, len(offsets)).turned(prior.axes).around_given(offsets)
+        return info.held(precision)
 
     n_folds = min(n_views, _FOLDS)
     everything = np.arange(n_folds)
@@ -65,12 +72,3 @@ def holds_for_views_left_out(
         alone += cost_at(out, told) - cost_at(out, nothing)
         together += cost_at(whole, told) - cost_at(others, told) + cost_at(others, nothing)
     return alone < 0 or together < 0
-
-
-def _of(sight: Sight, some: NDArray[np.bool_]) -> Sight:
-    """Some views of a camera."""
-    which = np.flatnonzero(some)
-    state = replace(sight.state, R=sight.state.R[which], t=sight.state.t[which])
-    return replace(
-        sight, views=sight.views.subset(which), state=state, label=sight.label[some[sight.views.index]]
-    )

@@ -32,8 +32,10 @@ from neurocal_cli.target_shape.system import Solved, System
 
 __all__ = [
     "Posterior",
+    "camera_step_of",
     "cost_at",
     "evidence_of_given",
+    "given_posterior",
     "known_sizes",
     "posterior",
     "prior_covariance",
@@ -102,17 +104,24 @@ _NO_COST = 1e-300  # what rounding leaves may be negative
 
 def evidence_of_given(info: Information) -> float:
     """Logarithm of the evidence of the target as it is given."""
-    spare = info.equations - len(info.camera) - 6 * len(info.pose)
     S, g, cost, logdet = _poses_eliminated(info)
     cost -= float(g @ np.linalg.solve(S, g)) if len(g) else 0.0
-    return _log_evidence(spare, cost, logdet + (float(np.linalg.slogdet(S)[1]) if len(g) else 0.0))
+    logdet += float(np.linalg.slogdet(S)[1]) if len(g) else 0.0
+    return _log_evidence(info.spare, cost, logdet - info.log_precision)
+
+
+def camera_step_of(info: Information) -> Array:
+    """(f,) steps of the cameras, the points being where they are given."""
+    S, g, *_ = _poses_eliminated(info)
+    scaled, scale = unit_diagonal(S)
+    return np.asarray(scale * (np.linalg.pinv(scaled, hermitian=True) @ (scale * g)))
 
 
 def cost_at(info: Information, offsets: Array) -> float:
     """Squared error with these offsets (n, 3), at the best cameras and poses for them."""
-    S, g, cost, _ = _poses_eliminated(info.around_given(-offsets))
-    scaled, scale = unit_diagonal(S)
-    return cost - float((scale * g) @ np.linalg.pinv(scaled, hermitian=True) @ (scale * g))
+    info = info.around_given(-offsets)
+    _, g, cost, _ = _poses_eliminated(info)
+    return cost - float(g @ camera_step_of(info))
 
 
 def _poses_eliminated(info: Information) -> tuple[Array, Array, float, float]:
@@ -162,6 +171,26 @@ def posterior(
         other = parts.climbed(parts.at(parts.with_stretch_changed(now)))
         now = other if other.evidence > now.evidence else now
     return parts.posterior(now)
+
+
+def given_posterior(info: Information, prior: Prior) -> Posterior:
+    """The same where the points stay as they are given."""
+    n, f = len(info.point), len(info.camera)
+    S, g, cost, logdet = _poses_eliminated(info)
+    inverse = np.linalg.inv(S)
+    cost -= float(g @ inverse @ g)
+    logdet += float(np.linalg.slogdet(S)[1]) - info.log_precision
+    return Posterior(
+        offsets=np.zeros((n, 3)),
+        variance=cost / info.spare,
+        camera_step=inverse @ g,
+        camera=np.asarray(inverse, dtype=float),
+        followed=np.zeros((f, n, 3)),
+        std=np.zeros((n, 3)),
+        sizes=dict.fromkeys((*prior.groups, *_SINGLE), _NOTHING * prior.size),
+        determined=0.0,
+        evidence=_log_evidence(info.spare, cost, logdet),
+    )
 
 
 def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Posterior:
@@ -226,7 +255,7 @@ class _Parts:
     def __init__(self, info: Information, prior: Prior, flat: bool) -> None:
         self.system, self.prior, self.flat = System(info, prior), prior, flat
         self.least, self.stretch = _NOTHING * prior.size, STRETCH * prior.size
-        self.spare = info.equations - self.system.f - 6 * self.system.P
+        self.spare, self.log_precision = info.spare, info.log_precision
 
     def start(self) -> dict[str, float]:
         names = (*self.prior.groups, *_SINGLE)
@@ -242,7 +271,7 @@ class _Parts:
             smooth[places] = (self.prior.size / ratios[name]) ** 2
         single = self.of_points(ratios)
         solved = self.system.solve(smooth, single)
-        logprior = float(np.log(smooth).sum()) + float(np.log(single).sum())
+        logprior = float(np.log(smooth).sum()) + float(np.log(single).sum()) + self.log_precision
         evidence = _log_evidence(self.spare, solved.cost, solved.logdet - logprior)
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
 

@@ -35,7 +35,7 @@ class System:
 
     def __init__(self, info: Information, prior: Prior) -> None:
         self.info, self.prior = info, prior
-        self.n, self.P = len(info.point), len(info.pose)
+        self.n, (self.P, self.p) = len(info.point), info.pose.shape[:2]
         self.f, self.m = len(info.camera), prior.basis.shape[2]
         basis = prior.basis
         by_basis = info.point @ basis  # (n, 3, m)
@@ -44,10 +44,12 @@ class System:
         self.shared = np.block([[info.camera, across], [across.T, inner]])
         self.right = np.concatenate([info.camera_right, np.einsum("nim,ni->m", basis, info.point_right)])
         self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
-        pose_basis = info.pose_point.reshape(self.P * 6, 3 * self.n) @ basis.reshape(3 * self.n, self.m)
-        self.pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, 6, self.m)], axis=2)
+        pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ basis.reshape(3 * self.n, self.m)
+        self.pose_shared = np.concatenate(
+            [info.pose_camera, pose_basis.reshape(self.P, self.p, self.m)], axis=2
+        )
         self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
-        self.points_first = 3 * self.n >= 6 * self.P
+        self.points_first = 3 * self.n >= self.p * self.P
         if not self.points_first:
             self._eliminate_poses()
 
@@ -59,9 +61,9 @@ class System:
     def _eliminate_poses(self) -> None:
         info, s = self.info, self.s
         root = np.linalg.inv(np.linalg.cholesky(info.pose))
-        columns = [self.pose_shared, info.pose_point.reshape(self.P, 6, -1), info.pose_right[..., None]]
+        columns = [self.pose_shared, info.pose_point.reshape(self.P, self.p, -1), info.pose_right[..., None]]
         rows = root @ np.concatenate(columns, axis=2)
-        flat = rows.reshape(6 * self.P, -1)
+        flat = rows.reshape(self.p * self.P, -1)
         dim = s + 3 * self.n
         M = np.zeros((dim + 1, dim + 1))
         M[:s, :s] = self.shared
@@ -138,26 +140,27 @@ class System:
         if self.prior.stated is None:
             return None
         own = np.linalg.inv(self.info.pose)
-        gain = own @ np.concatenate([self.pose_shared, self.info.pose_point.reshape(self.P, 6, -1)], axis=2)
+        by_point = self.info.pose_point.reshape(self.P, self.p, -1)
+        gain = own @ np.concatenate([self.pose_shared, by_point], axis=2)
         return np.asarray(own + gain @ inverse @ np.swapaxes(gain, 1, 2))
 
     def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
         """The bordered matrix of cameras, smooth parts and poses; roots and rows of the points."""
-        info, s, f, n, P = self.info, self.s, self.f, self.n, self.P
+        info, s, f, n, P, p = self.info, self.s, self.f, self.n, self.P, self.p
         root = np.linalg.inv(np.linalg.cholesky(info.point + single[:, :, None] * np.eye(3)))  # (n, 3, 3)
-        poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, 6 * P, 3).swapaxes(1, 2)
+        poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, p * P, 3).swapaxes(1, 2)
         rows = root @ np.concatenate([self.point_shared, poses, info.point_right[..., None]], axis=2)
         flat = rows.reshape(3 * n, -1)
-        dim = s + 6 * P
+        dim = s + p * P
         M = np.zeros((dim + 1, dim + 1))
         M[:s, :s] = self.shared
         at = np.arange(f, s)
         M[at, at] += smooth
-        M[:s, s:dim] = self.pose_shared.reshape(6 * P, s).T
+        M[:s, s:dim] = self.pose_shared.reshape(p * P, s).T
         M[s:dim, :s] = M[:s, s:dim].T
-        at = s + 6 * np.arange(P)
-        for i in range(6):
-            for j in range(6):
+        at = s + p * np.arange(P)
+        for i in range(p):
+            for j in range(p):
                 M[at + i, at + j] = info.pose[:, i, j]
         M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.pose_right.reshape(-1), info.cost
         M[-1, :dim] = M[:dim, -1]
@@ -165,8 +168,8 @@ class System:
         return M, root, rows
 
     def _points_first(self, smooth: Array, single: Array) -> Solved:
-        s, f, n, P = self.s, self.f, self.n, self.P
-        dim = s + 6 * P
+        s, f, n, P, p = self.s, self.f, self.n, self.P, self.p
+        dim = s + p * P
         M, root, rows = self._without_points(smooth, single)
         inverse, logdet = _inverse(M[:dim, :dim])
         x = inverse @ M[:dim, -1]
@@ -188,7 +191,7 @@ class System:
             return Rest(
                 self._with_offsets(inverse[:f, f:s], cross[:f]),
                 self._variance(inverse[f:s, f:s], cross[f:s], var_single, along_gauge.reshape(n, 3, -1)),
-                inverse[s:, s:].reshape(P, 6, P, 6)[np.arange(P), :, np.arange(P)],
+                inverse[s:, s:].reshape(P, p, P, p)[np.arange(P), :6, np.arange(P), :6],
             )
 
         return Solved(

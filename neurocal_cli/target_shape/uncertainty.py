@@ -9,22 +9,26 @@ of which sums over views have the information that is left.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.bends import N_SHAPES, surface_of
 from neurocal_cli.bundle_adjustment.point_batches import products
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, camera_columns, derivatives
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.schur_complement import eliminate
+from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
 
 if TYPE_CHECKING:
-    from neurocal_cli.target_shape.information import Sight
+    from neurocal_cli.target_shape.information import Information, Sight
+    from neurocal_cli.target_shape.posterior import Posterior
     from neurocal_cli.target_shape.prior import Prior
 
 __all__ = ["CovarianceBasis", "covariance_basis"]
@@ -68,7 +72,7 @@ def covariance_basis(
     state: CameraState,
     free: NDArray[np.bool_],
     free_poses: bool,
-    world: Array,
+    points: Correspondences,
     normal: Array,
     shared: Array | None = None,
 ) -> CovarianceBasis:
@@ -80,8 +84,8 @@ def covariance_basis(
         The one that was found, if so.
     views, state, free, free_poses
         As for `adjust`, at the minimum.
-    world : (N, 3) array [world unit]
-        Where the points are, in their own order.
+    points : Correspondences
+        Where the target has them.
     normal : (V, 12 + K, 12 + K) array
         From `reprojection.normal_blocks`.
     shared : (f, f) array, optional
@@ -94,8 +98,8 @@ def covariance_basis(
     """
     if target is None:
         return CovarianceBasis(normal, shared, views.n_equations)
-    ordered = world if views.order is None else world[views.order]
-    known = _target_uncertainty(target, views, state, free, free_poses, ordered)
+    cost = float(normal[:, -1, -1].sum()) * views.pixel_scale**2
+    known = _target_uncertainty(target, views, state, free, free_poses, points, cost)
     return CovarianceBasis(
         known.normal, known.entries, views.n_equations - known.determined, known.moves_without, known.poses
     )
@@ -124,7 +128,7 @@ class _TargetUncertainty:
     _sight: Sight
     _offsets: Array
     _prior: Prior
-    _sizes: Mapping[str, float]
+    _target: Target
     _variance: float
 
     def moves_without(self, group: NDArray[np.intp]) -> Array | None:
@@ -148,63 +152,95 @@ class _TargetUncertainty:
 
     def _step(self, kept: NDArray[np.intp]) -> Array:
         from neurocal_cli.target_shape.information import information_of
-        from neurocal_cli.target_shape.posterior import known_sizes
 
-        sight = self._sight
-        state = replace(sight.state, R=sight.state.R[kept], t=sight.state.t[kept])
-        label = sight.label[np.isin(sight.views.index, kept)]
-        some = replace(sight, views=sight.views.subset(kept), state=state, label=label)
+        some = self._sight.of_views(kept)
         info = information_of([some], len(self._offsets)).turned(self._prior.axes)
-        return known_sizes(
-            info.around_given(self._offsets), self._prior, self._sizes, self._variance
+        return _solved(
+            info.around_given(self._offsets), self._prior, self._target, self._variance
         ).camera_step
 
 
+def _solved(info: Information, prior: Prior, target: Target, variance: float) -> Posterior:
+    """Cameras and target, for a target whose parts have known sizes."""
+    from neurocal_cli.target_shape.posterior import given_posterior, known_sizes
+
+    if target.bends is not None:
+        info = info.held(variance / target.bends.size**2)
+    if target.only_bends:
+        return given_posterior(info, prior)
+    return known_sizes(info, prior, target.sizes, variance)
+
+
 def _target_uncertainty(
-    target: Target, views: Views, state: CameraState, free: NDArray[np.bool_], free_poses: bool, world: Array
+    target: Target,
+    views: Views,
+    state: CameraState,
+    free: NDArray[np.bool_],
+    free_poses: bool,
+    points: Correspondences,
+    cost: float,
 ) -> _TargetUncertainty:
-    """Of one camera; world (N, 3) in the order of `views`."""
+    """Of one camera with this squared error [px^2]."""
     from neurocal_cli.target_shape.information import Sight, information_of, labelled
-    from neurocal_cli.target_shape.posterior import known_sizes
     from neurocal_cli.target_shape.prior import prior_of_target
     from neurocal_cli.target_shape.surveyed import noise_variance
 
-    label = target.rows_of(world)
+    label = target.rows_of(target.straightened(points).world)
+    label = label if views.order is None else label[views.order]
     prior = prior_of_target(target)
     sight = Sight(views, state, free, free_poses, label)
+    bent, bends = 0.0, np.zeros((views.n_views, N_SHAPES))  # unknowns that the data determine
+    if target.bends is not None:
+        bends = target.bends.of_views(views.names)
+        sight = replace(sight, shapes=surface_of(target.given).offsets(target.found), bends=bends)
+        bent = target.bends.determined(bends)
     info = information_of([sight], len(target.given)).turned(prior.axes)
     offsets = prior.along_axes(target.offsets)
-    spare = info.equations - len(info.camera) - 6 * len(info.pose)
-    variance = info.cost / spare
+    variance = cost / (info.spare - bent)
     info = info.around_given(offsets)
     if prior.stated is not None:
         variance = noise_variance(info, prior, target.sizes["stated"])
-    found = known_sizes(info, prior, target.sizes, variance)
+    found = _solved(info, prior, target, variance)
     followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
     followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # points of no target: -1
-    normal = _efficient(views, state, np.flatnonzero(free), labelled(views, label), followed)
+    normal = _efficient(sight, labelled(views, label), followed)
+    if target.bends is not None:
+        normal = _without_bends(normal, bends, variance / (target.bends.size * views.pixel_scale) ** 2)
     return _TargetUncertainty(
-        found.variance * found.camera, normal, found.determined,
+        found.variance * found.camera, normal, found.determined + bent,
         found.variance * found.poses if free_poses and found.poses is not None else None,
-        sight, offsets, prior, target.sizes, variance,
+        sight, offsets, prior, target, variance,
     )  # fmt: skip
 
 
-def _efficient(
-    views: Views, state: CameraState, free: NDArray[np.intp], label: NDArray[np.intp], followed: Array
-) -> Array:
-    from neurocal_cli.target_shape.information import by_world
+def _efficient(sight: Sight, label: NDArray[np.intp], followed: Array) -> Array:
+    """(V, 12 + K, 12 + K), or with three columns of bends before the residual."""
+    from neurocal_cli.target_shape.information import by_world, with_bends
 
+    views, state, shapes = sight.views, sight.state, sight.shapes
     batches, width = views.batches, 12 + len(state.k)
-    columns = camera_columns(len(state.k))[free]
-    by_batch = np.empty((len(batches.view), width, width))
+    whole = width if shapes is None else width + N_SHAPES
+    columns = camera_columns(len(state.k))[np.flatnonzero(sight.free)]
+    by_batch = np.empty((len(batches.view), whole, whole))
     buffer = batches.memory(width)
     for chunk in batches.chunks():
         view = batches.view[chunk]
         part = buffer[: len(view)]
         derivatives(batches, chunk, state, part[:, :-1])
         by_point = by_world(part, state, views.scale, view)
-        J = part.copy()
+        J = part.copy() if shapes is None else with_bends(part, by_point, shapes[label[chunk]])
         J[:, columns] -= np.einsum("ftni,ticn->tfcn", followed[:, label[chunk]], by_point)
         products(J, by_batch[chunk])
     return batches.sum_by_view(by_batch)
+
+
+def _without_bends(normal: Array, bends: Array, precision: float) -> Array:
+    """With the bends (V, 3) integrated out; the squared error stays what it is with them."""
+    width = normal.shape[1]
+    own = np.arange(width - 1 - N_SHAPES, width - 1)
+    normal = normal.copy()
+    normal[:, own, own] += precision
+    normal[:, own, -1] -= precision * bends
+    left, _ = eliminate(normal, np.delete(np.arange(width), own), own)
+    left[:, -1, -1] = normal[:, -1, -1]
+    return np.asarray(left)

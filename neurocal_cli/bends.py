@@ -1,0 +1,109 @@
+"""A flat board that bends anew in each view: out of its plane, by a quadratic surface of each view's own.
+
+A thin sheet bends into cylinders. A shallow one with its axis at the angle phi has the height
+
+    a (x cos phi + y sin phi)^2 = a/2 (x^2 + y^2) + a/2 cos 2 phi (x^2 - y^2) + a/2 sin 2 phi (2 x y),
+
+so that over all angles the three shapes on the right have variances of 2 : 1 : 1. Less the plane that is
+nearest to each, because a pose makes up for planes, these are the shapes of a view's bend.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.frozen_dataclass import frozen_dataclass
+from neurocal_cli.geometry import Array
+
+__all__ = ["N_SHAPES", "Bends", "Surface", "surface_of"]
+
+N_SHAPES = 3
+
+
+@frozen_dataclass(eq=False)
+class Bends:
+    """How the board is bent in each view.
+
+    Attributes
+    ----------
+    size : float [world unit]
+        Prior standard deviation of each coefficient: the rms height of boards that are as this one.
+    names : tuple of str
+        Views.
+    coefficients : (V, 3) array [world unit]
+        Of the three shapes, in each view.
+    """
+
+    size: float
+    names: tuple[str, ...]
+    coefficients: Array
+
+    def of_views(self, names: tuple[str, ...]) -> Array:
+        """(V, 3) coefficients of some views; 0 where a view is not known."""
+        known = dict(zip(self.names, self.coefficients, strict=True))
+        return np.array([known.get(name, np.zeros(N_SHAPES)) for name in names]).reshape(-1, N_SHAPES)
+
+    def determined(self, coefficients: Array) -> float:
+        """How many of the coefficients (V, 3) the data determine, where the size is the most probable one.
+
+        MacKay's step stays there: of n coefficients w, gamma = |w|^2 / size^2.
+        """
+        return float(min((coefficients**2).sum() / self.size**2, coefficients.size))
+
+
+@frozen_dataclass(eq=False)
+class Surface:
+    """The three shapes over the plane of a board.
+
+    Attributes
+    ----------
+    centre : (3,) array [world unit]
+    axes : (3, 3) array
+        Columns: two in the plane, and the normal.
+    half : float [world unit]
+        Half of the board's longer side.
+    times : (3,) array
+        Of x^2 + y^2, x^2 - y^2 and 2 x y, so that coefficients of variance 1 make heights of mean square 1.
+    planes : (3, 3) array
+        What is taken from each shape: columns of 1, x and y.
+    """
+
+    centre: Array
+    axes: Array
+    half: float
+    times: Array
+    planes: Array
+
+    def offsets(self, world: Array) -> Array:
+        """(N, 3, 3) offsets of points (N, 3), in the world's axes, for a coefficient of 1 of each shape."""
+        places = (world - self.centre) @ self.axes[:, :2] / self.half
+        heights = _shapes(places) * self.times - _linear(places) @ self.planes
+        return np.asarray(self.axes[:, 2, None] * heights[:, None])
+
+
+def surface_of(given: Array) -> Surface:
+    """Shapes for a flat board with these points (n, 3)."""
+    centre = given.mean(axis=0)
+    normal = np.linalg.svd(given - centre, full_matrices=False)[2][2]
+    normal = normal * np.sign(normal[np.argmax(np.abs(normal))])
+    x = np.eye(3)[np.argmin(np.abs(normal))]  # not the principal axes: a square board has none
+    x = x - (x @ normal) * normal
+    x /= np.linalg.norm(x)
+    axes = np.column_stack([x, np.cross(normal, x), normal])
+    places = (given - centre) @ axes[:, :2]
+    half = 0.5 * float(np.ptp(places, axis=0).max())
+    places = places / half
+    times = np.sqrt([2.0, 1.0, 1.0])
+    shapes = _shapes(places) * times
+    planes = np.linalg.lstsq(_linear(places), shapes, rcond=None)[0]
+    mean_square = ((shapes - _linear(places) @ planes) ** 2).mean(axis=0).sum()
+    return Surface(centre, axes, half, times / np.sqrt(mean_square), planes / np.sqrt(mean_square))
+
+
+def _shapes(places: Array) -> Array:
+    x, y = places.T
+    return np.column_stack([x * x + y * y, x * x - y * y, 2 * x * y])
+
+
+def _linear(places: Array) -> Array:
+    return np.column_stack([np.ones(len(places)), places])

@@ -1,0 +1,62 @@
+"""How much a board bends anew in each view, and how it is bent in each, where its common points are held.
+
+The bends of a view are unknowns beside its pose (`information`), Gaussian a priori with one size for all
+views. The evidence of the pixels with cameras, poses and bends integrated out tells that size.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from neurocal_cli.geometry import Array
+from neurocal_cli.target_shape.information import Information
+from neurocal_cli.target_shape.posterior import evidence_of_given
+
+__all__ = ["bends_of", "most_probable_precision"]
+
+_LEAST, _MOST = 1e-6, 1.0  # of the target's size, as if all errors were noise
+_GRID, _FINER = 12, (0.6, 0.3, 0.1)  # places, and the widths of the parabolas that follow; of logarithms
+
+
+def most_probable_precision(info: Information, size: float, roughly: bool = False) -> float:
+    """Precision of the bends, in units of the noise's, that makes the pixels most probable.
+
+    Parameters
+    ----------
+    info : Information
+        Around the points that all views share.
+    size : float
+        Of the target [world unit].
+    roughly : bool
+        Whether a factor of 3 either way is near enough.
+    """
+    noise = info.straight().cost / info.spare
+
+    def evidence(log_size: float) -> float:
+        return evidence_of_given(info.held(noise * np.exp(-2 * log_size)))
+
+    grid = np.linspace(np.log(_LEAST * size), np.log(_MOST * size), _GRID)
+    values = [evidence(x) for x in grid]
+    best = int(np.argmax(values))
+    x, highest = float(grid[best]), values[best]
+    for width in () if roughly else _FINER:
+        low, high = evidence(x - width), evidence(x + width)
+        curved = low - 2 * highest + high
+        step = 0.5 * (low - high) / curved * width if curved < 0 else np.sign(high - low) * width
+        x += float(np.clip(step, -width, width))
+        highest = evidence(x)
+    return float(noise * np.exp(-2 * x))
+
+
+def bends_of(info: Information, camera_step: Array, offsets: Array) -> Array:
+    """(P, 3) the most probable bends [world unit], for the cameras' steps (f,) and the offsets (n, 3).
+
+    Parameters
+    ----------
+    info : Information
+        With its prior; see `Information.held`.
+    """
+    right = (
+        info.pose_right - info.pose_camera @ camera_step - np.einsum("pqni,ni->pq", info.pose_point, offsets)
+    )
+    return np.asarray(np.linalg.solve(info.pose, right[..., None])[:, 6:, 0])

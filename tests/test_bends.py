@@ -1,0 +1,143 @@
+"""A board that bends anew in each view: found with the camera, and kept in files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.simulated_targets import draw, outcome
+from support.targets import board
+
+from neurocal_cli import calibrate
+from neurocal_cli.bends import Bends, surface_of
+from neurocal_cli.bundle_adjustment.covariance import covariance
+from neurocal_cli.calibration import Calibration
+from neurocal_cli.errors import FormatError
+from neurocal_cli.evaluation import evaluate_camera
+from neurocal_cli.geometry import rotation_step
+from neurocal_cli.io.calibration_yaml import format_calibration, read_calibration, write_calibration
+from neurocal_cli.pipeline.common_target import _fit as fit_of
+from neurocal_cli.pipeline.common_target import on_one_target
+from neurocal_cli.report import calibration_report
+from neurocal_cli.target_shape.uncertainty import covariance_basis
+
+FLEXING = draw("flexing", 29)  # eight views
+
+
+@cache
+def found() -> Calibration:
+    return calibrate(FLEXING.points, distortion=FLEXING.truth.model)
+
+
+def bends(calibration: Calibration) -> Bends:
+    assert calibration.target is not None
+    assert calibration.target.bends is not None
+    return calibration.target.bends
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_shapes_are_bends_alone_with_heights_of_mean_square_1(turned: bool) -> None:
+    given = board() @ rotation_step(np.array([[0.4, -0.7, 0.2]]))[0].T if turned else board()
+    offsets = surface_of(given).offsets(given)
+    centred = given - given.mean(axis=0)
+    assert (offsets**2).sum(axis=1).mean(axis=0).sum() == pytest.approx(1)
+    assert np.abs(np.einsum("ni,nik->k", centred, offsets)).max() < 1e-9  # out of the plane
+    for height in np.linalg.norm(offsets, axis=1).T * np.sign(offsets.sum(axis=1)).T:
+        assert np.abs(np.column_stack([np.ones(63), centred]).T @ height).max() < 1e-9  # no plane
+
+
+def test_the_camera_is_as_well_known_as_to_who_knows_the_prior() -> None:
+    one = outcome(FLEXING)
+    np.testing.assert_allclose(one.error, one.best, atol=0.5 * one.bound.max())
+    np.testing.assert_allclose(one.std, one.bound, rtol=0.2)
+    given = calibrate(FLEXING.points, distortion=FLEXING.truth.model, target="given")
+    assert one.found.rmse_px < 0.7 * given.rmse_px
+    assert one.found.n_rejected == 0
+
+
+def test_each_view_is_bent_as_it_was() -> None:
+    target = found().target
+    assert target is not None
+    seen = target.seen(FLEXING.points).world.reshape(8, 63, 3)[..., 2]
+    true, x = FLEXING.truth.bent[..., 2], np.column_stack([np.ones(63), board()[:, :2]])
+    true = true - (x @ np.linalg.lstsq(x, true.T, rcond=None)[0]).T
+    assert np.sqrt(((seen - true) ** 2).mean()) < 0.2 * np.sqrt((true**2).mean())
+    assert target.bend_of_views() == pytest.approx(np.sqrt((true**2).mean()), rel=0.05)
+
+
+def test_bends_are_integrated_out_of_what_each_view_tells() -> None:
+    target, (problem, adjusted) = found().target, fit_of(found())
+    asked = problem.free_camera, problem.free_poses
+    basis = covariance_basis(target, problem.views, adjusted.state, *asked, problem.points, adjusted.normal)
+    assert basis.shared is not None
+    views = covariance(basis.normal, *asked, basis.n_equations).entries
+    np.testing.assert_allclose(np.diagonal(views), np.diagonal(basis.shared), rtol=0.02)
+    fixed = covariance(adjusted.normal, *asked, basis.n_equations).entries
+    assert (np.diagonal(fixed) < np.diagonal(basis.shared)).all()
+
+
+def test_points_are_taken_back_to_where_they_were_given() -> None:
+    target = found().target
+    assert target is not None
+    seen = target.seen(FLEXING.points)
+    assert (seen.world == found().points.world).all()
+    assert (target.as_given(seen).world == FLEXING.points.world).all()
+    assert (target.applied(FLEXING.points).world == FLEXING.points.world).all()
+
+
+@pytest.mark.parametrize("long", [False, True])
+def test_files_keep_the_bends_and_reproduce_the_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, long: bool
+) -> None:
+    kept = found()
+    if long:  # tables as texts
+        monkeypatch.setattr("neurocal_cli.io.calibration_yaml._MOST_VIEWS", 4)
+    write_calibration(kept, tmp_path / "c.yaml")
+    again = read_calibration(tmp_path / "c.yaml")
+    assert (bends(again).coefficients == bends(kept).coefficients).all()
+    assert (bends(again).size, bends(again).names) == (bends(kept).size, bends(kept).names)
+    assert format_calibration(again) == format_calibration(kept)
+    assert evaluate_camera(again).rmse_px == pytest.approx(kept.rmse_px, rel=1e-12)
+    assert evaluate_camera(again, FLEXING.points).rmse_px > 1.5 * kept.rmse_px
+    assert "bends anew in each view, by 0.2" in calibration_report(again)
+
+
+def test_damaged_bends_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "c.yaml").write_text(format_calibration(found()).replace("saddle", "horse"), "utf-8")
+    with pytest.raises(FormatError, match="a table with view, bowl, saddle, twist"):
+        read_calibration(tmp_path / "c.yaml")
+
+
+def test_other_cameras_take_the_board_without_its_bends() -> None:
+    again = calibrate(FLEXING.points, distortion=FLEXING.truth.model, target=found().target)
+    assert again.target is not None
+    assert again.target.bends is None
+    left, right = on_one_target(found(), replace(found(), camera_name="other"))
+    assert left.target is right.target
+    assert left.target is not None
+    assert left.target.bends is None
+    assert (left.points.world == FLEXING.points.world).all()
+
+
+@pytest.mark.parametrize("kind", ["flat", "parabola"])
+def test_other_boards_do_not_bend_anew(kind: str) -> None:
+    one = draw(kind, 1)
+    target = calibrate(one.points, distortion=one.truth.model).target
+    assert target is None or target.bends is None
+
+
+def test_one_odd_view_is_no_board_that_bends() -> None:
+    one = draw("flat", 10)
+    pixels = one.points.pixels.copy()
+    height = np.linspace(-1, 1, 9)[None].repeat(7, axis=0).ravel() ** 2
+    pixels[:63, 1] += 4.0 * height
+    target = calibrate(replace(one.points, pixels=pixels), distortion="k1").target
+    assert target is None or target.bends is None
+
+
+def test_a_board_that_stays_flat_does_not_bend() -> None:
+    target = calibrate(FLEXING.points, distortion=FLEXING.truth.model, target="flat").target
+    assert target is None or target.bends is None
