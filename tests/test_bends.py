@@ -6,15 +6,19 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+from support.real_data import RealFiles
 from support.simulated_targets import draw, outcome
 from support.targets import board
 
 from neurocal_cli import calibrate
 from neurocal_cli.bends import Bends, surface_of
+from neurocal_cli.board import Board
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.calibration import Calibration
+from neurocal_cli.detection.detect import detect_points, gather
 from neurocal_cli.errors import FormatError
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.geometry import rotation_step
@@ -141,3 +145,20 @@ def test_one_odd_view_is_no_board_that_bends() -> None:
 def test_a_board_that_stays_flat_does_not_bend() -> None:
     target = calibrate(FLEXING.points, distortion=FLEXING.truth.model, target="flat").target
     assert target is None or target.bends is None
+
+
+@pytest.mark.slow
+def test_standard_deviations_of_photographs_count_what_bends_take_in(real_files: RealFiles) -> None:
+    """The bends of a half of the views hide that these contradict each other; leaving views out shows it."""
+    images = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in real_files("opencv_stereo/right??.jpg")]
+    sheet = Board.single(9, 6, 25.0)
+    points = gather({f"{k:02d}": detect_points(image, sheet, "vertices") for k, image in enumerate(images)})
+    halves = [calibrate(points.select(points.view_index % 2 == part)) for part in (0, 1)]
+    assert all(half.target is not None and half.target.bends is not None for half in halves)
+    names = ("alpha_u", "alpha_v", "u0", "v0")
+    value, std = (
+        np.array([[getattr(half.intrinsics, n) for n in names] for half in halves]),
+        np.array([[half.std[n] for n in names] for half in halves]),
+    )
+    apart = (value[0] - value[1]) / np.hypot(*std)
+    assert np.sqrt(np.mean(apart**2)) < 1.2

@@ -9,7 +9,8 @@ step, d_v = -(S - S_v)^-1 g_v with the poses eliminated, and
 
 With few views it is a rough measure. Taken always, it would make the std of clean data a third too large at
 five views, and a quarter at ten. So it is taken only where views contradict each other more than chance
-allows, and nowhere below the normal matrix's. Views that repeat a pose (`repeated_poses`) are one view here.
+allows, and nowhere below the normal matrix's; and on boards that bend anew in each view, which hides that,
+where it is far larger. Views that repeat a pose (`repeated_poses`) are one view here.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ __all__ = ["counting_views", "scores_of_poses"]
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty
 _TOLD = 1e-10  # least eigenvalue of a normal matrix with a unit diagonal that rounding leaves alone
+# Variance by the jackknife over that of the normal matrix, from which on it is believed where boards bend
+# anew in each view: at most 11.5 in 63 sets of tests/test_simulated_targets.py, and 21 to 73 in photographs.
+_GROWN = 15.0
 _FEWEST = 3  # poses, of which one can be left out and two still differ
 
 
@@ -47,6 +51,7 @@ def counting_views(
     n_residuals: float,
     repeated: RepeatedPoses,
     moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None,
+    bends: bool = False,
 ) -> Covariance:
     """Covariances as far as views, not residuals, are independent.
 
@@ -60,6 +65,9 @@ def counting_views(
     moves_without : callable, optional
         How far the free parameters move without the views of each pose, given each view's pose, where the
         normal matrices do not tell.
+    bends : bool
+        Whether each view has bends of its own. They take in what else makes views contradict each other, and
+        only the jackknife shows that.
 
     Returns
     -------
@@ -78,11 +86,14 @@ def counting_views(
     entries = before = found.entries if told is None else told.back @ found.entries @ told.back.T
     if not repeated.none:
         entries = _of_copies(q, repeated.variance, variance)
-    if len(q.cost) >= _FEWEST and _contradict(q, repeated.variance, variance):
+    contradict = len(q.cost) >= _FEWEST and _contradict(q, repeated.variance, variance)
+    if contradict or (bends and len(q.cost) >= _FEWEST):
         moves = None if moves_without is None else moves_without(repeated.group)
         if moves is not None and told is not None:
             moves = moves @ told.back.T
-        entries = _at_least(_jackknife(q.moves_without_each() if moves is None else moves), entries)
+        jackknife = _jackknife(q.moves_without_each() if moves is None else moves)
+        if contradict or _grown(jackknife, entries) > _GROWN:
+            entries = _at_least(jackknife, entries)
     if entries is before or not np.isfinite(entries).all():
         return found
     if told is not None:
@@ -171,6 +182,12 @@ def _jackknife(moves: Array) -> Array:
     """(f, f) from the moves (P, f) without each pose; nan where views cannot be left out."""
     moves = moves - moves.mean(axis=0)
     return np.asarray((len(moves) - 1) / len(moves) * moves.T @ moves)
+
+
+def _grown(jackknife: Array, entries: Array) -> float:
+    """Mean of the variances by the jackknife over the other ones, in all directions; 0 where unknown."""
+    grown = float(np.trace(solve_or_nan(entries, jackknife))) / len(entries)
+    return grown if np.isfinite(grown) else 0.0
 
 
 def _at_least(jackknife: Array, entries: Array) -> Array:

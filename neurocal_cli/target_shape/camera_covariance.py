@@ -136,7 +136,10 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
         plain = replace(plain, poses=basis.poses)
     if seen.shared is not None:
         return CameraCovariance(basis, plain, plain)
-    found = counting_views(plain, basis.normal, *asked, basis.n_equations, seen.repeated, basis.moves_without)
+    bends = seen.target is not None and seen.target.bends is not None
+    found = counting_views(
+        plain, basis.normal, *asked, basis.n_equations, seen.repeated, basis.moves_without, bends
+    )
     known = CameraCovariance(basis, plain, found)
     kept = seen.target_kept and seen.free_poses and bool(seen.free.any())
     if not np.isfinite(found.entries).all() or not (seen.choice or kept):
