@@ -30,6 +30,7 @@ __all__ = [
     "nearest_rotation",
     "nearest_similarity",
     "orthonormalised",
+    "plane_axes",
     "rotation_step",
     "rotation_to_axis",
     "rotation_to_euler",
@@ -220,6 +221,18 @@ def distinct_rows(table: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.int
     label = np.empty(len(table), dtype=np.intp)
     label[order] = np.cumsum(new) - 1
     return order[new], label
+
+
+def plane_axes(normal: Array) -> Array:
+    """Axes (3, 3) of a plane as columns: the world's axis nearest to it, the one beside that, the normal.
+
+    Unlike principal axes, they do not depend on rounding where the plane's points reach as far both ways.
+    """
+    normal = normal * np.sign(normal[np.argmax(np.abs(normal))])
+    x = np.eye(3)[np.argmin(np.abs(normal))]
+    x = x - (x @ normal) * normal
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(normal, x), normal])
 
 
 def similarity(points: Array) -> tuple[Array, float]:

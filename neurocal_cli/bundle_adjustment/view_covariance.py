@@ -66,8 +66,8 @@ def counting_views(
         How far the free parameters move without the views of each pose, given each view's pose, where the
         normal matrices do not tell.
     bends : bool
-        Whether each view has bends of its own. They take in what else makes views contradict each other, and
-        only the jackknife shows that.
+        Whether each view has bends of its own. Other causes for which views contradict each other end in
+        these bends, too, and only the jackknife shows that.
 
     Returns
     -------
@@ -86,8 +86,9 @@ def counting_views(
     entries = before = found.entries if told is None else told.back @ found.entries @ told.back.T
     if not repeated.none:
         entries = _of_copies(q, repeated.variance, variance)
-    contradict = len(q.cost) >= _FEWEST and _contradict(q, repeated.variance, variance)
-    if contradict or (bends and len(q.cost) >= _FEWEST):
+    enough = len(q.cost) >= _FEWEST
+    contradict = enough and _contradict(q, repeated.variance, variance)
+    if contradict or (bends and enough):
         moves = None if moves_without is None else moves_without(repeated.group)
         if moves is not None and told is not None:
             moves = moves @ told.back.T

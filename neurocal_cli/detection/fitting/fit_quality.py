@@ -38,7 +38,9 @@ def is_typical(fit: BatchFit) -> NDArray[np.bool_]:
     return (contrast > _LEAST_CONTRAST**2) & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
 
 
-def is_reliable(fit: BatchFit, departure: Array, beyond: Array) -> NDArray[np.bool_]:
+def is_reliable(
+    fit: BatchFit, departure: Array, beyond: Array, known: Array | None = None
+) -> NDArray[np.bool_]:
     """(E,) mask of fits that agree with their pixels, the rest of the board, and the map.
 
     Parameters
@@ -48,6 +50,9 @@ def is_reliable(fit: BatchFit, departure: Array, beyond: Array) -> NDArray[np.bo
         Distance from the map, in standard deviations.
     beyond : (E,) array
         Share of the pixels that lie outside the image.
+    known : array, optional
+        chi2 of each pixel in fits that are known to be reliable; without it, the fits are compared with
+        each other.
     """
     contrast = fit.values[:, CONTRAST] / fit.prior.mean[:, CONTRAST]
     blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]
@@ -63,8 +68,9 @@ def is_reliable(fit: BatchFit, departure: Array, beyond: Array) -> NDArray[np.bo
     good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
     good &= np.abs(departure) < _LIMIT
     rough = fit.chi2 / np.maximum(fit.count, 1)
-    usual = upper_median(rough[good]) if good.any() else 1.0
-    scatter = MAD_TO_SIGMA * upper_median(np.abs(rough[good] - usual)) if good.any() else 0.0
+    among = rough[good] if known is None else known
+    usual = upper_median(among) if len(among) else 1.0
+    scatter = MAD_TO_SIGMA * upper_median(np.abs(among - usual)) if len(among) else 0.0
     chance = usual * np.sqrt(2 / np.maximum(fit.count, 1))
     good &= rough - usual < _LIMIT * np.maximum(scatter, chance) + _ROUGH * usual
     return good & (good.mean() > _LEAST_SHARE) if len(good) else good

@@ -357,10 +357,10 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     start = np.concatenate([np.full((n, 1), shift), np.zeros((n, 1)), prior.mean], axis=1)
     data = with_weight(data, fitted.noise.weights(light_at(data, start)))
     fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, _STEPS)
-    fit = fit.scaled(max(upper_median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
     variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
     departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
-    good = is_reliable(fit, departure, data.beyond)
+    # A rim that is bad all around would agree with itself.
+    good = is_reliable(fit, departure, data.beyond, known=(fitted.fit.chi2 / fitted.fit.count)[fitted.good])
     return edges, replace(fitted, lines=lines, fit=fit, data=data, shape=shape, good=good)
 
 
