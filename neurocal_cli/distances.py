@@ -14,7 +14,7 @@ from neurocal_cli.geometry import Array
 __all__ = ["NO_SCALE", "Distance", "Scale", "fitted_scale", "grid_place"]
 
 _NUMBER = r"-?(?:[0-9]+\.?[0-9]*|\.[0-9]+)"
-_LABEL = re.compile(rf"(?:(?P<plane>.*)/)?(?P<c>{_NUMBER}):(?P<r>{_NUMBER})")
+_LABEL = rf"(?:(?P<plane>.*)/)?(?P<c>{_NUMBER}):(?P<r>{_NUMBER})"
 _ANOTHER_UNIT = 0.1  # a scale further from 1 is no print of the stated board
 
 
@@ -85,7 +85,7 @@ def grid_place(label: str) -> tuple[str, float, float]:
     InputError
         No such id.
     """
-    match = _LABEL.fullmatch(label) if isinstance(label, str) else None
+    match = re.fullmatch(_LABEL, label) if isinstance(label, str) else None
     if match is None:
         raise InputError(f"{label!r} is no place on a board; write a vertex as column:row, such as 0:0")
     return match["plane"] or "", float(match["c"]), float(match["r"])

@@ -40,6 +40,7 @@ def frozen_dataclass(cls: Any = None, /, *, eq: bool = True) -> Any:
 
 
 def _frozen(cls: type, eq: bool) -> type:
+    cls.__doc__ = cls.__doc__ or cls.__name__  # else `dataclass` looks for the signature
     dataclass(repr=False, eq=False)(cls)
     shared: dict[str, Any] = {"__repr__": _repr, "__setattr__": _setattr, "__delattr__": _delattr}
     if eq:

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.bends import Bends, surface_of
-from neurocal_cli.board import Board, Plane, smooth_between
 from neurocal_cli.distances import NO_SCALE, Distance, Scale, fitted_scale, grid_place
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.points import Correspondences
+
+if TYPE_CHECKING:
+    from neurocal_cli.bends import Bends
+    from neurocal_cli.board import Board, Plane
 
 __all__ = [
     "TARGETS",
@@ -121,14 +124,19 @@ class Target:
         if self.bends is None:
             return np.zeros_like(points.world)
         by_view = self.bends.of_views(points.view_names)[points.view_index]
-        offsets = surface_of(self.given).offsets(points.world)
-        return np.asarray((offsets @ by_view[..., None])[..., 0])
+        return np.asarray((self._shapes(points.world) @ by_view[..., None])[..., 0])
+
+    def _shapes(self, world: Array) -> Array:
+        """(N, 3, 3) offsets of points for a coefficient of 1 of each shape of a bend."""
+        from neurocal_cli.bends import surface_of
+
+        return surface_of(self.given).offsets(world)
 
     def bend_of_views(self) -> float:
         """Rms height over points and views by which the board is bent anew [world unit]; 0: not at all."""
         if self.bends is None:
             return 0.0
-        heights = surface_of(self.given).offsets(self.found) @ self.bends.coefficients.T  # (n, 3, V)
+        heights = self._shapes(self.found) @ self.bends.coefficients.T  # (n, 3, V)
         return float(np.sqrt((heights**2).sum(axis=1).mean()))
 
     def joined(self, other: Target) -> Target:
@@ -195,6 +203,8 @@ def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) ->
         raise InputError(
             "the points have no ids, so they are no board's; calibrate from points that detect found"
         )
+    from neurocal_cli.board import Board
+
     planes: dict[str, list[tuple[tuple[float, float], Array, Array]]] = {}
     for label, given, found in zip(target.point.tolist(), target.given, target.found, strict=True):
         name, place = _place(str(label))
@@ -220,6 +230,8 @@ def scale_of_points(world: Array, ids: NDArray[np.str_] | None, distances: tuple
     """The same of the different points (n, 3) of a target with their ids."""
     if not distances or ids is None:
         return NO_SCALE
+    from neurocal_cli.board import smooth_between
+
     names = [_place(str(label)) for label in ids.tolist()]
     planes = np.array([name for name, _ in names])
     grid = np.array([place for _, place in names])
@@ -248,6 +260,8 @@ def _place(label: str) -> tuple[str, tuple[float, float]]:
 
 
 def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> Plane:
+    from neurocal_cli.board import Plane
+
     grid = np.array([place for place, _, _ in rows])
     given, found = np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
     unknowns = np.linalg.lstsq(np.column_stack([np.ones(len(grid)), grid]), given, rcond=None)[0]

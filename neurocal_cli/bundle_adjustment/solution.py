@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
-from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import in_pixels
@@ -17,6 +17,9 @@ from neurocal_cli.calibration import StraightLines
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target
+
+if TYPE_CHECKING:
+    from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 
 __all__ = ["Solution", "TrainingRecord"]
 

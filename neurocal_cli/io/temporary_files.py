@@ -14,7 +14,7 @@ from contextlib import suppress
 
 __all__ = ["remove_stale", "temporary_name"]
 
-_NAME = re.compile(r"\.neurocal-([0-9a-f]{8})-(\d{1,10})-[0-9a-f]{16}\.tmp")
+_NAME = r"\.neurocal-([0-9a-f]{8})-(\d{1,10})-[0-9a-f]{16}\.tmp"
 _seen: set[str] = set()  # folders that this process has cleared
 
 
@@ -32,7 +32,7 @@ def remove_stale(folder: str) -> None:
     with suppress(OSError):
         names = [name for name in os.listdir(folder or ".") if name.startswith(".neurocal-")]
         for name in names:
-            match = _NAME.fullmatch(name)
+            match = re.fullmatch(_NAME, name)
             if match and match[1] == _computer() and not _runs(int(match[2])):
                 with suppress(OSError):
                     os.unlink(os.path.join(folder, name))

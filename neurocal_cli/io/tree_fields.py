@@ -15,7 +15,7 @@ from neurocal_cli.geometry import Array
 __all__ = ["Field"]
 
 # YAML 1.1 takes 1e-05 for text, as it has no point; other programs write it for a number.
-_NUMBER_TEXT = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?").fullmatch
+_NUMBER_TEXT = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
 
 class Field:
@@ -162,7 +162,7 @@ def _as_float(value: Any) -> float:
             return float(value)
         except OverflowError:
             return math.nan
-    if isinstance(value, str) and _NUMBER_TEXT(value):
+    if isinstance(value, str) and re.fullmatch(_NUMBER_TEXT, value):
         return float(value)
     return math.nan
 

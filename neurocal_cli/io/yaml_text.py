@@ -22,9 +22,9 @@ _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*").fullmatch
 _RESERVED = frozenset(("null", "true", "false", "yes", "no", "on", "off", "y", "n"))
 
 # What YAML would fold, refuse or show wrongly; \uXXXX means the same to YAML and JSON.
-_UNSAFE = re.compile("[\x7f-\xa0\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff0-\uffff]")
+_UNSAFE = "[\x7f-\xa0\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ufff0-\uffff]"
 _encode = json.JSONEncoder(ensure_ascii=False).encode
-_SURROGATE = re.compile("[\ud800-\udfff]")
+_SURROGATE = "[\ud800-\udfff]"
 
 
 def number(value: float) -> str:
@@ -72,10 +72,12 @@ def quoted(value: str) -> str:
     InputError
         Half of a surrogate pair: no UTF-8 file can hold it.
     """
-    if _SURROGATE.search(value):
-        raise InputError(f"the name {value[:40]!a} cannot be written as UTF-8; rename it")
     quoted = _encode(value)
-    return quoted if quoted.isascii() and "\x7f" not in quoted else _UNSAFE.sub(_escaped, quoted)
+    if quoted.isascii() and "\x7f" not in quoted:
+        return quoted
+    if re.search(_SURROGATE, value):
+        raise InputError(f"the name {value[:40]!a} cannot be written as UTF-8; rename it")
+    return re.sub(_UNSAFE, _escaped, quoted)
 
 
 def _escaped(match: re.Match[str]) -> str:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 from neurocal_cli.bundle_adjustment.covariance import Covariance
 from neurocal_cli.bundle_adjustment.observability import refuse_undetermined
 from neurocal_cli.bundle_adjustment.outlier_views import seen_from_behind
@@ -24,6 +25,9 @@ from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import scale_of
 from neurocal_cli.target_shape.camera_covariance import CameraCovariance, CameraSeen, camera_covariance
+
+if TYPE_CHECKING:
+    from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 
 __all__ = ["calibration_of"]
 
