@@ -24,9 +24,11 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.cross_validation import FOLDS, held_out_views
+from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
+from neurocal_cli.bundle_adjustment.restart import of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import MODELS, WIDE
@@ -37,9 +39,12 @@ from neurocal_cli.distortion.candidate_models import (
     judged_again,
     worth,
 )
+from neurocal_cli.distortion.multi_start import VIEWS_THAT_TELL
 from neurocal_cli.geometry import Array
 
 __all__ = ["predicts_decidedly_better", "select_model"]
+
+Starts = Callable[[Problem], Iterable[CameraState]]
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models; the true one in 86 to
 # 100 %, never more than two coefficients too many, 1 % of the best error on new views) and
@@ -57,16 +62,14 @@ _CORRELATED = 0.3  # correlation of neighbours' residuals
 _BETTER, _MUCH_BETTER = 0.999, 0.8  # times the squared error
 
 
-def select_model(
-    solution: Solution, more_starts: Callable[[], Iterable[CameraState]] = tuple, preferred: str = ""
-) -> Solution:
+def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
     """Fit all models, from a solution with any of them, and choose.
 
     Parameters
     ----------
     solution : Solution
-    more_starts : callable
-        Other states to begin with, where the first leads to nothing that explains the points.
+    more_starts : callable, optional
+        Other states for a problem to begin with, where the first leads to nothing that explains the points.
     preferred : str
         A model to take where no other predicts decidedly better.
 
@@ -79,11 +82,8 @@ def select_model(
     problem, views = solution.problem, solution.problem.views
     by_views = _views_can_spare_any(solution)
     fitted = fit_candidates(problem, solution.state, by_views)
-    if (limit := _limit(views, fitted)) > 0:
-        for start in more_starts():
-            _join(fitted, fit_candidates(problem, start, by_views), limit)
-            if (limit := _limit(views, fitted)) == 0:
-                break
+    if more_starts is not None:
+        _look_elsewhere(fitted, solution, more_starts, by_views)
     if not fitted:  # not even the pinhole settled: as it is
         return replace(solution, model_errors={})
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
@@ -104,6 +104,36 @@ def select_model(
         would_take=solution.would_take | (good - {name}),
         model_errors={name: float(np.sqrt(c.lost.sum() / n)) * px for name, c in fitted.items()},
         refusal=_refusal(fitted, chosen),
+    )
+
+
+def _look_elsewhere(
+    fitted: dict[str, Candidate], solution: Solution, more_starts: Starts, by_views: bool
+) -> None:
+    """Take over what other starts lead to, as far as that is of interest."""
+    problem, views = solution.problem, solution.problem.views
+    if (limit := _limit(views, fitted)) == 0 or not _may_lead_lower(fitted, limit, solution, more_starts):
+        return
+    for start in more_starts(problem):
+        _join(fitted, fit_candidates(problem, start, by_views), limit)
+        if (limit := _limit(views, fitted)) == 0:
+            return
+
+
+def _may_lead_lower(
+    fitted: dict[str, Candidate], limit: float, solution: Solution, more_starts: Starts
+) -> bool:
+    """Whether another start leads below the limit; of many views, a few tell."""
+    if not np.isfinite(limit) or solution.problem.points.n_views <= VIEWS_THAT_TELL:
+        return True
+    closest = min(fitted.values(), key=lambda c: c.cost)
+    whole = replace(solution, problem=closest.problem, adjusted=closest.adjusted)
+    few = of_few_views(whole, VIEWS_THAT_TELL)
+    limit *= float(few.adjusted.cost.sum()) / closest.cost
+    return any(
+        candidate.cost < limit
+        for start in more_starts(few.problem)
+        for candidate in fit_candidates(few.problem, start, by_views=False).values()
     )
 
 

@@ -4,7 +4,8 @@ The minimum of a strong distortion is found only from a start that is near it. W
 neighbours are correlated, as a wrong distortion leaves them (and a board that is not flat), or where the
 points tell a focal length badly, every model is fitted, each from the one before it, from this start and
 from others; the best fit of the wanted model is the result. Wide lenses are reached through the fisheye, and
-a thin prism or a tilted sensor through the rational model.
+a thin prism or a tilted sensor through the rational model. Of many views, a few tell whether another start
+leads to a lower minimum.
 """
 
 from __future__ import annotations
@@ -15,21 +16,25 @@ from dataclasses import replace
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.observability import is_weak
+from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
+from neurocal_cli.bundle_adjustment.restart import of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import WIDE, WITH_PRISM
 from neurocal_cli.distortion.denominator import DENOMINATOR
 
-__all__ = ["with_more_starts"]
+__all__ = ["VIEWS_THAT_TELL", "with_more_starts"]
 
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
 # showed more.
 _CORRELATED = 0.15  # correlation of neighbours' residuals
+VIEWS_THAT_TELL = 30  # whether there is a lower minimum; 1000 views take as long as these
+_LOWER = 0.999  # times the squared error of these views
 
 
-def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[CameraState]]) -> Solution:
+def with_more_starts(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Solution:
     """The better of a solution and what other starts lead to, where it may be a local minimum.
 
     Parameters
@@ -37,31 +42,48 @@ def with_more_starts(solution: Solution, more_starts: Callable[[], Iterable[Came
     solution : Solution
         Of a problem whose distortion model is to be estimated; without one there is nothing to do.
     more_starts : callable
-        Other states to begin with.
+        Other states for a problem to begin with.
     """
-    problem, best = solution.problem, solution.adjusted
+    problem = solution.problem
     # An xi that is held, and k4 to k6 that are left out, belong to this lens.
-    if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR}:
+    if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR} or not _may_be_local(solution):
         return solution
-    views, wanted = problem.views, problem.distortion.model
-    cov = covariance(best.normal, problem.free_camera, problem.free_poses, views.n_equations)
-    weak = is_weak(problem, best.state, cov)
-    if best.converged and not weak and correlation(views, point_residuals(views, best.state)) < _CORRELATED:
+    few = of_few_views(solution, VIEWS_THAT_TELL)
+    if few is not solution and _cost(_lowest(few, more_starts)) >= _LOWER * _cost(few.adjusted):
         return solution
+    return replace(solution, adjusted=_lowest(solution, more_starts))
 
+
+def _may_be_local(solution: Solution) -> bool:
+    problem, found, views = solution.problem, solution.adjusted, solution.problem.views
+    if not found.converged:
+        return True
+    cov = covariance(found.normal, problem.free_camera, problem.free_poses, views.n_equations)
+    alike = correlation(views, point_residuals(views, found.state))
+    return is_weak(problem, found.state, cov) or not alike < _CORRELATED
+
+
+def _lowest(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Adjusted:
+    """The lowest minimum of the wanted model that any start leads to."""
     # Most are at the lowest minimum, and need none of what follows.
     from neurocal_cli.distortion.candidate_models import fit_candidates
 
+    problem, best = solution.problem, solution.adjusted
+    wanted = problem.distortion.model
     fitted = "fisheye" if wanted in WIDE else "rational" if wanted in WITH_PRISM else wanted
-    for start in (best.state, *more_starts()):
+    for start in (best.state, *more_starts(problem)):
         found = fit_candidates(problem, start, by_views=False, wanted=fitted).get(fitted)
-        if found is None or (fitted == wanted and not found.adjusted.cost.sum() < best.cost.sum()):
+        if found is None or (fitted == wanted and not found.cost < _cost(best)):
             continue
-        for near in _as(wanted, found.adjusted, views):
+        for near in _as(wanted, found.adjusted, problem.views):
             adjusted = problem.adjust(near)
-            if adjusted.cost.sum() < best.cost.sum():
+            if _cost(adjusted) < _cost(best):
                 best = adjusted
-    return replace(solution, adjusted=best)
+    return best
+
+
+def _cost(adjusted: Adjusted) -> float:
+    return float(adjusted.cost.sum())
 
 
 def _as(wanted: str, found: Adjusted, views: Views) -> list[Adjusted]:

@@ -11,9 +11,9 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
+from neurocal_cli.bundle_adjustment.restart import restarted
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.camera.distortion import WIDE, WITH_PRISM
 from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_told
 from neurocal_cli.distortion.given_distortion import check_distortion
@@ -51,7 +51,7 @@ def fit(problem: Problem, options: Options) -> Solution:
     first = _first_solution(problem, options)
     if options.distortion == "auto":
         return _finished(first, options)
-    solution = with_more_starts(first, lambda: _distorted_starts(problem, options))
+    solution = with_more_starts(first, lambda some: _distorted_starts(some, options))
     # The poses of several views that share a camera have been turned where that is better.
     if solution is not first or problem.type == 3 or problem.views.n_views == 1:
         solution = _turned(solution)
@@ -74,19 +74,8 @@ def fit_again(
     """
     if options.distortion == "plumb-line":
         return _plumb_line_first(solution.problem.with_points(points), options)
-    problem = solution.problem.with_points(points)
-    if not problem.free_distortion:
-        problem = problem.with_seen_pixels()
-    place = [solution.problem.views.names.index(name) for name in problem.views.names]
-    known, record = solution.in_pixels, solution.record
-    start = normalised(replace(known, R=known.R[place], t=known.t[place]), problem.views)
-    again = Solution(
-        problem,
-        problem.adjust(replace(solution.adjusted, state=start)),
-        replace(record, agreed=record.agreed[place]),
-        would_take=solution.would_take,
-    )
-    if problem.restraint is not None:  # a rich lens's prior
+    again = restarted(solution, points)
+    if again.problem.restraint is not None:  # a rich lens's prior
         return _displaced(again)
     return _finished(again, options, only_from_here)
 
@@ -109,8 +98,8 @@ def _finished(solution: Solution, options: Options, only_from_here: bool = False
 def _with_selected_model(solution: Solution, options: Options) -> Solution:
     from neurocal_cli.distortion.model_selection import select_model
 
-    def more_starts() -> Iterator[CameraState]:
-        return _distorted_starts(solution.problem, options)
+    def more_starts(problem: Problem) -> Iterator[CameraState]:
+        return _distorted_starts(problem, options)
 
     found = select_model(solution, more_starts, options.preferred)
     turned = _turned(found)
