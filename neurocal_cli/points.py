@@ -164,6 +164,12 @@ class Correspondences:
             return f"{source}:{int(self.lines[row])}"
         return f"{self.source}, row {row + 1}"
 
+    def of_few_views(self, most: int) -> Correspondences:
+        """The points of at most so many views, which lie evenly among all."""
+        if self.n_views <= most:
+            return self
+        return self.select(np.isin(self.view_index, np.linspace(0, self.n_views - 1, most).round()))
+
     def select(self, rows: NDArray[Any] | slice) -> Correspondences:
         """The same data restricted to some rows (a mask, indices or a slice)."""
 

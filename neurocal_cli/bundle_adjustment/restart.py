@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.points import Correspondences
@@ -30,9 +28,6 @@ def restarted(solution: Solution, points: Correspondences) -> Solution:
 
 
 def of_few_views(solution: Solution, most: int) -> Solution:
-    """The solution adjusted to at most so many of its views, which lie evenly among them."""
-    points = solution.problem.points
-    if points.n_views <= most:
-        return solution
-    some = np.linspace(0, points.n_views - 1, most).round().astype(np.intp)
-    return restarted(solution, points.select(np.isin(points.view_index, some)))
+    """The solution adjusted to at most so many of its views."""
+    few = solution.problem.points.of_few_views(most)
+    return solution if few is solution.problem.points else restarted(solution, few)

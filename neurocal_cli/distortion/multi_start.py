@@ -30,7 +30,7 @@ __all__ = ["VIEWS_THAT_TELL", "with_more_starts"]
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
 # showed more.
 _CORRELATED = 0.15  # correlation of neighbours' residuals
-VIEWS_THAT_TELL = 30  # whether there is a lower minimum; 1000 views take as long as these
+VIEWS_THAT_TELL = 20  # whether there is a lower minimum; 1000 views take as long as these
 _LOWER = 0.999  # times the squared error of these views
 
 

@@ -43,6 +43,7 @@ _STRENGTHS = (-0.8, -0.65, -0.5, -0.38, -0.27, -0.17, -0.08, 0.08, 0.17, 0.3)
 _STEP, _ROUNDS = 0.05, 5
 _WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, -1.0), (-1.0, 1.0)])
 _SCAN_STARTS = 4  # random starts of each network, while the distortion is sought
+_VIEWS_THAT_TELL = 10  # of the distortion; all of them train the networks that the camera follows from
 
 
 def radial_start(problem: Problem, options: Options) -> Solution | None:
@@ -60,14 +61,15 @@ def radial_start(problem: Problem, options: Options) -> Solution | None:
         A minimum of the reprojection error, with the distortion model that was nearest to the division
         model; None where it leads to no camera.
     """
-    search = _Search(problem, middle_of_image(problem), options)
-    strength = search.best_strength()
-    corrected = search.corrected(strength)
+    middle = middle_of_image(problem)
+    reach = float(np.hypot(*(problem.points.pixels - middle).T).max())
+    few = problem.with_points(problem.points.of_few_views(_VIEWS_THAT_TELL))
+    strength = _Search(_Radial(few, middle, reach), options).best_strength()
     best = None
-    for pinhole in _pinholes(corrected, search.middle):
+    for pinhole in _pinholes(_Radial(problem, middle, reach).corrected(strength), middle):
         with suppress(DegenerateGeometryError):
             found = solve(pinhole, options)
-            state = _distorted(found.in_pixels, strength, search.reach)
+            state = _distorted(found.in_pixels, strength, reach)
             distorted = problem.with_model(state.model)
             adjusted = try_mirrored(distorted, distorted.adjust(normalised(state, problem.views)))
             if best is None or adjusted.cost.sum() < best.adjusted.cost.sum():
@@ -98,14 +100,8 @@ def middle_of_image(problem: Problem) -> Array:
 class _Search:
     """For the distortion with which the free networks fit best."""
 
-    problem: Problem
-    middle: Array
+    radial: _Radial
     options: Options
-
-    @property
-    def reach(self) -> float:
-        """Distance of the farthest point [px]."""
-        return float(np.hypot(*(self.problem.points.pixels - self.middle).T).max())
 
     def best_strength(self) -> Array:
         """lambda_1 and lambda_2: the best of a row, and from there in steps that become smaller."""
@@ -124,44 +120,60 @@ class _Search:
                 step = step / 2
         return best
 
+    def error(self, strength: Array) -> float:
+        """Squared error of all free networks in the pixels that were given."""
+        scan = options_for("lm", _SCAN_STARTS, self.options.seed)
+        problem = self.radial.corrected(strength)
+        able = np.ones(problem.views.n_views, dtype=bool)
+        groups, _ = train_networks(problem, scan, np.random.default_rng(scan.seed), able)
+        # The networks' weights have mean 1.
+        weight = problem.views.pixel_scale**2 * (1 / self.radial.magnification(strength)).mean()
+        error = weight * sum(float(group.bound.sum()) for group in groups)
+        return float(error) if np.isfinite(error) else np.inf
+
+
+@frozen_dataclass(eq=False)
+class _Radial:
+    """A problem whose pixels were distorted by the division model.
+
+    Attributes
+    ----------
+    problem : Problem
+    middle : (2,) array [px]
+    reach : float [px]
+        Distance at which the model's terms are lambda_1 and lambda_2.
+    """
+
+    problem: Problem
+    middle: Array
+    reach: float
+
     def corrected(self, strength: Array) -> Problem:
         """The problem of a pinhole that sees the pixels without this distortion."""
         points = self.problem.points
-        away = points.pixels - self.middle
-        share = self._share()
-        variance = _magnification(strength, share)
+        variance = self.magnification(strength)
         seen = Correspondences(
             points.world,
-            self.middle + away / _divisor(strength, share)[:, None],
+            self.middle + (points.pixels - self.middle) / _divisor(strength, self._share())[:, None],
             points.view,
             covariance=np.column_stack([variance, np.zeros_like(variance), variance]),
         )
         return self.problem.with_model("none").with_points(seen)
 
-    def error(self, strength: Array) -> float:
-        """Squared error of all free networks in the pixels that were given."""
-        problem, scan = self.corrected(strength), options_for("lm", _SCAN_STARTS, self.options.seed)
-        able = np.ones(problem.views.n_views, dtype=bool)
-        groups, _ = train_networks(problem, scan, np.random.default_rng(scan.seed), able)
-        # The networks' weights have mean 1.
-        weight = problem.views.pixel_scale**2 * (1 / _magnification(strength, self._share())).mean()
-        error = weight * sum(float(group.bound.sum()) for group in groups)
-        return float(error) if np.isfinite(error) else np.inf
+    def magnification(self, strength: Array) -> Array:
+        """(N,) by which an area of the image becomes larger: along the radius times across it."""
+        share = self._share()
+        D, slope = _divisor(strength, share), strength[0] + 2 * strength[1] * share
+        return np.asarray((D - 2 * share * slope) / D**3)
 
     def _share(self) -> Array:
-        """(N,) squared distances from the middle, the farthest being 1."""
+        """(N,) squared distances from the middle, those at the reach being 1."""
         return np.asarray(((self.problem.points.pixels - self.middle) ** 2).sum(axis=1) / self.reach**2)
 
 
 def _divisor(strength: Array, share: Array) -> Array:
     """Of the division model, at a share of the farthest point's squared distance."""
     return np.asarray(1 + share * (strength[0] + strength[1] * share))
-
-
-def _magnification(strength: Array, share: Array) -> Array:
-    """By which an area of the image becomes larger: along the radius times across it."""
-    D, slope = _divisor(strength, share), strength[0] + 2 * strength[1] * share
-    return np.asarray((D - 2 * share * slope) / D**3)
 
 
 def _one_to_one(strength: Array) -> bool:
