@@ -8,10 +8,11 @@ be bent far more than the others, because one odd view is no board that bends; n
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled
-from neurocal_cli.target_shape.information import Information, Sight, information_of
+from neurocal_cli.target_shape.information import Information, Sight, information_of, joined
 from neurocal_cli.target_shape.posterior import camera_step_of
 
 __all__ = ["bends_hold"]
@@ -39,12 +40,15 @@ def bends_hold(sight: Sight, bends: Array, precision: float) -> bool:
     rank = np.arange(len(views)) - sight.views.first[views]
     ratio = 0.0  # its logarithm, because a fold that needs a camera of few views would outweigh the others
     n_folds = min(sight.views.n_views, _FOLDS)
-    for fold in range(n_folds):
-        out = views % n_folds == fold
-        rest, *halves = [
-            information_of([sight.of_points(rows)], len(shapes))
-            for rows in (~out, out & (rank % 2 == 0), out & (rank % 2 == 1))
-        ]
+
+    def information(kept: NDArray[np.bool_]) -> Information:
+        return information_of([sight.of_points(kept)], len(shapes))
+
+    folds = [views % n_folds == fold for fold in range(n_folds)]
+    parts = [information(out) for out in folds]
+    for fold, out in enumerate(folds):
+        rest = joined(parts[:fold] + parts[fold + 1 :])
+        halves = [information(out & (rank % 2 == half)) for half in (0, 1)]
         ratio += np.log(_lost(rest, halves, precision) / _lost(rest, halves, None))
     return bool(ratio < 0)
 

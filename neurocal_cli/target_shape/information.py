@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,7 @@ __all__ = [
     "Sight",
     "by_world",
     "information_of",
+    "joined",
     "labelled",
     "point_terms",
     "pose_columns",
@@ -184,6 +186,22 @@ def information_of(sights: Sequence[Sight], n_points: int) -> Information:
     found = replace(found, cost=cost)
     bends = [sight.bends for sight in sights if sight.bends is not None]
     return found.around_straight(np.concatenate(bends)) if bends else found
+
+
+def joined(parts: Sequence[Information]) -> Information:
+    """Sum over parts of the views, which were seen by the same cameras."""
+
+    def summed(name: str) -> Any:
+        return sum(getattr(part, name) for part in parts)
+
+    def together(name: str) -> Array:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    return Information(
+        summed("camera"), summed("camera_right"), together("pose"), together("pose_camera"),
+        together("pose_right"), summed("point"), summed("point_camera"), summed("point_right"),
+        together("pose_point"), summed("cost"), summed("equations"), summed("log_precision"),
+    )  # fmt: skip
 
 
 def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.target_shape.information import Information, Sight, information_of
+from neurocal_cli.target_shape.information import Information, Sight, information_of, joined
 from neurocal_cli.target_shape.posterior import cost_at, known_sizes
 from neurocal_cli.target_shape.prior import Prior
 
@@ -60,11 +60,18 @@ def holds_for_views_left_out(
         return info.held(precision)
 
     n_folds = min(n_views, _FOLDS)
-    everything = np.arange(n_folds)
-    whole, nothing = information(everything), np.zeros_like(offsets)
+    parts = [information(np.array([fold])) for fold in range(n_folds)]
+    # A camera with fewer views than there are folds is missing in some.
+    by_parts = len({len(part.camera) for part in parts}) == 1
+
+    def of(folds: list[int]) -> Information:
+        return joined([parts[fold] for fold in folds]) if by_parts else information(np.array(folds))
+
+    everything = list(range(n_folds))
+    whole, nothing = of(everything), np.zeros_like(offsets)
     alone, together = 0.0, -n_folds * cost_at(whole, nothing)
-    for fold in everything:
-        out, others = information(everything[fold : fold + 1]), information(np.delete(everything, fold))
+    for fold, out in enumerate(parts):
+        others = of(everything[:fold] + everything[fold + 1 :])
         try:
             told = known_sizes(others, prior, sizes, variance).offsets
         except np.linalg.LinAlgError:
