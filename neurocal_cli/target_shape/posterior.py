@@ -97,6 +97,7 @@ _MOST = 2e-3  # of its size, of a stretch: a skew of the image axes looks like o
 _NOTHING = 1e-7  # of its size
 _SETTLED = 0.03  # relative change of the sizes
 _NO_GAIN = 0.02  # of the logarithm of the evidence
+_FARTHEST = 8.0  # times MacKay's step
 _HALVINGS = 6
 _PASSES = 40
 _NO_COST = 1e-300  # what rounding leaves may be negative
@@ -317,18 +318,36 @@ class _Parts:
         return now.ratios | {"stretch": size / float(np.sqrt(now.variance))}
 
     def climbed(self, now: _Solution) -> _Solution:
-        """Steps to the most probable sizes."""
+        """Steps to the most probable sizes, ever longer ones for those that change as they did before."""
+        before, reach = dict.fromkeys(now.ratios, 0.0), dict.fromkeys(now.ratios, 1.0)
         for _ in range(_PASSES):
             wanted = self.renewed(now)
             if self.change(now.ratios, wanted) < _SETTLED:
                 break
-            better = next(self.better(now, wanted), None)
+            step = {name: float(np.log(wanted[name] / ratio)) for name, ratio in now.ratios.items()}
+            reach = {
+                name: min(2 * reach[name], _FARTHEST) if by * before[name] > 0 else 1.0
+                for name, by in step.items()
+            }
+            better = next(self.better(now, self.beyond(now, step, reach)), None)
             if better is None:
                 break
-            gain, now = better.evidence - now.evidence, better
+            gain, now, before = better.evidence - now.evidence, better, step
             if gain < _NO_GAIN:
                 break
         return now
+
+    def beyond(self, now: _Solution, step: dict[str, float], reach: dict[str, float]) -> dict[str, float]:
+        """Sizes after so many times these steps of their logarithms; a stretch has limits of its own."""
+        noise, most = np.sqrt(now.variance), self.prior.size
+        sizes = {
+            name: ratio * noise * np.exp(step[name] * (1.0 if name == "stretch" else reach[name]))
+            for name, ratio in now.ratios.items()
+        }
+        return {
+            name: size / noise if name == "stretch" else float(np.clip(size, self.least, most) / noise)
+            for name, size in sizes.items()
+        }
 
     def better(self, now: _Solution, wanted: dict[str, float]) -> Iterator[_Solution]:
         """Sizes on the way to the wanted ones, ever nearer, that raise the evidence."""
