@@ -10,6 +10,7 @@ from support.measured import Points, errors_of
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 from support.wide_boards import WideRecipe, in_circle, mixture, wide_picture
+from support.wide_camera import WideCamera
 
 from neurocal_cli.board import Board
 from neurocal_cli.detection.detect import detect_points
@@ -17,7 +18,7 @@ from neurocal_cli.detection.fitting.smooth_map import Frame
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.wide_lens import WideLens, fit_wide_lens
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering import PlaneTruth, WideCamera, render
+from neurocal_cli.simulation.rendering import PlaneTruth, render
 
 cv2 = pytest.importorskip("cv2")
 find_grids = pytest.importorskip("neurocal_cli.detection.finding.grids").find_grids
@@ -86,7 +87,7 @@ def test_rays_of_rendered_cameras_have_true_derivatives(law: str) -> None:
     pixels, seen = camera.project(directions)
     assert seen.all()
     rays = camera.rays(*pixels.T)
-    np.testing.assert_allclose(np.stack(rays[2:5], axis=-1), directions, atol=1e-9)
+    np.testing.assert_allclose(np.stack([rays.x, rays.y, rays.z], axis=-1), directions, atol=1e-9)
     for k_axis, (names, step) in enumerate(
         ((("xu", "yu", "zu"), (1e-4, 0)), (("xv", "yv", "zv"), (0, 1e-4)))
     ):

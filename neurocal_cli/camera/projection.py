@@ -200,7 +200,7 @@ def normalised_points(entries: Entries, u: Array, v: Array) -> tuple[Array, Arra
 
 
 class Rays(NamedTuple):
-    """Rays (x, y, 1) of pixels, in the camera's frame.
+    """Rays (x, y, z) of pixels, in the camera's frame.
 
     Attributes
     ----------
@@ -209,6 +209,8 @@ class Rays(NamedTuple):
         Undistorted normalised points; nan where the camera sees nothing.
     xu, xv, yu, yv : arrays [1/px]
         Derivatives of x and y by u and v.
+    z, zu, zv : arrays or floats
+        Not 1, 0 and 0 only where rays are directions of any length, so that they may point sideways.
     """
 
     u: Array
@@ -219,6 +221,13 @@ class Rays(NamedTuple):
     xv: Array
     yu: Array
     yv: Array
+    z: Array | float = 1.0
+    zu: Array | float = 0.0
+    zv: Array | float = 0.0
+
+    def some(self, places: NDArray[np.intp]) -> Rays:
+        """The rays at some places of flat arrays."""
+        return self._replace(**{k: x[places] for k, x in self._asdict().items() if isinstance(x, np.ndarray)})
 
 
 def rays_of(
