@@ -68,11 +68,6 @@ class Image:
     notes: tuple[str, ...] = ()
 
     @property
-    def bits(self) -> int:
-        """Bits of a pixel, 8 or 16."""
-        return 8 * self.grey.dtype.itemsize
-
-    @property
     def size(self) -> tuple[int, int]:
         """Width and height [px]."""
         return self.grey.shape[1], self.grey.shape[0]
