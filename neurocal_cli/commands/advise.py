@@ -7,20 +7,20 @@ import os
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, json_option, plot_option
+from neurocal_cli.commands.options import (
+    Command,
+    check_plot,
+    input_argument,
+    json_option,
+    plot_option,
+)
 from neurocal_cli.commands.places import check_outputs
 
 __all__ = ["advise"]
 
 
 @click.command(cls=Command)
-@click.argument(
-    "calibration",
-    metavar="CAMERA.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="A calibration that neurocal wrote; - is standard input.",
-)
+@input_argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")
 @click.option(
     "--next",
     "count",

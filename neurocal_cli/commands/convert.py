@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.options import INPUT, Argument, Command
+from neurocal_cli.commands.options import Command, input_argument
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
@@ -34,18 +34,16 @@ _SIZE = click.IntRange(1, 1_000_000)
 
 
 @click.command(cls=Command)
-@click.argument(
+@input_argument(
     "files",
-    nargs=-1,
-    required=True,
-    metavar="FILE...",
-    type=INPUT,
-    cls=Argument,
-    description="A camera or a rig of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or a "
+    "FILE...",
+    "A camera or a rig of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or a "
     "JSON or .npz dictionary; - is standard input. Two files are the left and the right camera of ROS or "
     "mrcal, or the two files of OpenCV's stereo sample. Points are files of neurocal, or corners in "
     "a dictionary of OpenCV or MATLAB, a .npy array, mrcal's corners.vnl, or text files of numbers: X Y Z, "
     "then u v of each view.",
+    nargs=-1,
+    required=True,
 )
 @click.option(
     "--to",

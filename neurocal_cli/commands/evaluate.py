@@ -9,7 +9,7 @@ import click
 
 from neurocal_cli.commands.calibration_options import given_camera
 from neurocal_cli.commands.evaluate_stereo import stereo
-from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
+from neurocal_cli.commands.options import Command, input_argument, json_option
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
@@ -44,21 +44,16 @@ evaluate.add_command(stereo)
 
 
 @evaluate.command(cls=Command)
-@click.argument(
+@input_argument(
     "calibration",
-    metavar="CAMERA.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="A calibration that neurocal wrote. With POINTS.csv also a ROS or OpenCV file; - is "
-    "standard input.",
+    "CAMERA.yaml",
+    "A calibration that neurocal wrote. With POINTS.csv also a ROS or OpenCV file; - is standard input.",
 )
-@click.argument(
+@input_argument(
     "points",
-    metavar="[POINTS.csv]",
-    type=INPUT,
+    "[POINTS.csv]",
+    "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
-    cls=Argument,
-    description="Points to evaluate the camera on; without them, those it was calibrated from.",
 )
 @panels_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @json_option

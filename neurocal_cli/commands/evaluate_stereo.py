@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.calibration_options import given_camera
-from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
+from neurocal_cli.commands.options import INPUT, Command, input_argument, json_option
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
@@ -26,15 +26,13 @@ __all__ = ["stereo"]
 
 
 @click.command(cls=Command)
-@click.argument(
+@input_argument(
     "cameras",
-    metavar="LEFT.yaml RIGHT.yaml",
+    "LEFT.yaml RIGHT.yaml",
+    "The calibrations of the left and the right camera, with --points also ROS or OpenCV files; "
+    "or one RIG.yaml with both; - is standard input.",
     nargs=-1,
     required=True,
-    type=INPUT,
-    cls=Argument,
-    description="The calibrations of the left and the right camera, with --points also ROS or OpenCV files; "
-    "or one RIG.yaml with both; - is standard input.",
 )
 @click.option(
     "--points",

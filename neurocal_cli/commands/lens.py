@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from neurocal_cli.commands.options import (
-    INPUT,
-    Argument,
     Command,
     FiniteNumber,
     check_plot,
+    input_argument,
     json_option,
     output_option,
     plot_option,
@@ -36,12 +35,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 _NOT_CONVERGED = 3
 _MOST_UNITS = 20
 
-_LENS = click.argument(
-    "lens_file",
-    metavar="LENS.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="A lens that `neurocal lens fit` wrote; - is standard input.",
+_LENS = input_argument(
+    "lens_file", "LENS.yaml", "A lens that `neurocal lens fit` wrote; - is standard input."
 )
 
 
@@ -61,16 +56,14 @@ def lens() -> None:
 
 
 @lens.command(cls=Command)
-@click.argument(
+@input_argument(
     "points",
-    nargs=-1,
-    required=True,
-    metavar="POINTS...",
-    type=INPUT,
-    cls=Argument,
-    description="CSV files of points with the columns zoom and/or focus, X,Y,Z,u,v and optionally view; or "
+    "POINTS...",
+    "CSV files of points with the columns zoom and/or focus, X,Y,Z,u,v and optionally view; or "
     "of known cameras with zoom and/or focus and alpha_u,alpha_v,u0,v0 (and t_z), or with zoom and/or focus "
     "and camera, the name of a calibration file. Several files are read as one; - is standard input.",
+    nargs=-1,
+    required=True,
 )
 @click.option(
     "--distortion",
@@ -306,13 +299,10 @@ def camera(
 
 @lens.command(cls=Command)
 @_LENS
-@click.argument(
+@input_argument(
     "points",
-    metavar="POINTS.csv",
-    type=INPUT,
-    cls=Argument,
-    description="A CSV file of points at any settings, with the columns zoom and/or focus; - is standard "
-    "input.",
+    "POINTS.csv",
+    "A CSV file of points at any settings, with the columns zoom and/or focus; - is standard input.",
 )
 @plot_option("the error over the settings, and the errors of the baseline models")
 @json_option

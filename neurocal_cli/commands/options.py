@@ -18,6 +18,8 @@ __all__ = [
     "Command",
     "FiniteNumber",
     "check_plot",
+    "input_argument",
+    "interpolation_option",
     "json_option",
     "lean_option",
     "output_option",
@@ -86,17 +88,20 @@ class FiniteNumber(FloatParamType):
         return number
 
 
+def input_argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
+    """Add an argument that names what is read."""
+    return click.argument(name, metavar=metavar, type=INPUT, cls=Argument, description=description, **more)
+
+
 def points_argument(f: F) -> F:
     """Add POINTS..., one or more CSV files that are read as one."""
-    return click.argument(
+    return input_argument(
         "points",
+        "POINTS...",
+        "CSV files with the columns X,Y,Z,u,v and optionally view. Several files are read as "
+        "one; - is standard input.",
         nargs=-1,
         required=True,
-        metavar="POINTS...",
-        type=INPUT,
-        cls=Argument,
-        description="CSV files with the columns X,Y,Z,u,v and optionally view. Several files are read as "
-        "one; - is standard input.",
     )(f)
 
 
@@ -111,6 +116,14 @@ def output_option(metavar: str, what: str) -> Callable[[F], F]:
         show_default="standard output",
         help=f"Write {what} to this file.",
     )
+
+
+interpolation_option = click.option(
+    "--interpolation",
+    type=click.Choice(["nearest", "linear", "cubic", "lanczos"]),
+    default="cubic",
+    help="Interpolation between the pixels of an image.",
+)
 
 
 def json_option(f: F) -> F:

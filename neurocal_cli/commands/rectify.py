@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, json_option
+from neurocal_cli.commands.options import (
+    Command,
+    FiniteNumber,
+    input_argument,
+    interpolation_option,
+    json_option,
+)
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, complain, note, say, warn
 from neurocal_cli.commands.summaries import print_summary
@@ -27,21 +33,17 @@ _SIDES = ("left", "right")
 
 
 @click.command(cls=Command)
-@click.argument(
+@input_argument(
     "rig",
-    metavar="RIG.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="A rig of neurocal, or of another program that neurocal convert reads; - is standard input.",
+    "RIG.yaml",
+    "A rig of neurocal, or of another program that neurocal convert reads; - is standard input.",
 )
-@click.argument(
+@input_argument(
     "files",
-    nargs=-1,
-    metavar="LEFT... RIGHT...",
-    type=INPUT,
-    cls=Argument,
-    description="Images of the left camera and as many of the right one, in the same order: files, file name "
+    "LEFT... RIGHT...",
+    "Images of the left camera and as many of the right one, in the same order: files, file name "
     "patterns or one folder each. Or CSV files of points.",
+    nargs=-1,
 )
 @click.option(
     "--alpha",
@@ -50,12 +52,7 @@ _SIDES = ("left", "right")
     show_default="not scaled",
     help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
 )
-@click.option(
-    "--interpolation",
-    type=click.Choice(["nearest", "linear", "cubic", "lanczos"]),
-    default="cubic",
-    help="Interpolation between the pixels of an image.",
-)
+@interpolation_option
 @click.option(
     "--side-by-side",
     is_flag=True,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.method_names import MethodNames
+from neurocal_cli.commands.method_names import methods_option
 from neurocal_cli.commands.options import INPUT, Command, FiniteNumber, check_plot, json_option, plot_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
@@ -88,14 +88,7 @@ def _is_number(word: str) -> bool:
     default=50,
     help="Number of trials at each sigma, as in the paper.",
 )
-@click.option(
-    "--methods",
-    metavar="M,...",
-    type=MethodNames(),
-    default=_DEFAULT_METHODS,
-    help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro with "
-    "the paper's trainer.",
-)
+@methods_option(_DEFAULT_METHODS)
 @click.option(
     "--random-starts",
     metavar="N",

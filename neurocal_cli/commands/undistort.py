@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber
+from neurocal_cli.commands.options import Command, FiniteNumber, input_argument, interpolation_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, complain, is_terminal, note, say
@@ -29,21 +29,13 @@ _UNTOLD = 2.0  # degrees that nobody misses
 
 
 @click.command(cls=Command)
-@click.argument(
-    "camera",
-    metavar="CAMERA.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="The camera, a neurocal, ROS or OpenCV file; - is standard input.",
-)
-@click.argument(
+@input_argument("camera", "CAMERA.yaml", "The camera, a neurocal, ROS or OpenCV file; - is standard input.")
+@input_argument(
     "files",
-    nargs=-1,
-    metavar="FILE...",
-    type=INPUT,
-    cls=Argument,
-    description="Images (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits, grey or colour), folders of "
+    "FILE...",
+    "Images (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits, grey or colour), folders of "
     "images, file name patterns, or CSV files of points; - is points from standard input.",
+    nargs=-1,
 )
 @click.option(
     "--to",
@@ -75,12 +67,7 @@ _UNTOLD = 2.0  # degrees that nobody misses
     show_default="keep the camera matrix",
     help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
 )
-@click.option(
-    "--interpolation",
-    type=click.Choice(["nearest", "linear", "cubic", "lanczos"]),
-    default="cubic",
-    help="Interpolation between the pixels of an image.",
-)
+@interpolation_option
 @click.option(
     "--camera",
     "new_camera",
