@@ -15,10 +15,10 @@ from neurocal_cli.commands.options import (
     interpolation_option,
     json_option,
 )
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, complain, note, say, warn
+from neurocal_cli.commands.progress import each_of
+from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import print_summary
-from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
+from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -120,6 +120,8 @@ def rectify(
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
     if os.path.exists(output) and not os.path.isdir(output):
         raise UsageError(f"-o {output} is a file; give a folder")
+    from neurocal_cli.io.image_paths import is_image
+
     sides = _sides(files)
     _check_outputs(sides, output)
     found = _read_rig(rig)
@@ -127,10 +129,10 @@ def rectify(
     work.tell_rows_of_rig()
     if maps:
         work.write_maps()
-    if files and work.is_points(sides[0][0]):
-        work.rectify_points(sides)
-    elif files:
+    if files and is_image(sides[0][0]):
         work.rectify_images(sides)
+    elif files:
+        work.rectify_points(sides)
     if as_json:
         print_summary(work.summary)
 
@@ -201,13 +203,6 @@ class _Work:
         self.pair = rectified_pair(self.rig, self.alpha)
         self.summary["along"] = "rows" if self.pair.axis == 0 else "columns"
 
-    @staticmethod
-    def is_points(path: str) -> bool:
-        """Whether a file is a table of points."""
-        from neurocal_cli.io.image_paths import IMAGE_ENDINGS
-
-        return not path.lower().endswith(IMAGE_ENDINGS)
-
     def tell_rows_of_rig(self) -> None:
         """Say how well the rows of the points agree from which the rig was found."""
         from neurocal_cli.report import number_or_none
@@ -258,19 +253,7 @@ class _Work:
     def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
         """Rectify all pairs; those that fail are named and left out."""
         pairs = list(zip(*sides, strict=True))
-        done = 0
-        with ProgressBar() as progress:
-            for number, pair in enumerate(pairs, start=1):
-                try:
-                    self._rectify_pair(pair)
-                    done += 1
-                except (InputError, FormatError) as error:
-                    if len(pairs) == 1:
-                        raise
-                    complain(str(error))
-                progress(f"{number} of {len(pairs)} pairs", number / len(pairs))
-        if not done:
-            raise NeurocalError(f"none of the {len(pairs)} pairs could be rectified; see the reasons above")
+        done = len(pairs) - len(each_of(pairs, self._rectify_pair, "pairs", "rectified"))
         self.summary["images"] = {"pairs": len(pairs), "rectified": done}
         self._tell(f"rectified {done} of {len(pairs)} pair{'s' * (len(pairs) != 1)}")
 
