@@ -193,7 +193,7 @@ def _is_zero(s: Any) -> bool:
 
 
 def normalised_points(entries: Entries, u: Array, v: Array) -> tuple[Array, Array]:
-    """Normalised image points of pixels, still distorted."""
+    """Normalised image points x, y of pixels u, v, still distorted; arrays of one shape."""
     a, s, b, u0, v0 = entries
     y = (v - v0) / b
     return (u - u0 - s * y) / a, y

@@ -157,6 +157,7 @@ class _Tally:
         self.points = self.behind = self.off = self.outside = 0
 
     def triangulated(self, batches: Iterable[Matches]) -> Iterator[tuple[Triangulated, Any]]:
+        """The points of each batch of matches, and their names."""
         from neurocal_cli.stereo.triangulation import triangulate as solve
 
         rig = self.rig

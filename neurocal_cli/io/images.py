@@ -176,7 +176,7 @@ def encode_png(picture: NDArray[np.uint8]) -> bytes:
 
 
 def shrink(grey: NDArray[np.uint8] | NDArray[np.uint16], width: int) -> NDArray[np.uint8]:
-    """An image of 8 bits that is no wider than so many pixels."""
+    """The (H, W) image with 8 bits, and no wider than so many pixels."""
     eight = (grey // 257 if grey.dtype == np.uint16 else grey).astype(np.uint8, copy=False)
     if eight.shape[1] <= width:
         return eight

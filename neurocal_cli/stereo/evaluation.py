@@ -155,6 +155,7 @@ class _Evaluator:
         ]
 
     def evaluation(self) -> StereoEvaluation:
+        """The errors of all points, through the poses of the views and through the rig."""
         fitted = self._fit_new() if self.new else None
         by_view = self._by_view(fitted)
         through = None if self.rig is None else self._through_rig(self.rig, fitted)

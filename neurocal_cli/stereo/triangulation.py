@@ -151,6 +151,7 @@ class _Rigs:
 
     @classmethod
     def of(cls, poses: Sequence[Pose], which: NDArray[np.intp] | None, n: int) -> _Rigs:
+        """Rigs with these poses, for n points."""
         if len(poses) != 1 and (which is None or len(which) != n):
             raise InputError(f"with several rigs, give the number of the rig of each of the {n} points")
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])

@@ -197,7 +197,7 @@ def solve_map(
 
 
 def loss_of(z: Array) -> float:
-    """Chi2 with every term limited to 100, for outliers."""
+    """Chi2 of normalised residuals z (N,) with every term limited to 100, for outliers."""
     return float(np.minimum(z * z, 100.0).sum())
 
 
