@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 
 import click
@@ -15,6 +14,7 @@ from neurocal_cli.commands.options import (
     plot_option,
 )
 from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.summaries import print_summary
 
 __all__ = ["advise"]
 
@@ -63,6 +63,6 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
 
         write_whole(plot, draw_advice(advice, known, os.path.splitext(plot)[1][1:].lower()))
     if as_json:
-        click.echo(json.dumps(advice_json(advice), indent=2, allow_nan=False))
+        print_summary(advice_json(advice))
     else:
         click.echo("\n".join(advice_lines(advice)))

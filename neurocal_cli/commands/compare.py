@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -12,6 +11,7 @@ from neurocal_cli.commands.method_names import methods_option
 from neurocal_cli.commands.options import Command, input_argument, json_option
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
+from neurocal_cli.commands.summaries import print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def compare(
     note(found.notes)
     if as_json:
         values: dict[str, Any] = comparison_json(found)
-        click.echo(json.dumps(values, indent=2, allow_nan=False))
+        print_summary(values)
     else:
         click.echo(comparison_report(found))
 

@@ -17,6 +17,10 @@ __all__ = [
     "Argument",
     "Command",
     "FiniteNumber",
+    "alpha_option",
+    "camera_name_option",
+    "check_alpha",
+    "check_camera_name",
     "check_plot",
     "input_argument",
     "interpolation_option",
@@ -116,6 +120,44 @@ def output_option(metavar: str, what: str) -> Callable[[F], F]:
         show_default="standard output",
         help=f"Write {what} to this file.",
     )
+
+
+camera_name_option = click.option(
+    "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
+)
+
+
+def check_camera_name(name: str) -> None:
+    """Refuse a name that no file can hold.
+
+    Raises
+    ------
+    UsageError
+    """
+    if not name.strip() or not name.isprintable():
+        raise UsageError("--camera-name must hold printable characters only; give another name")
+
+
+def alpha_option(default: str) -> Callable[[F], F]:
+    """Add ``--alpha``, how much of the original images is shown; see `check_alpha`."""
+    return click.option(
+        "--alpha",
+        metavar="ALPHA",
+        type=FiniteNumber(),
+        show_default=default,
+        help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
+    )
+
+
+def check_alpha(alpha: float | None) -> None:
+    """Refuse an alpha that is no share.
+
+    Raises
+    ------
+    UsageError
+    """
+    if alpha is not None and not 0 <= alpha <= 1:
+        raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
 
 
 interpolation_option = click.option(

@@ -10,7 +10,8 @@ import click
 
 from neurocal_cli.commands.options import (
     Command,
-    FiniteNumber,
+    alpha_option,
+    check_alpha,
     input_argument,
     interpolation_option,
     json_option,
@@ -45,13 +46,7 @@ _SIDES = ("left", "right")
     "patterns or one folder each. Or CSV files of points.",
     nargs=-1,
 )
-@click.option(
-    "--alpha",
-    metavar="ALPHA",
-    type=FiniteNumber(),
-    show_default="not scaled",
-    help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
-)
+@alpha_option("not scaled")
 @interpolation_option
 @click.option(
     "--side-by-side",
@@ -114,8 +109,7 @@ def rectify(
           --side-by-side --json -o pairs
     """  # noqa: D301 - as in the group
     check_one_stdin(rig, *files)
-    if alpha is not None and not 0 <= alpha <= 1:
-        raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
+    check_alpha(alpha)
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
     if os.path.exists(output) and not os.path.isdir(output):

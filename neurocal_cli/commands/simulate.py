@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +12,7 @@ from neurocal_cli.commands.options import INPUT, Command, FiniteNumber, check_pl
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
+from neurocal_cli.commands.summaries import print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
@@ -272,7 +272,7 @@ def _compare(
         found |= noise_json(study)
         if starts is not None:
             found["random_starts"] = starts_json(starts)
-        click.echo(json.dumps(found, indent=2, allow_nan=False))
+        print_summary(found)
     else:
         _show(*simulation_tables(study, starts, paper))
 
@@ -289,7 +289,7 @@ def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool
 
         write_whole(plot, draw_rates(study, _kind(plot)))
     if as_json:
-        click.echo(json.dumps(rates_json(study), indent=2, allow_nan=False))
+        print_summary(rates_json(study))
     else:
         _show(*rates_tables(study))
 

@@ -6,7 +6,14 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands.options import Command, FiniteNumber, input_argument, interpolation_option
+from neurocal_cli.commands.options import (
+    Command,
+    FiniteNumber,
+    alpha_option,
+    check_alpha,
+    input_argument,
+    interpolation_option,
+)
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, say
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
@@ -48,13 +55,7 @@ __all__ = ["undistort"]
     show_default="that of the images",
     help="Size of the result in pixels.",
 )
-@click.option(
-    "--alpha",
-    metavar="ALPHA",
-    type=FiniteNumber(),
-    show_default="keep the camera matrix",
-    help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
-)
+@alpha_option("keep the camera matrix")
 @interpolation_option
 @click.option(
     "--camera",
@@ -161,8 +162,7 @@ def undistort(
 
 
 def _check_view(shape: str, fov: float | None, size: tuple[int, int] | None, alpha: float | None) -> None:
-    if alpha is not None and not 0 <= alpha <= 1:
-        raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
+    check_alpha(alpha)
     if alpha is not None and (shape != "plane" or fov is not None or size is not None):
         raise UsageError(
             "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"
