@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.directions import project_directions
 from neurocal_cli.camera.distortion import WIDE, Distortion, distort, distort_with_jacobian
-from neurocal_cli.camera.monotonic import nearly_undistorted, undistort
+from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.camera.polynomial import Coefficients
 from neurocal_cli.geometry import Array
 
@@ -31,7 +31,6 @@ __all__ = [
     "Rays",
     "image_points",
     "image_points_with_jacobian",
-    "nearly_rays",
     "normalised_points",
     "project_points",
     "project_with_jacobian",
@@ -249,11 +248,6 @@ def rays_of(
     scale = 1 / (ux * vy - uy * vx)
     xu, xv, yu, yv = (np.broadcast_to(d * scale, x.shape) for d in (vy, -uy, -vx, ux))
     return Rays(u, v, x, y, xu, xv, yu, yv)
-
-
-def nearly_rays(entries: Entries, distortion: Distortion, u: Array, v: Array) -> tuple[Array, Array]:
-    """Undistorted normalised points of pixels to a thousandth or so: where to start from."""
-    return nearly_undistorted(distortion, *normalised_points(entries, u, v))
 
 
 def undistorted_pixels(distortion: Distortion, A: Array, pixels: Array) -> Array:

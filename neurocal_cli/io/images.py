@@ -118,10 +118,10 @@ def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
     return parse_image(*read_bytes(path), most_pixels)
 
 
-def read_picture(path: str | Path, most_pixels: int = MOST_PIXELS) -> Picture:
+def read_picture(path: str | Path) -> Picture:
     """Read an image with its colours; else as `read_image` does."""
     data, source = read_bytes(path)
-    pixels, notes = _upright(data, source, most_pixels, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    pixels, notes = _upright(data, source, MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     return Picture(pixels if pixels.ndim == 2 else pixels[..., ::-1], source, notes)
 
 
