@@ -6,6 +6,8 @@ and the exit code that the class names. A message says what is wrong, where, and
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 __all__ = [
     "CoincidentCamerasError",
     "DegenerateGeometryError",
@@ -13,6 +15,7 @@ __all__ = [
     "InputError",
     "NeurocalError",
     "UsageError",
+    "check_choice",
 ]
 
 
@@ -59,3 +62,15 @@ class UsageError(NeurocalError):
     """A request that makes no sense as put, whatever the data: the user's to change."""
 
     exit_code = 2
+
+
+def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    """Refuse a value that an option does not have.
+
+    Raises
+    ------
+    UsageError
+        It names the option and its values.
+    """
+    if value not in choices:
+        raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")

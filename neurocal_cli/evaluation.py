@@ -23,7 +23,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.given_points import GivenPoints
 
-__all__ = ["CameraEvaluation", "ViewEvaluation", "evaluate_camera"]
+__all__ = ["CameraEvaluation", "ViewEvaluation", "evaluate_camera", "refuse_another_size"]
 
 # Most points of the same image lie within these of where the calibration sees them: a user's own noise and
 # small edits do, another image of the board does not. Repeated by tests/test_evaluation.py.
@@ -142,7 +142,7 @@ def evaluate_camera(
         points = calibration.points if points is None else points
         if not len(points):
             raise InputError("the calibration has no points of its own; give the points to evaluate it on")
-        _refuse_another_size(calibration, points)
+        refuse_another_size(calibration, points)
         seed = calibration.seed
         poses = {name: view.pose for name, view in calibration.views.items()}
         if given is not None and calibration.target is not None:
@@ -171,7 +171,14 @@ def evaluate_camera(
     return replace(measured, renamed=renamed, fit=fit, on_target=on_target)
 
 
-def _refuse_another_size(calibration: Calibration, points: Correspondences) -> None:
+def refuse_another_size(calibration: Calibration, points: Correspondences) -> None:
+    """Refuse points of images of another size than the camera's.
+
+    Raises
+    ------
+    InputError
+        It names both sizes.
+    """
     here, there = points.image_size, calibration.image_size
     if here is not None and there is not None and here != there:
         raise InputError(

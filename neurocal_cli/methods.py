@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.problem import problem_for
+from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.calibration import Calibration, Rejected, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.errors import DegenerateGeometryError, UsageError
+from neurocal_cli.errors import DegenerateGeometryError, UsageError, check_choice
 from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.options import Progress, options_for
+from neurocal_cli.initialisation.options import Options, Progress, options_for
 from neurocal_cli.pipeline.fit import fit
 from neurocal_cli.pipeline.result import calibration_of
 from neurocal_cli.points import Correspondences
@@ -154,25 +154,9 @@ def calibrate(
                 warnings=(*found.warnings, *_unused(points, f"the method is {method}")),
                 judgement=assess,
             )
-        # What is not asked for is not imported, either.
-        if outliers == "reject":
-            from neurocal_cli.pipeline.outlier_rejection import fit_robustly
-
-            solution, rejected = fit_robustly(problem, options)
-        else:
-            solution, rejected = fit(problem, options), Rejected()
-        if choice != "given":
-            from neurocal_cli.pipeline.rich_choice import with_rich_lens
-            from neurocal_cli.pipeline.target_choice import with_target
-
-            solution, rejected = with_target(problem, solution, rejected, options, choice)
-            solution, rejected = with_rich_lens(problem, solution, rejected, options, choice)
+        solution, rejected = _solved(problem, options, outliers, choice)
         if known_target is not None:
             solution = replace(solution, target=known_target)
-        if solution.state.model in WITH_XI:
-            from neurocal_cli.distortion.xi_profile import with_all_minima
-
-            solution = with_all_minima(solution)
         if solution.refusal:
             raise DegenerateGeometryError(solution.refusal)
         found = calibration_of(
@@ -191,6 +175,27 @@ def calibrate(
         if text == str(error):
             raise
         raise DegenerateGeometryError(text) from error
+
+
+def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> tuple[Solution, Rejected]:
+    """The network's answer; what is not asked for is not imported, either."""
+    if outliers == "reject":
+        from neurocal_cli.pipeline.outlier_rejection import fit_robustly
+
+        solution, rejected = fit_robustly(problem, options)
+    else:
+        solution, rejected = fit(problem, options), Rejected()
+    if choice != "given":
+        from neurocal_cli.pipeline.rich_choice import with_rich_lens
+        from neurocal_cli.pipeline.target_choice import with_target
+
+        solution, rejected = with_target(problem, solution, rejected, options, choice)
+        solution, rejected = with_rich_lens(problem, solution, rejected, options, choice)
+    if solution.state.model in WITH_XI:
+        from neurocal_cli.distortion.xi_profile import with_all_minima
+
+        solution = with_all_minima(solution)
+    return solution, rejected
 
 
 def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:
@@ -255,15 +260,11 @@ def _refuse_misfit(calibration: Calibration) -> None:
 def _check_options(
     method: str, trainer: str, distortion: str, outliers: str, target: str, starts: int, seed: int
 ) -> None:
-    for name, value, choices in (
-        ("method", method, METHODS),
-        ("trainer", trainer, TRAINERS),
-        ("distortion", distortion, DISTORTIONS),
-        ("outliers", outliers, OUTLIERS),
-        ("target", target, TARGETS),
-    ):
-        if value not in choices:
-            raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
+    check_choice("method", method, METHODS)
+    check_choice("trainer", trainer, TRAINERS)
+    check_choice("distortion", distortion, DISTORTIONS)
+    check_choice("outliers", outliers, OUTLIERS)
+    check_choice("target", target, TARGETS)
     if method != "neuro" and target in ("flat", "free"):
         raise UsageError(f"target {target} needs the method neuro, but the method is {method}; leave it out")
     if not isinstance(starts, (int, np.integer)) or starts < 2:

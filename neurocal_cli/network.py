@@ -25,12 +25,10 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 __all__ = [
-    "Gradients",
     "Patterns",
     "e_2d",
     "e_orth",
     "e_orth_gradient",
-    "gradients",
     "optimal_gamma",
     "output",
     "random_weights",
@@ -89,29 +87,6 @@ def e_2d(W: Array, V: Array, gamma: Array, patterns: Patterns) -> Array:
     """E_2D, eq. (8) summed over the patterns; (G,)."""
     error = patterns.targets - gamma[..., None] * output(W, V, patterns.inputs)
     return np.asarray(0.5 * (patterns.weights * (error**2).sum(-1)).sum(-1))
-
-
-@frozen_dataclass(eq=False)
-class Gradients:
-    """Derivatives of E_2D by W (G, 3, 3), V (G, 3, I) and gamma (G, N)."""
-
-    W: Array
-    V: Array
-    gamma: Array
-
-
-def gradients(W: Array, V: Array, gamma: Array, patterns: Patterns) -> Gradients:
-    """Exact gradient of E_2D; (9)-(11) are its negative for a single pattern."""
-    Z, w = patterns.inputs, patterns.weights
-    Y = Z @ np.swapaxes(V, -1, -2)  # hidden outputs, eq. (6)
-    o = Y @ np.swapaxes(W, -1, -2)
-    error = w[..., None] * (patterns.targets - gamma[..., None] * o)
-    scaled = gamma[..., None] * error
-    return Gradients(
-        W=-np.swapaxes(scaled, -1, -2) @ Y,  # eq. (9)
-        V=-np.swapaxes(scaled @ W, -1, -2) @ Z,  # eq. (10)
-        gamma=-(error * o).sum(-1),  # eq. (11)
-    )
 
 
 def residual_jacobian(W: Array, V: Array, patterns: Patterns) -> tuple[Array, Array]:

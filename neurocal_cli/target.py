@@ -292,7 +292,7 @@ def distinct_points(
 
 
 def planes_of(given: Array, point: NDArray[np.str_] | None) -> NDArray[np.intp]:
-    """Plane of each point: what its id says before a slash, else all are of one."""
+    """Plane (N,) of each point given (N, 3): what its id says before a slash, else all are of one."""
     one = np.zeros(len(given), dtype=np.intp)
     if point is None or not np.char.count(point, "/").astype(bool).all():
         return one
@@ -303,7 +303,7 @@ def planes_of(given: Array, point: NDArray[np.str_] | None) -> NDArray[np.intp]:
 
 
 def is_flat(given: Array) -> bool:
-    """Whether points lie in one plane, up to rounding."""
+    """Whether points (N, 3) lie in one plane, up to rounding."""
     extent = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
     return bool(extent[-1] < _THIN * extent[0])
 

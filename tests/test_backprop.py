@@ -11,10 +11,12 @@ from typing import Any, Literal
 
 import numpy as np
 import pytest
+from support.decomposition import decompose
+from support.gradients import gradients
 from support.plain_projection import project
 from support.slow_cases import slow_but
 
-from neurocal_cli.camera.pinhole import Intrinsics, Pose, decompose
+from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, euler_to_rotation, similarity
 from neurocal_cli.network import (
@@ -22,7 +24,6 @@ from neurocal_cli.network import (
     e_2d,
     e_orth,
     e_orth_gradient,
-    gradients,
     optimal_gamma,
     output,
     random_weights,
@@ -165,7 +166,7 @@ def least_loss(product: Array, patterns: Patterns) -> float:
 
 def intrinsic_errors(scene: Scene, product: Array) -> Array:
     P = scene.S1 @ product @ scene.S2  # eq. (12)
-    found = [decompose(each, scene.world)[0].values() for each in P]
+    found = [decompose(each)[0].values() for each in P]
     return np.abs(np.array(found) - scene.intrinsics.values())
 
 

@@ -34,7 +34,7 @@ def true_points(seen: Rendered) -> dict[str, np.ndarray]:
     return {
         name: np.concatenate([world, pixel])
         for plane in seen.truth.planes
-        for name, world, pixel in zip(plane.midpoint_ids, plane.midpoints_world, plane.midpoints, strict=True)
+        for name, world, pixel in zip(*plane.plane.midpoints(), plane.midpoints, strict=True)
     }
 
 

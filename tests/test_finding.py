@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.occluders import Rectangle
+from support.picture_bound import scene_bound
 from support.real_data import RealFiles
 from support.rendered import condition, picture
 from support.slow_cases import slow_but
@@ -21,7 +23,7 @@ from neurocal_cli.detection.finding.saddles import find_saddles
 from neurocal_cli.detection.finding.seeds import find_seeds_3x3
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering import PlaneTruth, Rectangle, render, scene_bound
+from neurocal_cli.simulation.rendering import PlaneTruth, render
 
 cv2 = pytest.importorskip("cv2")
 

@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from support.occluders import Rectangle
 from support.rendered import Recipe, board_pose, condition, folded, single
 from support.rendered import picture as rendered_picture
 from support.seen_grids import labelled_vertices, seen_grid, seen_grids, true_vertices, turned_by
@@ -22,7 +23,7 @@ from neurocal_cli.detection.identity.messages import SYMMETRIC_BOARD, NoBoardErr
 from neurocal_cli.detection.identity.placement import Placement, placements
 from neurocal_cli.detection.identity.trim import trimmed
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering import Rectangle, Rendered, Scene, Sides, Target, ground_truth, render
+from neurocal_cli.simulation.rendering import Rendered, Scene, Sides, Target, ground_truth, render
 
 picture = cache(rendered_picture)
 
@@ -289,7 +290,7 @@ def test_a_placement_says_which_squares_are_dark() -> None:
 def test_the_linear_camera_tells_a_mirrored_target() -> None:
     scene = condition("two planes", 0)
     truth = picture("two planes", 0).truth
-    world = np.concatenate([t.vertices_world.reshape(-1, 3) for t in truth.planes])
+    world = np.concatenate([t.plane.vertices().reshape(-1, 3) for t in truth.planes])
     pixels = np.concatenate([t.vertices.reshape(-1, 2) for t in truth.planes])
     assert isinstance(scene.targets[0], Target)
     fit = fit_camera(world, pixels)

@@ -50,7 +50,7 @@ def test_grey_pixels_come_back_as_they_are(ending: str) -> None:
     plain = b"P5\n# a comment\n40 30\n255\n" + GREY.tobytes()
     data = plain if ending == ".ppm" else encoded(ending, GREY)
     image = parse_image(data)
-    assert (image.bits, image.size, image.notes) == (8, (40, 30), ())
+    assert (image.grey.dtype, image.size, image.notes) == (np.uint8, (40, 30), ())
     np.testing.assert_array_equal(image.grey, GREY)
 
 
@@ -64,7 +64,7 @@ def test_colours_are_weighed_as_opencv_weighs_them(ending: str) -> None:
 def test_sixteen_bits_are_kept(ending: str) -> None:
     deep = GREY.astype(np.uint16) * 257
     image = parse_image(encoded(ending, deep))
-    assert image.bits == 16
+    assert image.grey.dtype == np.uint16
     np.testing.assert_array_equal(image.grey, deep)
 
 

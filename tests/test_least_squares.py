@@ -196,10 +196,6 @@ def test_a_rejected_step_that_promised_nothing_is_the_bottom() -> None:
     assert minimise(Stack(flat, [[1.0]])).stop[0] == Stop.FLAT
 
 
-def test_every_end_has_a_sentence() -> None:
-    assert all(stop.sentence.endswith(".") for stop in Stop)
-
-
 def test_a_problem_that_changes_is_taken_up_again() -> None:
     """A goal that is moved in between, as priors are that follow the data."""
     goal = np.array([1.0])

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from support.gradients import gradients
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array, nearest_rotation
-from neurocal_cli.network import Patterns, e_2d, gradients, optimal_gamma, output, random_weights
+from neurocal_cli.network import Patterns, e_2d, optimal_gamma, output, random_weights
 from neurocal_cli.training import Task
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
 

@@ -7,12 +7,12 @@ from typing import Literal
 import numpy as np
 import pytest
 from support.measured import errors, found, places, take
+from support.picture_bound import edge_bound
 from support.real_data import RealFiles
 from support.slow_cases import slow_but
 
 from neurocal_cli.detection import EDGE_H, EDGE_V, VERTEX, Grid
 from neurocal_cli.detection.measuring import measure
-from neurocal_cli.simulation.rendering import edge_bound
 
 # Conditions in which the bound is to be met within a fifth, and those where a factor of two is allowed:
 # edges along the pixels, blur as wide as the squares, unknown responses, clipped light, hardly any pixels.

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.gradients import gradients
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import (
@@ -14,7 +15,6 @@ from neurocal_cli.network import (
     e_2d,
     e_orth,
     e_orth_gradient,
-    gradients,
     optimal_gamma,
     output,
     random_weights,

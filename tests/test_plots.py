@@ -17,7 +17,7 @@ from support.slow_cases import slow_but
 from neurocal_cli import NeurocalError, write_calibration, write_points
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.plots import CAMERA_PANELS, RIG_PANELS, SPACE_PANELS
-from neurocal_cli.plots.pages import draw_calibration, draw_camera, draw_points_in_space, draw_rig
+from neurocal_cli.plots.pages import draw_camera, draw_points_in_space, draw_rig
 from neurocal_cli.plots.subject import Subject
 from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
@@ -28,9 +28,9 @@ BEGINNINGS = {"png": b"\x89PNG\r\n", "pdf": b"%PDF", "svg": b"<?xml"}
 
 @pytest.mark.parametrize("kind", BEGINNINGS)
 def test_the_same_calibration_gives_the_same_picture(kind: str) -> None:
-    picture = draw_calibration(made_calibration(2), kind, "views")
+    picture = draw_camera(Subject.of(made_calibration(2)), kind, "views")
     assert picture.startswith(BEGINNINGS[kind])
-    assert draw_calibration(made_calibration(2), kind, "views") == picture
+    assert draw_camera(Subject.of(made_calibration(2)), kind, "views") == picture
 
 
 @pytest.mark.parametrize(
@@ -46,20 +46,21 @@ def test_the_same_calibration_gives_the_same_picture(kind: str) -> None:
     ],
 )
 def test_odd_calibrations_are_drawn(calibration: Calibration) -> None:
-    assert draw_calibration(calibration).startswith(BEGINNINGS["png"])
+    assert draw_camera(Subject.of(calibration)).startswith(BEGINNINGS["png"])
 
 
 def test_missing_matplotlib_is_said_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(NeurocalError, match=r"pip install 'neurocal\[plot\]'"):
-        draw_calibration(made_calibration())
+        draw_camera(Subject.of(made_calibration()))
 
 
 @pytest.mark.slow
 def test_drawing_leaves_the_state_of_pyplot_alone() -> None:
     code = (
         "import sys; from support.made_calibration import made_calibration;"
-        "from neurocal_cli.plots.pages import draw_calibration; draw_calibration(made_calibration());"
+        "from neurocal_cli.plots.pages import draw_camera; from neurocal_cli.plots.subject import Subject;"
+        "draw_camera(Subject.of(made_calibration()));"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, check=True)
@@ -67,7 +68,7 @@ def test_drawing_leaves_the_state_of_pyplot_alone() -> None:
 
 @pytest.mark.parametrize("panel", slow_but(("uncertainty", "poses"), CAMERA_PANELS))
 def test_each_panel_of_a_camera_is_a_picture(panel: str) -> None:
-    assert draw_calibration(made_calibration(3), "svg", panel).startswith(BEGINNINGS["svg"])
+    assert draw_camera(Subject.of(made_calibration(3)), "svg", panel).startswith(BEGINNINGS["svg"])
 
 
 def test_a_camera_without_a_calibration_is_drawn_with_the_points_it_was_judged_by() -> None:

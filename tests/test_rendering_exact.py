@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.special import ndtr
+from support.picture_bound import noise_free
 from support.rendered import board_pose, condition
 from support.slow_cases import slow_but
 
@@ -25,7 +26,6 @@ from neurocal_cli.simulation.rendering import (
     Sides,
     Target,
     ground_truth,
-    noise_free,
 )
 from neurocal_cli.simulation.rendering.light import image_light
 

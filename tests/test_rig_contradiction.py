@@ -62,7 +62,7 @@ def test_the_sum_of_squares_is_that_of_the_common_adjustment(degrees: float) -> 
     start = problem.start(find_consensus(problem).rig)
     free = np.concatenate([[True, False, True, True, True] * 2, [True] * 6])
     adjusted = adjust_rig(problem.frames, problem.observations, start, free.astype(bool))
-    alone = sum(float(cost.sum()) for cost in problem.own_cost)
+    alone = sum(float(normal[:, -1, -1].sum()) for normal in problem.own_normal)
     assert told.scatter**2 * told.degrees == pytest.approx(adjusted.cost - alone, rel=0.02)
 
 

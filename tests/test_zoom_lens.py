@@ -8,13 +8,13 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.interpolate import RBFInterpolator, RectBivariateSpline, RegularGridInterpolator
+from simulated_zoom import SimulatedZoom
 from support.real_data import RealFiles
 from support.zoom_laws import FLOOR, HIGH, LAWS, LOW, between, covered, grid, seen, truth
 
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.points import Correspondences
-from neurocal_cli.simulation.zoom_lens import SimulatedZoom
 from neurocal_cli.zoom_lens.baseline_models import baselines_of
 from neurocal_cli.zoom_lens.camera_at import camera_at
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from neurocal_cli import calibrate, read_points
-from neurocal_cli.plots.pages import draw_calibration
+from neurocal_cli.plots.pages import draw_camera
+from neurocal_cli.plots.subject import Subject
 
 HERE = Path(__file__).resolve().parent
 SAMPLES = HERE.parents[1] / "sample_data"
@@ -14,7 +15,7 @@ SAMPLES = HERE.parents[1] / "sample_data"
 def main() -> None:
     """Draw ``panels.png``."""
     found = calibrate(read_points(str(SAMPLES / "flat.csv")), skew=False)
-    (HERE / "panels.png").write_bytes(draw_calibration(found))
+    (HERE / "panels.png").write_bytes(draw_camera(Subject.of(found)))
 
 
 if __name__ == "__main__":

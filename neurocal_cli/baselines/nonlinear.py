@@ -59,6 +59,7 @@ class _Unknowns:
         self.zero = np.zeros(len(free) + (6 * len(start.R) if free_poses else 0))
 
     def state(self, x: Array) -> CameraState:
+        """The state at (n,) steps from the start, in the order of the free unknowns."""
         by_camera = np.zeros((1, self.width))
         by_camera[0, self.free] = x[: len(self.free)]
         by_pose = x[len(self.free) :].reshape(-1, 6) if self.free_poses else np.zeros((len(self.start.R), 6))
@@ -66,7 +67,7 @@ class _Unknowns:
 
 
 def whitened_residuals(views: Views) -> Callable[[CameraState], Array]:
-    """Function from a state to its residuals in normalised pixels, all points' u and v one by one."""
+    """Function from a state to its (2 N,) residuals in normalised pixels, u and v of point by point."""
     batches = views.batches
     factors = batches.whitening
 
@@ -80,5 +81,5 @@ def whitened_residuals(views: Views) -> Callable[[CameraState], Array]:
 
 
 def view_of_residual(views: Views) -> NDArray[np.intp]:
-    """View of each residual of `whitened_residuals`."""
+    """View (2 N,) of each residual of `whitened_residuals`."""
     return np.repeat(views.batches.view, 2 * views.batches.local.shape[2])

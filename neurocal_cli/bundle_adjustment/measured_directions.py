@@ -24,7 +24,7 @@ LEAST = 0.01  # of an equation
 
 
 def equations(across: Array | None, n: int, along: float = LEAST) -> Array:
-    """How many equations each of n points gives: 2, or 1 and its say along the edge."""
+    """How many equations each of n points gives, (n,): 2, or 1 and its say along the edge."""
     if across is None:
         return np.full(n, 2.0)
     return np.where(single(across), 1.0 + along, 2.0)

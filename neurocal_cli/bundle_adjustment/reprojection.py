@@ -40,7 +40,7 @@ _COEFFICIENTS = 11  # first column of the coefficients of the distortion
 
 
 def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
-    """Columns of what all views share: the entries of A, then the coefficients."""
+    """Columns (5 + K,) of what all views share: the entries of A, then the coefficients."""
     return np.concatenate([np.arange(5), _COEFFICIENTS + np.arange(n_coefficients)])
 
 

@@ -131,7 +131,10 @@ def _determined(S: Array) -> _Determined | None:
 def scores_of_poses(
     normal: Array, free: NDArray[np.bool_], free_poses: bool, repeated: RepeatedPoses
 ) -> Quadratics:
-    """Quadratics of the different poses at their minimum, weighed so that cov(g) is variance times S."""
+    """Quadratics of the different poses at their minimum, weighed so that cov(g) is variance times S.
+
+    The parameters are those of `reduced`.
+    """
     return _weighed(_by_pose(reduced(normal, free, free_poses), repeated), repeated.variance)
 
 

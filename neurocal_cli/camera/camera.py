@@ -19,7 +19,6 @@ from neurocal_cli.camera.projection import (
     ENTRIES,
     Rays,
     image_points,
-    image_points_with_jacobian,
     normalised_points,
     project_points,
     project_with_jacobian,
@@ -228,11 +227,6 @@ class Camera:
     def image_points(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Pixels u, v of normalised image points x, y."""
         return image_points(self.entries, self.model, self.distortion.coefficients, x, y)
-
-    def image_jacobian(self, x: Array, y: Array) -> Array:
-        """(N, 2, 2) derivatives of the pixels of normalised image points (N,)."""
-        by = image_points_with_jacobian(self.entries, self.model, self.distortion.coefficients, x, y).by_point
-        return np.stack([np.broadcast_to(d, x.shape) for d in by], axis=-1).reshape(*x.shape, 2, 2)
 
     def normalised_points(self, u: Array, v: Array) -> tuple[Array, Array]:
         """Normalised image points x, y of pixels u, v, without the distortion; nan where there are none."""

@@ -116,7 +116,7 @@ class Distortion:
 
 
 def pinhole_coefficients(model: str) -> Array:
-    """Coefficients with which a model moves no point, a fisheye's nearly."""
+    """Coefficients (K,) with which a model moves no point, a fisheye's nearly."""
     return np.array(_PINHOLES.get(model, np.zeros(len(coefficient_names(model)))))
 
 

@@ -11,16 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from neurocal_cli.errors import DegenerateGeometryError, InputError
+from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation, rotation_to_euler, rq
+from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation, rotation_to_euler
 
 __all__ = [
     "INTRINSIC_NAMES",
     "POSE_NAMES",
     "Intrinsics",
     "Pose",
-    "decompose",
     "entries_of",
 ]
 
@@ -173,46 +172,3 @@ def entries_of(alpha_u: Any, alpha_v: Any, u0: Any, v0: Any, theta: float) -> tu
     # The float nearest to pi/2 is not quite pi/2, and its tangent not infinite.
     skew = -alpha_u / np.tan(theta) if theta != np.pi / 2 else 0.0
     return alpha_u, skew, alpha_v / np.sin(theta), u0, v0
-
-
-def decompose(P: Array, world: Array | None = None) -> tuple[Intrinsics, Pose]:
-    """Split a projection matrix into its 11 parameters (Faugeras 1993).
-
-    Parameters
-    ----------
-    P : (3, 4) array
-        Defined up to scale and sign.
-    world : (N, 3) array, optional
-        Points that lie in front of the camera; they fix the sign of P. Without them the sign that
-        makes R a rotation is taken.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        P's left 3 x 3 block is singular (a camera at infinity), points on both sides of the
-        camera, or points that only a mirrored camera could see.
-    """
-    P = np.asarray(P, dtype=float)
-    M = P[:, :3]
-    lengths = np.linalg.norm(M, axis=1, keepdims=True)
-    if not lengths.min() > 0 or np.linalg.cond(M / lengths) > 1e14:
-        raise DegenerateGeometryError(
-            "the projection matrix is singular, so it has no focal length; check the points"
-        )
-    if world is None:
-        sign = np.sign(np.linalg.det(M))
-    else:
-        depth = world @ P[2, :3] + P[2, 3]
-        if depth.min() < 0 < depth.max():
-            raise DegenerateGeometryError(
-                "the points lie on both sides of the camera; check that each pixel belongs to its point"
-            )
-        sign = np.sign(depth.sum())
-    if sign * np.linalg.det(M) < 0:
-        raise DegenerateGeometryError(
-            "only a mirrored camera could see these points; check the axes of X,Y,Z "
-            "(right-handed?) and of u,v (v downwards?)"
-        )
-    K, R = rq(sign * M)
-    t = np.linalg.solve(K, sign * P[:, 3])
-    return Intrinsics.from_matrix(K / K[2, 2]), Pose(nearest_rotation(R), t)

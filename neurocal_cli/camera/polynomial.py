@@ -28,7 +28,7 @@ Distorted = tuple[tuple[Array, Array], tuple[Array, Array, Array, Array], list[t
 
 
 def distorted(k: Coefficients, x: Array, y: Array) -> tuple[Array, Array]:
-    """Distorted points."""
+    """Distorted points x', y' of undistorted ones x, y, in normalised coordinates; arrays of one shape."""
     r2 = x * x + y * y
     R, _ = _radial(k, r2)
     if len(k) <= 2:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.directions import project_directions
 from neurocal_cli.camera.distortion import WIDE, Distortion, distort, distort_with_jacobian
-from neurocal_cli.camera.monotonic import nearly_undistorted, undistort
+from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.camera.polynomial import Coefficients
 from neurocal_cli.geometry import Array
 
@@ -31,7 +31,6 @@ __all__ = [
     "Rays",
     "image_points",
     "image_points_with_jacobian",
-    "nearly_rays",
     "normalised_points",
     "project_points",
     "project_with_jacobian",
@@ -193,14 +192,14 @@ def _is_zero(s: Any) -> bool:
 
 
 def normalised_points(entries: Entries, u: Array, v: Array) -> tuple[Array, Array]:
-    """Normalised image points of pixels, still distorted."""
+    """Normalised image points x, y of pixels u, v, still distorted; arrays of one shape."""
     a, s, b, u0, v0 = entries
     y = (v - v0) / b
     return (u - u0 - s * y) / a, y
 
 
 class Rays(NamedTuple):
-    """Rays (x, y, 1) of pixels, in the camera's frame.
+    """Rays (x, y, z) of pixels, in the camera's frame.
 
     Attributes
     ----------
@@ -209,6 +208,8 @@ class Rays(NamedTuple):
         Undistorted normalised points; nan where the camera sees nothing.
     xu, xv, yu, yv : arrays [1/px]
         Derivatives of x and y by u and v.
+    z, zu, zv : arrays or floats
+        Not 1, 0 and 0 only where rays are directions of any length, so that they may point sideways.
     """
 
     u: Array
@@ -219,6 +220,13 @@ class Rays(NamedTuple):
     xv: Array
     yu: Array
     yv: Array
+    z: Array | float = 1.0
+    zu: Array | float = 0.0
+    zv: Array | float = 0.0
+
+    def some(self, places: NDArray[np.intp]) -> Rays:
+        """The rays at some places of flat arrays."""
+        return self._replace(**{k: x[places] for k, x in self._asdict().items() if isinstance(x, np.ndarray)})
 
 
 def rays_of(
@@ -240,11 +248,6 @@ def rays_of(
     scale = 1 / (ux * vy - uy * vx)
     xu, xv, yu, yv = (np.broadcast_to(d * scale, x.shape) for d in (vy, -uy, -vx, ux))
     return Rays(u, v, x, y, xu, xv, yu, yv)
-
-
-def nearly_rays(entries: Entries, distortion: Distortion, u: Array, v: Array) -> tuple[Array, Array]:
-    """Undistorted normalised points of pixels to a thousandth or so: where to start from."""
-    return nearly_undistorted(distortion, *normalised_points(entries, u, v))
 
 
 def undistorted_pixels(distortion: Distortion, A: Array, pixels: Array) -> Array:

@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import json
 import os
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, json_option, plot_option
+from neurocal_cli.commands.options import (
+    Command,
+    check_plot,
+    input_argument,
+    json_option,
+    plot_option,
+)
 from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.summaries import print_summary
 
 __all__ = ["advise"]
 
 
 @click.command(cls=Command)
-@click.argument(
-    "calibration",
-    metavar="CAMERA.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="A calibration that neurocal wrote; - is standard input.",
-)
+@input_argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")
 @click.option(
     "--next",
     "count",
@@ -63,6 +63,6 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
 
         write_whole(plot, draw_advice(advice, known, os.path.splitext(plot)[1][1:].lower()))
     if as_json:
-        click.echo(json.dumps(advice_json(advice), indent=2, allow_nan=False))
+        print_summary(advice_json(advice))
     else:
         click.echo("\n".join(advice_lines(advice)))

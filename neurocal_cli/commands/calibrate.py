@@ -9,6 +9,8 @@ import click
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.options import (
     Command,
+    camera_name_option,
+    check_camera_name,
     lean_option,
     output_option,
     points_argument,
@@ -20,7 +22,6 @@ from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
-from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import CAMERA_PANELS
 
 if TYPE_CHECKING:
@@ -34,9 +35,7 @@ _NOT_CONVERGED = 3
 @click.command(cls=Command)
 @points_argument
 @estimation_options
-@click.option(
-    "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
-)
+@camera_name_option
 @panels_option(
     "the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS
 )
@@ -112,8 +111,7 @@ def calibrate(
 
 
 def _check_outputs(output: str, plots: Plots, camera_name: str) -> None:
-    if not camera_name.strip() or not camera_name.isprintable():
-        raise UsageError("--camera-name must hold printable characters only; give another name")
+    check_camera_name(camera_name)
     check_plots(plots, output)
 
 

@@ -9,17 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from neurocal_cli.commands.given_camera import given_camera
 from neurocal_cli.commands.options import INPUT, FiniteNumber
 from neurocal_cli.commands.streams import note, warn
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 if TYPE_CHECKING:
-    from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
     from neurocal_cli.training.backprop import BackpropOptions
 
-__all__ = ["Estimation", "estimation_options", "estimation_options_without_files", "given_camera"]
+__all__ = [
+    "Estimation",
+    "estimation_options",
+    "estimation_options_without_files",
+]
 
 _BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
 
@@ -151,29 +155,6 @@ class Estimation:
             ]
         )
         return center
-
-
-def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera]:
-    """Read a known camera; give the points its image size if they have none.
-
-    Raises
-    ------
-    InputError
-        A camera of another image size.
-    """
-    from neurocal_cli.io.camera_files import read_intrinsics
-
-    camera = read_intrinsics(path)
-    if camera.image_size is not None:
-        if points.image_size is None:
-            points = replace(points, image_size=camera.image_size)
-        elif points.image_size != tuple(camera.image_size):
-            raise InputError(
-                f"{path}: the camera is for images of {camera.image_size[0]} x {camera.image_size[1]} px, "
-                f"but {points.source} has {points.image_size[0]} x {points.image_size[1]} px; give a camera "
-                "for this image size"
-            )
-    return points, camera
 
 
 def estimation_options(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.method_names import MethodNames
-from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
+from neurocal_cli.commands.method_names import methods_option
+from neurocal_cli.commands.options import Command, input_argument, json_option
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
+from neurocal_cli.commands.summaries import print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
 
 if TYPE_CHECKING:
@@ -21,29 +21,14 @@ __all__ = ["compare"]
 
 
 @click.command(cls=Command)
-@click.argument(
-    "points",
-    metavar="POINTS.csv",
-    type=INPUT,
-    cls=Argument,
-    description="Points of a camera, as for calibrate; - is standard input.",
-)
-@click.argument(
+@input_argument("points", "POINTS.csv", "Points of a camera, as for calibrate; - is standard input.")
+@input_argument(
     "right",
-    metavar="[RIGHT.csv]",
-    type=INPUT,
+    "[RIGHT.csv]",
+    "Points of a second camera, as for stereo: then points in space are compared too.",
     required=False,
-    cls=Argument,
-    description="Points of a second camera, as for stereo: then points in space are compared too.",
 )
-@click.option(
-    "--methods",
-    metavar="M,...",
-    type=MethodNames(),
-    default="neuro,nonlinear,linear,tsai,opencv",
-    help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro with "
-    "the paper's trainer.",
-)
+@methods_option("neuro,nonlinear,linear,tsai,opencv")
 @click.option(
     "--distortion",
     type=click.Choice(["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye"]),
@@ -127,7 +112,7 @@ def compare(
     note(found.notes)
     if as_json:
         values: dict[str, Any] = comparison_json(found)
-        click.echo(json.dumps(values, indent=2, allow_nan=False))
+        print_summary(values)
     else:
         click.echo(comparison_report(found))
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.options import INPUT, Argument, Command
+from neurocal_cli.commands.options import Command, input_argument
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
     from neurocal_cli.board import Board
     from neurocal_cli.io.exchange.camera_set import CameraSet
-    from neurocal_cli.io.exchange.fitting_in import Fitted
     from neurocal_cli.points import Correspondences
 
 __all__ = ["convert"]
@@ -34,18 +33,16 @@ _SIZE = click.IntRange(1, 1_000_000)
 
 
 @click.command(cls=Command)
-@click.argument(
+@input_argument(
     "files",
-    nargs=-1,
-    required=True,
-    metavar="FILE...",
-    type=INPUT,
-    cls=Argument,
-    description="A camera or a rig of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or a "
+    "FILE...",
+    "A camera or a rig of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or a "
     "JSON or .npz dictionary; - is standard input. Two files are the left and the right camera of ROS or "
     "mrcal, or the two files of OpenCV's stereo sample. Points are files of neurocal, or corners in "
     "a dictionary of OpenCV or MATLAB, a .npy array, mrcal's corners.vnl, or text files of numbers: X Y Z, "
     "then u v of each view.",
+    nargs=-1,
+    required=True,
 )
 @click.option(
     "--to",
@@ -151,32 +148,39 @@ def convert(
     check_outputs((None if os.path.isdir(output) else output,), (*files, board))
     target_board = given_board(board, cols, rows, square, None if square is None and board is None else unit)
     points = _points(files, target_board, unit, image_size)
-    if points is not None:
+    if points is None:
+        if target_board is not None:
+            raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
+        if len(files) > 2:
+            raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
+        from neurocal_cli.io.exchange.reading import read_cameras
+
+        cameras = _completed(read_cameras(files), unit, image_size)
+        told = _write_cameras(cameras, target, model, force, output)
+    else:
         if model is not None:
             raise UsageError("FILE holds points, which have no distortion model; leave out --model")
-        _write_points(points, target, output, as_json)
-        return
-    if target_board is not None:
-        raise UsageError("FILE holds cameras, not points; leave out --board, --cols, --rows and --square")
-    if len(files) > 2:
-        raise UsageError(f"there are {len(files)} files; give one, or the two of a rig")
+        told = _write_points(points, target, output)
+        if not as_json:
+            say(f"{len(points)} points of {points.n_views} view{'s' * (points.n_views != 1)}")
+    if as_json:
+        print_summary(told)
+
+
+def _write_cameras(
+    cameras: CameraSet, target: str, model: str | None, force: bool, output: str
+) -> dict[str, Any]:
+    """Write cameras; what there is to say of them, for programs."""
     from neurocal_cli.io.exchange.fitting_in import fitted_in
     from neurocal_cli.io.exchange.formats import FORMATS
-    from neurocal_cli.io.exchange.reading import read_cameras
 
-    cameras = _completed(read_cameras(files), unit, image_size)
     wanted = FORMATS[target]
     fitted = fitted_in(cameras, wanted, force, model)
     contents = wanted.text(fitted.cameras, os.path.splitext(output)[1].lower())
     note(fitted.remarks)
     warn(fitted.losses)
     _write(contents, output, target)
-    if as_json:
-        print_summary(_summary(fitted, cameras.program, target))
-
-
-def _summary(fitted: Fitted, program: str, target: str) -> dict[str, Any]:
-    cameras = [
+    written = [
         {
             "name": camera.name,
             "distortion": camera.distortion.model,
@@ -186,9 +190,9 @@ def _summary(fitted: Fitted, program: str, target: str) -> dict[str, Any]:
         for camera, moved in zip(fitted.cameras.cameras, fitted.moved, strict=True)
     ]
     return {
-        "from": program,
+        "from": cameras.program,
         "to": target,
-        "cameras": cameras,
+        "cameras": written,
         "n_views": len(fitted.cameras.poses),
         "warnings": [*fitted.losses, *fitted.remarks],
     }
@@ -215,7 +219,8 @@ def _points(
     return points
 
 
-def _write_points(points: Correspondences, target: str, output: str, as_json: bool) -> None:
+def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
+    """Write points; what there is to say of them, for programs."""
     from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
     from neurocal_cli.io.writing import write_whole
 
@@ -223,10 +228,7 @@ def _write_points(points: Correspondences, target: str, output: str, as_json: bo
     lost = points_lost(points, target)
     warn(lost)
     write_whole(output, text)
-    if as_json:
-        print_summary({"to": target, "n_points": len(points), "n_views": points.n_views, "warnings": lost})
-        return
-    say(f"{len(points)} points of {points.n_views} view{'s' * (points.n_views != 1)}")
+    return {"to": target, "n_points": len(points), "n_views": points.n_views, "warnings": lost}
 
 
 def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:

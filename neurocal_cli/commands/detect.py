@@ -11,7 +11,12 @@ import click
 from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.frames import videos_as_frames
 from neurocal_cli.commands.one_size import of_one_size
-from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
+from neurocal_cli.commands.options import (
+    Command,
+    FiniteNumber,
+    input_argument,
+    output_option,
+)
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, complain, note, one_line, say, warn
@@ -33,15 +38,13 @@ _SECOND = 2  # images of another size, from which on it is no single one that st
 
 
 @click.command(cls=Command)
-@click.argument(
+@input_argument(
     "images",
+    "IMAGE...",
+    "Images of one camera (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits), folders of "
+    "images, file name patterns, or videos; - is standard input.",
     nargs=-1,
     required=True,
-    metavar="IMAGE...",
-    type=INPUT,
-    cls=Argument,
-    description="Images of one camera (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits), folders of "
-    "images, file name patterns, or videos; - is standard input.",
 )
 @board_options("Unit of --square. A board file names its own unit.")
 @click.option(

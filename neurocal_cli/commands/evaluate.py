@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.calibration_options import given_camera
 from neurocal_cli.commands.evaluate_stereo import stereo
-from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
+from neurocal_cli.commands.given_camera import calibration_or_camera
+from neurocal_cli.commands.options import Command, input_argument, json_option
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
+from neurocal_cli.commands.summaries import print_summary
 from neurocal_cli.commands.tables import show
-from neurocal_cli.errors import FormatError
 from neurocal_cli.plots import CAMERA_PANELS
 
 if TYPE_CHECKING:
@@ -44,21 +43,16 @@ evaluate.add_command(stereo)
 
 
 @evaluate.command(cls=Command)
-@click.argument(
+@input_argument(
     "calibration",
-    metavar="CAMERA.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="A calibration that neurocal wrote. With POINTS.csv also a ROS or OpenCV file; - is "
-    "standard input.",
+    "CAMERA.yaml",
+    "A calibration that neurocal wrote. With POINTS.csv also a ROS or OpenCV file; - is standard input.",
 )
-@click.argument(
+@input_argument(
     "points",
-    metavar="[POINTS.csv]",
-    type=INPUT,
+    "[POINTS.csv]",
+    "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
-    cls=Argument,
-    description="Points to evaluate the camera on; without them, those it was calibrated from.",
 )
 @panels_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
 @json_option
@@ -117,26 +111,19 @@ def _evaluate(
     name: str, points: Correspondences | None
 ) -> tuple[CameraEvaluation, Verdict | None, Calibration | Camera]:
     """Evaluate a calibration or, given points, any camera file: then all poses are fitted."""
+    from neurocal_cli.calibration import Calibration
     from neurocal_cli.evaluation import evaluate_camera
-    from neurocal_cli.io.calibration_yaml import read_calibration
     from neurocal_cli.verdict.assessment import assess
     from neurocal_cli.verdict.given_points import judged_by_points
 
-    try:
-        calibration = read_calibration(name)
-        evaluation, verdict = evaluate_camera(calibration, points), assess(calibration)
-        if verdict is not None and points is not None:
-            verdict = judged_by_points(verdict, calibration, evaluation.given_points)
-        return evaluation, verdict, calibration
-    except FormatError as error:
-        if points is None or name == "-":
-            raise
-        try:
-            points, camera = given_camera(name, points)
-        except FormatError:
-            raise error from None  # no camera file of any kind: tell why it is no calibration
-        note([f"only the intrinsic parameters and the distortion are used: {error}"])
-    return evaluate_camera(camera, points), None, camera
+    camera, points = calibration_or_camera(name, points)
+    evaluation = evaluate_camera(camera, points)
+    if not isinstance(camera, Calibration):
+        return evaluation, None, camera
+    verdict = assess(camera)
+    if verdict is not None and points is not None:
+        verdict = judged_by_points(verdict, camera, evaluation.given_points)
+    return evaluation, verdict, camera
 
 
 def _tell(evaluation: CameraEvaluation) -> None:
@@ -159,7 +146,7 @@ def _show(evaluation: CameraEvaluation, verdict: Verdict | None, as_json: bool) 
     from neurocal_cli.verdict.report import verdict_lines
 
     if as_json:
-        click.echo(json.dumps(evaluation_json(evaluation, verdict), indent=2, allow_nan=False))
+        print_summary(evaluation_json(evaluation, verdict))
     else:
         below = [] if verdict is None else verdict_lines(verdict)
         show(evaluation_report(evaluation, verdict), evaluation_tables(evaluation), below)

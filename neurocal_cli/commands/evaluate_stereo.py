@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.calibration_options import given_camera
-from neurocal_cli.commands.options import INPUT, Argument, Command, json_option
+from neurocal_cli.commands.given_camera import calibration_or_camera
+from neurocal_cli.commands.options import INPUT, Command, input_argument, json_option
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
+from neurocal_cli.commands.summaries import print_summary
 from neurocal_cli.commands.tables import show
-from neurocal_cli.errors import FormatError, UsageError
+from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import SPACE_PANELS
 
 if TYPE_CHECKING:
@@ -26,15 +26,13 @@ __all__ = ["stereo"]
 
 
 @click.command(cls=Command)
-@click.argument(
+@input_argument(
     "cameras",
-    metavar="LEFT.yaml RIGHT.yaml",
+    "LEFT.yaml RIGHT.yaml",
+    "The calibrations of the left and the right camera, with --points also ROS or OpenCV files; "
+    "or one RIG.yaml with both; - is standard input.",
     nargs=-1,
     required=True,
-    type=INPUT,
-    cls=Argument,
-    description="The calibrations of the left and the right camera, with --points also ROS or OpenCV files; "
-    "or one RIG.yaml with both; - is standard input.",
 )
 @click.option(
     "--points",
@@ -142,20 +140,14 @@ def _evaluate(
 
 def _camera(name: str, points: Correspondences) -> Calibration:
     """Read a calibration, or any camera file: then its poses are fitted to the points."""
-    from neurocal_cli.io.calibration_yaml import read_calibration
+    from neurocal_cli.calibration import Calibration
     from neurocal_cli.methods import calibrate
 
-    try:
-        return read_calibration(name)
-    except FormatError as error:
-        if name == "-":
-            raise
-        try:
-            points, camera = given_camera(name, points)
-        except FormatError:
-            raise error from None  # no camera file of any kind: tell why it is no calibration
-        note([f"only the intrinsic parameters and the distortion are used; the poses are fitted: {error}"])
-    return calibrate(points, type=3, intrinsics=camera, outliers="keep")
+    camera, seen = calibration_or_camera(name, points, "; the poses are fitted")
+    if isinstance(camera, Calibration):
+        return camera
+    assert seen is not None
+    return calibrate(seen, type=3, intrinsics=camera, outliers="keep")
 
 
 def _show(evaluation: StereoEvaluation, as_json: bool) -> None:
@@ -167,7 +159,7 @@ def _show(evaluation: StereoEvaluation, as_json: bool) -> None:
     from neurocal_cli.verdict.report import verdict_lines
 
     if as_json:
-        click.echo(json.dumps(stereo_evaluation_json(evaluation), indent=2, allow_nan=False))
+        print_summary(stereo_evaluation_json(evaluation))
     else:
         below = [] if evaluation.verdict is None else verdict_lines(evaluation.verdict)
         show(stereo_evaluation_report(evaluation), stereo_evaluation_tables(evaluation), below)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -10,11 +9,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from neurocal_cli.commands.options import (
-    INPUT,
-    Argument,
     Command,
     FiniteNumber,
+    camera_name_option,
+    check_camera_name,
     check_plot,
+    input_argument,
     json_option,
     output_option,
     plot_option,
@@ -24,7 +24,6 @@ from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
-from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
     from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
@@ -36,12 +35,8 @@ F = TypeVar("F", bound=Callable[..., Any])
 _NOT_CONVERGED = 3
 _MOST_UNITS = 20
 
-_LENS = click.argument(
-    "lens_file",
-    metavar="LENS.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="A lens that `neurocal lens fit` wrote; - is standard input.",
+_LENS = input_argument(
+    "lens_file", "LENS.yaml", "A lens that `neurocal lens fit` wrote; - is standard input."
 )
 
 
@@ -61,16 +56,14 @@ def lens() -> None:
 
 
 @lens.command(cls=Command)
-@click.argument(
+@input_argument(
     "points",
-    nargs=-1,
-    required=True,
-    metavar="POINTS...",
-    type=INPUT,
-    cls=Argument,
-    description="CSV files of points with the columns zoom and/or focus, X,Y,Z,u,v and optionally view; or "
+    "POINTS...",
+    "CSV files of points with the columns zoom and/or focus, X,Y,Z,u,v and optionally view; or "
     "of known cameras with zoom and/or focus and alpha_u,alpha_v,u0,v0 (and t_z), or with zoom and/or focus "
     "and camera, the name of a calibration file. Several files are read as one; - is standard input.",
+    nargs=-1,
+    required=True,
 )
 @click.option(
     "--distortion",
@@ -253,9 +246,7 @@ def _write(learnt: ZoomLens, output: str, plot: str | None) -> None:
     show_default="refuse such a setting",
     help="Allow a setting outside the calibrated range.",
 )
-@click.option(
-    "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
-)
+@camera_name_option
 @summary_option
 @output_option("CAMERA.yaml", "the calibration")
 def camera(
@@ -280,8 +271,7 @@ def camera(
           --camera-name tele --json -o tele.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
-    if not camera_name.strip() or not camera_name.isprintable():
-        raise UsageError("--camera-name must hold printable characters only; give another name")
+    check_camera_name(camera_name)
     check_summary(as_json, output)
     check_outputs((output,), (lens_file,))
     from neurocal_cli.io.calibration_yaml import write_calibration
@@ -306,13 +296,10 @@ def camera(
 
 @lens.command(cls=Command)
 @_LENS
-@click.argument(
+@input_argument(
     "points",
-    metavar="POINTS.csv",
-    type=INPUT,
-    cls=Argument,
-    description="A CSV file of points at any settings, with the columns zoom and/or focus; - is standard "
-    "input.",
+    "POINTS.csv",
+    "A CSV file of points at any settings, with the columns zoom and/or focus; - is standard input.",
 )
 @plot_option("the error over the settings, and the errors of the baseline models")
 @json_option
@@ -357,7 +344,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
 
         write_whole(plot, draw_evaluation(evaluation, learnt.controls, os.path.splitext(plot)[1][1:].lower()))
     if as_json:
-        click.echo(json.dumps(evaluation_json(evaluation, verdict), indent=2, allow_nan=False))
+        print_summary(evaluation_json(evaluation, verdict))
     else:
         click.echo(evaluation_report(evaluation, learnt.controls, verdict))
     warn(evaluation.warnings)

@@ -129,17 +129,13 @@ def _name_lines(name: str, summary: str) -> list[str]:
 
 def _split_help(text: str) -> tuple[str, list[str], list[str]]:
     """Summary, paragraphs and lines of examples of a help text."""
-    paragraphs = [p for p in re.split(r"\n\s*\n", _dedent(text)) if p.strip()]
+    import inspect
+
+    paragraphs = [p for p in re.split(r"\n\s*\n", inspect.cleandoc(text)) if p.strip()]
     examples = [p for p in paragraphs if p.startswith("\b\nExamples:")]
     others = [p for p in paragraphs[1:] if p not in examples]
     lines = [line.removeprefix("  ") for p in examples for line in p.splitlines()[2:]]
     return " ".join(paragraphs[0].split()), others, lines
-
-
-def _dedent(text: str) -> str:
-    import inspect
-
-    return inspect.cleandoc(text)
 
 
 def _synopsis(ctx: click.Context) -> list[str]:
@@ -212,14 +208,9 @@ def _verbatim(text: list[str]) -> list[str]:
 
 
 def _terms(rows: tuple[tuple[str, str], ...] | list[tuple[str, str]]) -> list[str]:
-    return [
-        line for term, text in rows for line in (".TP", rf"\fB{_breakable(_escape(term))}\fR", *_fill(text))
-    ]
-
-
-def _breakable(term: str) -> str:
-    """Lines may break behind each value of a long list."""
-    return term.replace("|", r"|\:")
+    # Lines may break behind each value of a long list.
+    named = [(_escape(term).replace("|", r"|\:"), text) for term, text in rows]
+    return [line for term, text in named for line in (".TP", rf"\fB{term}\fR", *_fill(text))]
 
 
 def _fill(text: str) -> list[str]:

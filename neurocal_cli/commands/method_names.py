@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import click
 
-__all__ = ["MethodNames"]
+__all__ = ["methods_option"]
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 # Those of `comparison.by_method`, which a test compares.
 NAMES = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 
 
-class MethodNames(click.ParamType):  # type: ignore[type-arg]
+class _MethodNames(click.ParamType):  # type: ignore[type-arg]
     """Names of methods, separated by commas; a tuple without repetitions."""
 
     name = "methods"
@@ -25,3 +28,15 @@ class MethodNames(click.ParamType):  # type: ignore[type-arg]
         if not names or any(name not in NAMES for name in names):
             self.fail(f"{value!r} is not a list of {', '.join(NAMES)}.", param, ctx)
         return names
+
+
+def methods_option(default: str) -> Callable[[F], F]:
+    """Add ``--methods``, the methods to compare."""
+    return click.option(
+        "--methods",
+        metavar="M,...",
+        type=_MethodNames(),
+        default=default,
+        help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro "
+        "with the paper's trainer.",
+    )

@@ -17,7 +17,13 @@ __all__ = [
     "Argument",
     "Command",
     "FiniteNumber",
+    "alpha_option",
+    "camera_name_option",
+    "check_alpha",
+    "check_camera_name",
     "check_plot",
+    "input_argument",
+    "interpolation_option",
     "json_option",
     "lean_option",
     "output_option",
@@ -86,17 +92,20 @@ class FiniteNumber(FloatParamType):
         return number
 
 
+def input_argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
+    """Add an argument that names what is read."""
+    return click.argument(name, metavar=metavar, type=INPUT, cls=Argument, description=description, **more)
+
+
 def points_argument(f: F) -> F:
     """Add POINTS..., one or more CSV files that are read as one."""
-    return click.argument(
+    return input_argument(
         "points",
+        "POINTS...",
+        "CSV files with the columns X,Y,Z,u,v and optionally view. Several files are read as "
+        "one; - is standard input.",
         nargs=-1,
         required=True,
-        metavar="POINTS...",
-        type=INPUT,
-        cls=Argument,
-        description="CSV files with the columns X,Y,Z,u,v and optionally view. Several files are read as "
-        "one; - is standard input.",
     )(f)
 
 
@@ -111,6 +120,52 @@ def output_option(metavar: str, what: str) -> Callable[[F], F]:
         show_default="standard output",
         help=f"Write {what} to this file.",
     )
+
+
+camera_name_option = click.option(
+    "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
+)
+
+
+def check_camera_name(name: str) -> None:
+    """Refuse a name that no file can hold.
+
+    Raises
+    ------
+    UsageError
+    """
+    if not name.strip() or not name.isprintable():
+        raise UsageError("--camera-name must hold printable characters only; give another name")
+
+
+def alpha_option(default: str) -> Callable[[F], F]:
+    """Add ``--alpha``, how much of the original images is shown; see `check_alpha`."""
+    return click.option(
+        "--alpha",
+        metavar="ALPHA",
+        type=FiniteNumber(),
+        show_default=default,
+        help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
+    )
+
+
+def check_alpha(alpha: float | None) -> None:
+    """Refuse an alpha that is no share.
+
+    Raises
+    ------
+    UsageError
+    """
+    if alpha is not None and not 0 <= alpha <= 1:
+        raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
+
+
+interpolation_option = click.option(
+    "--interpolation",
+    type=click.Choice(["nearest", "linear", "cubic", "lanczos"]),
+    default="cubic",
+    help="Interpolation between the pixels of an image.",
+)
 
 
 def json_option(f: F) -> F:

@@ -4,16 +4,20 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
-from neurocal_cli.commands.streams import is_terminal, tell_more, verbose
+from neurocal_cli.commands.streams import complain, is_terminal, tell_more, verbose
+from neurocal_cli.errors import FormatError, InputError, NeurocalError
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-__all__ = ["ProgressBar"]
+__all__ = ["ProgressBar", "each_of"]
+
+T = TypeVar("T")
 
 _PATIENCE = 0.5  # seconds before the bar appears; shorter work shows nothing
 
@@ -60,3 +64,41 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         if self._bar is not None:
             self._bar.stop()
         tell_more(f"{time.monotonic() - self._start:7.2f} s  {'done' if kind is None else 'stopped'}")
+
+
+def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str) -> dict[int, str]:
+    """Do the work on each item; of several, those that fail are told and left out.
+
+    Parameters
+    ----------
+    items : sequence
+    work : callable
+    what, done : str
+        In words: what the items are, and what is done to them.
+
+    Returns
+    -------
+    failed : dict of str by int
+        Why, by the item's place.
+
+    Raises
+    ------
+    InputError, FormatError
+        The only item fails.
+    NeurocalError
+        All of them do.
+    """
+    failed: dict[int, str] = {}
+    with ProgressBar() as progress:
+        for k, item in enumerate(items):
+            try:
+                work(item)
+            except (InputError, FormatError) as error:
+                if len(items) == 1:
+                    raise
+                complain(str(error))
+                failed[k] = str(error)
+            progress(f"{k + 1} of {len(items)} {what}", (k + 1) / len(items))
+    if len(failed) == len(items):
+        raise NeurocalError(f"none of the {len(items)} {what} could be {done}; see the reasons above")
+    return failed

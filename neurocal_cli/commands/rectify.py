@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, json_option
-from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, complain, note, say, warn
+from neurocal_cli.commands.options import (
+    Command,
+    alpha_option,
+    check_alpha,
+    input_argument,
+    interpolation_option,
+    json_option,
+)
+from neurocal_cli.commands.progress import each_of
+from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import print_summary
-from neurocal_cli.errors import FormatError, InputError, NeurocalError, UsageError
+from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,35 +34,20 @@ _SIDES = ("left", "right")
 
 
 @click.command(cls=Command)
-@click.argument(
+@input_argument(
     "rig",
-    metavar="RIG.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="A rig of neurocal, or of another program that neurocal convert reads; - is standard input.",
+    "RIG.yaml",
+    "A rig of neurocal, or of another program that neurocal convert reads; - is standard input.",
 )
-@click.argument(
+@input_argument(
     "files",
-    nargs=-1,
-    metavar="LEFT... RIGHT...",
-    type=INPUT,
-    cls=Argument,
-    description="Images of the left camera and as many of the right one, in the same order: files, file name "
+    "LEFT... RIGHT...",
+    "Images of the left camera and as many of the right one, in the same order: files, file name "
     "patterns or one folder each. Or CSV files of points.",
+    nargs=-1,
 )
-@click.option(
-    "--alpha",
-    metavar="ALPHA",
-    type=FiniteNumber(),
-    show_default="not scaled",
-    help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
-)
-@click.option(
-    "--interpolation",
-    type=click.Choice(["nearest", "linear", "cubic", "lanczos"]),
-    default="cubic",
-    help="Interpolation between the pixels of an image.",
-)
+@alpha_option("not scaled")
+@interpolation_option
 @click.option(
     "--side-by-side",
     is_flag=True,
@@ -117,12 +109,13 @@ def rectify(
           --side-by-side --json -o pairs
     """  # noqa: D301 - as in the group
     check_one_stdin(rig, *files)
-    if alpha is not None and not 0 <= alpha <= 1:
-        raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
+    check_alpha(alpha)
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
     if os.path.exists(output) and not os.path.isdir(output):
         raise UsageError(f"-o {output} is a file; give a folder")
+    from neurocal_cli.io.image_paths import is_image
+
     sides = _sides(files)
     _check_outputs(sides, output)
     found = _read_rig(rig)
@@ -130,10 +123,10 @@ def rectify(
     work.tell_rows_of_rig()
     if maps:
         work.write_maps()
-    if files and work.is_points(sides[0][0]):
-        work.rectify_points(sides)
-    elif files:
+    if files and is_image(sides[0][0]):
         work.rectify_images(sides)
+    elif files:
+        work.rectify_points(sides)
     if as_json:
         print_summary(work.summary)
 
@@ -204,13 +197,6 @@ class _Work:
         self.pair = rectified_pair(self.rig, self.alpha)
         self.summary["along"] = "rows" if self.pair.axis == 0 else "columns"
 
-    @staticmethod
-    def is_points(path: str) -> bool:
-        """Whether a file is a table of points."""
-        from neurocal_cli.io.image_paths import IMAGE_ENDINGS
-
-        return not path.lower().endswith(IMAGE_ENDINGS)
-
     def tell_rows_of_rig(self) -> None:
         """Say how well the rows of the points agree from which the rig was found."""
         from neurocal_cli.report import number_or_none
@@ -261,19 +247,7 @@ class _Work:
     def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
         """Rectify all pairs; those that fail are named and left out."""
         pairs = list(zip(*sides, strict=True))
-        done = 0
-        with ProgressBar() as progress:
-            for number, pair in enumerate(pairs, start=1):
-                try:
-                    self._rectify_pair(pair)
-                    done += 1
-                except (InputError, FormatError) as error:
-                    if len(pairs) == 1:
-                        raise
-                    complain(str(error))
-                progress(f"{number} of {len(pairs)} pairs", number / len(pairs))
-        if not done:
-            raise NeurocalError(f"none of the {len(pairs)} pairs could be rectified; see the reasons above")
+        done = len(pairs) - len(each_of(pairs, self._rectify_pair, "pairs", "rectified"))
         self.summary["images"] = {"pairs": len(pairs), "rectified": done}
         self._tell(f"rectified {done} of {len(pairs)} pair{'s' * (len(pairs) != 1)}")
 

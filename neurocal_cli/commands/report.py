@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, output_option
+from neurocal_cli.commands.options import Command, input_argument, output_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
@@ -21,12 +21,10 @@ _MOST_BYTES = 1_400_000  # of all photographs; as text in the page they take a t
 
 
 @click.command(cls=Command)
-@click.argument(
+@input_argument(
     "result",
-    metavar="CAMERA.yaml|RIG.yaml|LENS.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="What neurocal calibrate, stereo or lens fit wrote; - is standard input.",
+    "CAMERA.yaml|RIG.yaml|LENS.yaml",
+    "What neurocal calibrate, stereo or lens fit wrote; - is standard input.",
 )
 @click.option(
     "--images",

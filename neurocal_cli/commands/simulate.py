@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import json
 import os
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.method_names import MethodNames
+from neurocal_cli.commands.method_names import methods_option
 from neurocal_cli.commands.options import INPUT, Command, FiniteNumber, check_plot, json_option, plot_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
+from neurocal_cli.commands.summaries import print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
@@ -88,14 +88,7 @@ def _is_number(word: str) -> bool:
     default=50,
     help="Number of trials at each sigma, as in the paper.",
 )
-@click.option(
-    "--methods",
-    metavar="M,...",
-    type=MethodNames(),
-    default=_DEFAULT_METHODS,
-    help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro with "
-    "the paper's trainer.",
-)
+@methods_option(_DEFAULT_METHODS)
 @click.option(
     "--random-starts",
     metavar="N",
@@ -279,7 +272,7 @@ def _compare(
         found |= noise_json(study)
         if starts is not None:
             found["random_starts"] = starts_json(starts)
-        click.echo(json.dumps(found, indent=2, allow_nan=False))
+        print_summary(found)
     else:
         _show(*simulation_tables(study, starts, paper))
 
@@ -296,7 +289,7 @@ def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool
 
         write_whole(plot, draw_rates(study, _kind(plot)))
     if as_json:
-        click.echo(json.dumps(rates_json(study), indent=2, allow_nan=False))
+        print_summary(rates_json(study))
     else:
         _show(*rates_tables(study))
 

@@ -11,8 +11,8 @@ import click
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
 from neurocal_cli.commands.options import (
     INPUT,
-    Argument,
     Command,
+    input_argument,
     lean_option,
     output_option,
 )
@@ -36,16 +36,8 @@ _NOT_CONVERGED = 3
 
 
 @click.command(cls=Command)
-@click.argument(
-    "left",
-    metavar="LEFT.csv",
-    type=INPUT,
-    cls=Argument,
-    description="Points of the left camera; - is standard input.",
-)
-@click.argument(
-    "right", metavar="RIGHT.csv", type=INPUT, cls=Argument, description="Points of the right camera."
-)
+@input_argument("left", "LEFT.csv", "Points of the left camera; - is standard input.")
+@input_argument("right", "RIGHT.csv", "Points of the right camera.")
 @estimation_options_without_files
 @click.option(
     "--left-intrinsics",

@@ -6,7 +6,13 @@ import os
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, check_plot, output_option, plot_option
+from neurocal_cli.commands.options import (
+    Command,
+    check_plot,
+    input_argument,
+    output_option,
+    plot_option,
+)
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import say
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
@@ -16,12 +22,8 @@ __all__ = ["target"]
 
 
 @click.command(cls=Command)
-@click.argument(
-    "camera",
-    metavar="CAMERA.yaml",
-    type=INPUT,
-    cls=Argument,
-    description="A calibration that `neurocal calibrate` wrote; - is standard input.",
+@input_argument(
+    "camera", "CAMERA.yaml", "A calibration that `neurocal calibrate` wrote; - is standard input."
 )
 @plot_option("the heights of the board's points and their shifts")
 @summary_option

@@ -8,7 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.options import INPUT, Argument, Command, FiniteNumber, output_option
+from neurocal_cli.commands.options import (
+    Command,
+    FiniteNumber,
+    input_argument,
+    output_option,
+)
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
@@ -27,15 +32,13 @@ _MANY_OFF = 0.5  # share of the points that no bad luck explains
 
 
 @click.command(cls=Command)
-@click.argument(
+@input_argument(
     "inputs",
-    metavar="RIG.yaml MATCHES.csv",
+    "RIG.yaml MATCHES.csv",
+    "A rig, or LEFT.yaml RIGHT.yaml, two calibrations with a view in common; then a CSV file of "
+    "pixels with the columns uL,vL,uR,vR and optionally point. - is standard input.",
     nargs=-1,
     required=True,
-    type=INPUT,
-    cls=Argument,
-    description="A rig, or LEFT.yaml RIGHT.yaml, two calibrations with a view in common; then a CSV file of "
-    "pixels with the columns uL,vL,uR,vR and optionally point. - is standard input.",
 )
 @click.option(
     "--sigma",
@@ -154,6 +157,7 @@ class _Tally:
         self.points = self.behind = self.off = self.outside = 0
 
     def triangulated(self, batches: Iterable[Matches]) -> Iterator[tuple[Triangulated, Any]]:
+        """The points of each batch of matches, and their names."""
         from neurocal_cli.stereo.triangulation import triangulate as solve
 
         rig = self.rig

@@ -42,14 +42,6 @@ class WideLens:
         away = pixels - self.centre
         return np.asarray(np.hypot(away[..., 0], away[..., 1]) / self.focal)
 
-    def rays(self, pixels: Array) -> Array:
-        """Unit vectors (..., 3) that pixels (..., 2) see; z is the axis."""
-        away = pixels - self.centre
-        radius = np.hypot(away[..., 0], away[..., 1])
-        angle = np.minimum(radius / self.focal, _FARTHEST)
-        share = np.where(radius > 0, np.sin(angle) / np.where(radius > 0, radius, 1.0), 1 / self.focal)
-        return np.concatenate([away * share[..., None], np.cos(angle)[..., None]], axis=-1)
-
     def pixels(self, directions: Array) -> Array:
         """Pixels (..., 2) of directions (..., 3) of any length."""
         across = np.hypot(directions[..., 0], directions[..., 1])

@@ -184,6 +184,7 @@ class _Chain:
     wanted: str | None = None
 
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
+        """Fits of all models that the points support, each begun from the best of the simpler ones."""
         fitted: dict[str, Candidate] = {}
         least = self._cost(state)
         for model in ("none", *_CHAIN):

@@ -80,7 +80,7 @@ def with_displacement(solution: Solution) -> Solution:
 
 
 def promised(solution: Solution, repeated: RepeatedPoses) -> Array:
-    """Squared error of each view when it is left out, as a rich lens promises it that is not yet adjusted.
+    """Squared error (V,) of views that are left out, as a rich lens promises it that is not yet adjusted.
 
     Parameters
     ----------

@@ -184,6 +184,7 @@ class _Images:
         return self.images.whiten(uu * dx + uv * dy, vu * dx + vv * dy)
 
     def errors(self) -> Array:
+        """Whitened distances (N,) of the points across their curves."""
         return self.nu[0] * self.error[0] + self.nu[1] * self.error[1]
 
     def across(self, direction: Array) -> Array:

@@ -84,7 +84,7 @@ def _crosses(pixels: Array | None, width: int) -> str:
 
 
 def enlargement(residuals: Array, size: tuple[int, int]) -> float:
-    """A round factor by which residuals can be seen in an image of this size."""
+    """A round factor by which residuals (N, 2) can be seen in an image of this size; all in px."""
     rms = float(np.sqrt(np.mean(np.sum(residuals**2, axis=1)))) if len(residuals) else 0.0
     if not rms > 0:
         return 1.0
@@ -94,7 +94,7 @@ def enlargement(residuals: Array, size: tuple[int, int]) -> float:
 
 
 def scatter(residuals: Array) -> str:
-    """The residuals du, dv as points, with a circle of three times the rms of a coordinate."""
+    """The residuals (N, 2) [px] as points, with a circle of three times the rms of a coordinate."""
     sigma = float(np.sqrt(np.mean(residuals**2))) if len(residuals) else 0.0
     if not sigma > 0:
         return ""

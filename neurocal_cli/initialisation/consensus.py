@@ -151,6 +151,7 @@ class _Search:
         self.spread = np.sqrt(np.nanvar(seen, axis=1).sum(axis=1))
 
     def run(self) -> None:
+        """Search until two starts of each view agree, in a few rounds at most."""
         open_views = np.arange(len(self.members))
         for _ in range(_ROUNDS):
             if not open_views.size:

@@ -27,6 +27,7 @@ _OPTIONS = DescentOptions(
 )  # fmt: skip
 _FLOOR = 1e-28  # loss that rounding alone accounts for
 _LONGEST = 2.0  # step of any entry; in the logarithm a factor of 7
+_STARTS = 8  # at random, trained side by side
 _ENOUGH = 3  # starts that have ended at the same, lowest loss
 
 
@@ -58,7 +59,6 @@ def shared_intrinsics(
     given: Array,
     free: NDArray[np.bool_],
     rng: np.random.Generator,
-    starts: int = 8,
 ) -> SharedIntrinsics:
     """Learn W from the products of all views.
 
@@ -73,11 +73,9 @@ def shared_intrinsics(
     free : (5,) bool array
         Of W11, W12, W22, W13, W23. W11 and W22 stay positive.
     rng : numpy.random.Generator
-    starts : int
-        Random starts, trained side by side.
     """
     conditions = _Conditions(solid, flat, free)
-    p = np.where(free, rng.uniform(-1, 1, (starts, 5)), _to_log(given))
+    p = np.where(free, rng.uniform(-1, 1, (_STARTS, 5)), _to_log(given))
     p[:, [0, 2]] = np.where(free[[0, 2]], np.log(np.abs(p[:, [0, 2]]) + 1e-3), p[:, [0, 2]])
     p, loss = _minimum(conditions, p)
     order = np.argsort(loss, kind="stable")
@@ -86,11 +84,11 @@ def shared_intrinsics(
     entries[:, [0, 2]] = np.exp(p[:, [0, 2]])
     agreed = int((np.abs(loss - loss[0]) <= _tie(loss[0])).sum())
     distinct = [0]
-    for n in range(1, starts):
+    for n in range(1, _STARTS):
         gap = np.abs(p[n] - p[distinct]).max(axis=1).min()
         if np.isfinite(loss[n]) and gap > 1e-2:
             distinct.append(n)
-    return SharedIntrinsics(entries[distinct], loss[distinct], starts, agreed)
+    return SharedIntrinsics(entries[distinct], loss[distinct], _STARTS, agreed)
 
 
 def _to_log(entries: Array) -> Array:

@@ -12,9 +12,14 @@ from pathlib import Path
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.files import one_line
 
-__all__ = ["IMAGE_ENDINGS", "find_images", "natural_order", "view_names"]
+__all__ = ["find_images", "is_image", "natural_order", "view_names"]
 
-IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm")
+_ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm")
+
+
+def is_image(path: str) -> bool:
+    """Whether a file is an image, by the ending of its name."""
+    return path.lower().endswith(_ENDINGS)
 
 
 def find_images(words: Iterable[str]) -> tuple[str, ...]:
@@ -79,11 +84,11 @@ def _in_folder(folder: str) -> list[str]:
     except OSError as error:
         raise FormatError("may not be read; change its permissions", one_line(folder)) from error
     # Hidden files are other programs' business: previews, half of a copy.
-    names = [name for name in names if name.lower().endswith(IMAGE_ENDINGS) and not name.startswith(".")]
+    names = [name for name in names if is_image(name) and not name.startswith(".")]
     paths = [path for path in (os.path.join(folder, name) for name in names) if os.path.isfile(path)]
     if not paths:
         raise FormatError(
-            f"holds no images ({', '.join(IMAGE_ENDINGS)}); give a folder that does", one_line(folder)
+            f"holds no images ({', '.join(_ENDINGS)}); give a folder that does", one_line(folder)
         )
     return paths
 

@@ -68,11 +68,6 @@ class Image:
     notes: tuple[str, ...] = ()
 
     @property
-    def bits(self) -> int:
-        """Bits of a pixel, 8 or 16."""
-        return 8 * self.grey.dtype.itemsize
-
-    @property
     def size(self) -> tuple[int, int]:
         """Width and height [px]."""
         return self.grey.shape[1], self.grey.shape[0]
@@ -123,10 +118,10 @@ def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
     return parse_image(*read_bytes(path), most_pixels)
 
 
-def read_picture(path: str | Path, most_pixels: int = MOST_PIXELS) -> Picture:
+def read_picture(path: str | Path) -> Picture:
     """Read an image with its colours; else as `read_image` does."""
     data, source = read_bytes(path)
-    pixels, notes = _upright(data, source, most_pixels, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
+    pixels, notes = _upright(data, source, MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     return Picture(pixels if pixels.ndim == 2 else pixels[..., ::-1], source, notes)
 
 
@@ -181,7 +176,7 @@ def encode_png(picture: NDArray[np.uint8]) -> bytes:
 
 
 def shrink(grey: NDArray[np.uint8] | NDArray[np.uint16], width: int) -> NDArray[np.uint8]:
-    """An image of 8 bits that is no wider than so many pixels."""
+    """The (H, W) image with 8 bits, and no wider than so many pixels."""
     eight = (grey // 257 if grey.dtype == np.uint16 else grey).astype(np.uint8, copy=False)
     if eight.shape[1] <= width:
         return eight

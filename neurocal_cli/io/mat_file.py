@@ -18,7 +18,7 @@ from neurocal_cli.errors import FormatError
 __all__ = ["read_variables"]
 
 _HEADER = 128  # bytes
-_MATRIX, _COMPRESSED, _UTF8 = 14, 15, 16
+_MATRIX, _COMPRESSED = 14, 15
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _TEXT_TYPES = {2: "utf-8", 4: "utf-16", 16: "utf-8", 17: "utf-16", 1: "utf-8"}
 _CELL, _STRUCT, _CHAR = 1, 2, 4

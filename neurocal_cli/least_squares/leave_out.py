@@ -99,7 +99,7 @@ def solve_or_nan(S: Array, g: Array) -> Array:
 
 
 def inverse_or_nan(S: Array) -> Array:
-    """S^-1 of a stack of symmetric matrices; nan where they are singular to rounding."""
+    """S^-1 of symmetric matrices (..., n, n); nan where they are singular to rounding."""
     return _solved(S, np.broadcast_to(np.eye(S.shape[-1]), S.shape))
 
 

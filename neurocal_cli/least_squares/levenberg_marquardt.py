@@ -113,27 +113,13 @@ class DescentOptions:
 
 
 class Stop(IntEnum):
-    """How the descent of a group ended; `sentence` says it in words."""
+    """How the descent of a group ended."""
 
-    LIMIT = 0
-    STUCK = 1
-    CONVERGED = 2
-    FLAT = 3
-    EXACT = 4
-
-    @property
-    def sentence(self) -> str:
-        """For people."""
-        return _SENTENCES[self]
-
-
-_SENTENCES = {
-    Stop.LIMIT: "The limit of iterations was reached.",
-    Stop.STUCK: "No step of any length lowers the sum of squares.",
-    Stop.CONVERGED: "The last step gained next to nothing.",
-    Stop.FLAT: "The last step promised next to nothing and gained nothing.",
-    Stop.EXACT: "What is left of the sum of squares is rounding.",
-}
+    LIMIT = 0  # of iterations
+    STUCK = 1  # no step of any length lowers the sum of squares
+    CONVERGED = 2  # the last step gained next to nothing
+    FLAT = 3  # the last step promised next to nothing and gained nothing
+    EXACT = 4  # what is left of the sum of squares is rounding
 
 
 @frozen_dataclass(eq=False)

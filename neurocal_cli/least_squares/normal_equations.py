@@ -66,7 +66,7 @@ def damped_step(H: Array, g: Array, damping: Array) -> tuple[Array, Array]:
 
 
 def inverse_scaled(H: Array, reference: Array) -> tuple[Array, float]:
-    """Inverse of symmetric matrices, and their smallest eigenvalue relative to `reference`'s diagonal.
+    """Inverse of symmetric matrices (..., n, n), and their smallest eigenvalue by `reference`'s diagonal.
 
     The inverse is nan and the eigenvalue 0 where a matrix is singular.
     """

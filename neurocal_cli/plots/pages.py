@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration
 from neurocal_cli.geometry import Array
 from neurocal_cli.plots.figure import ACCENT, INK, picture, plain, style
 from neurocal_cli.plots.residuals import draw_learning, draw_residuals, draw_scatter, draw_views
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-__all__ = ["draw_calibration", "draw_camera", "draw_points_in_space", "draw_rig"]
+__all__ = ["draw_camera", "draw_points_in_space", "draw_rig"]
 
 _PAD = 0.12  # inches
 _PAGE = (16.0, 12.5)
@@ -31,12 +30,12 @@ _ROWS = (("residuals", "coverage", "uncertainty"), ("scatter", "poses", "learnin
 Draw = Callable[["Axes"], None]
 
 
-def draw_calibration(calibration: Calibration, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw how well a calibrated camera fits, where it can be trusted, and how its network learned.
+def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -> bytes:
+    """Draw how well a camera fits, where it can be trusted, and how its network learned.
 
     Parameters
     ----------
-    calibration : Calibration
+    subject : Subject
     kind : {"png", "pdf", "svg"}
     panel : str, optional
         One of `plots.CAMERA_PANELS` by itself; default: all on one page.
@@ -44,18 +43,13 @@ def draw_calibration(calibration: Calibration, kind: str = "png", panel: str | N
     Returns
     -------
     picture : bytes
-        The same for the same calibration, byte for byte.
+        The same for the same subject, byte for byte.
 
     Raises
     ------
     NeurocalError
         matplotlib is not installed.
     """
-    return draw_camera(Subject.of(calibration), kind, panel)
-
-
-def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw a camera and the points that it was judged by; see `draw_calibration`."""
     panels = _camera_panels(subject)
     if panel is not None:
         return _alone(panel, panels[panel], kind)
@@ -63,7 +57,7 @@ def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -
 
 
 def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw both cameras of a rig side by side; see `draw_calibration`.
+    """Draw both cameras of a rig side by side; see `draw_camera`.
 
     Parameters
     ----------
@@ -107,7 +101,7 @@ def _with_side(side: str, draw: Draw) -> Draw:
 def draw_points_in_space(
     evaluation: StereoEvaluation, rig: Rig | None, kind: str = "png", panel: str | None = None
 ) -> bytes:
-    """Draw the errors of triangulated points; see `draw_calibration`.
+    """Draw the errors of triangulated points; see `draw_camera`.
 
     Parameters
     ----------

@@ -48,7 +48,6 @@ def adjust_rig(
     observations: tuple[Observations, Observations],
     start: RigState,
     free: NDArray[np.bool_],
-    max_iterations: int = 200,
 ) -> AdjustedRig:
     """Minimise the reprojection error of both cameras from a start near the minimum.
 
@@ -60,10 +59,9 @@ def adjust_rig(
         With all points in front of their cameras.
     free : (n_shared,) bool array
         Which parameters of the cameras and the rig are free; the poses always are.
-    max_iterations : int
     """
     problem = _RigReprojection(frames, observations, start, free)
-    options = replace(OPTIONS, damping=_DAMPING, max_iterations=max_iterations)
+    options = replace(OPTIONS, damping=_DAMPING)
     floor = FLOOR**2 * sum(observed.n_equations * observed.weight for observed in observations)
     outcome = minimise(problem, options, floor)
     settled = bool(outcome.settled[0])

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, InputError
+from neurocal_cli.evaluation import refuse_another_size
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.pipeline.common_target import on_one_target
 from neurocal_cli.points import Correspondences
@@ -154,6 +155,7 @@ class _Evaluator:
         ]
 
     def evaluation(self) -> StereoEvaluation:
+        """The errors of all points, through the poses of the views and through the rig."""
         fitted = self._fit_new() if self.new else None
         by_view = self._by_view(fitted)
         through = None if self.rig is None else self._through_rig(self.rig, fitted)
@@ -243,12 +245,7 @@ class _Evaluator:
 
 
 def _refuse_other(camera: Calibration, points: Correspondences) -> None:
-    here, there = points.image_size, camera.image_size
-    if here is not None and there is not None and here != there:
-        raise InputError(
-            f"{points.source}: the points' image_size {here[0]} x {here[1]} differs from the camera's "
-            f"{there[0]} x {there[1]}; evaluate on images of the camera's size"
-        )
+    refuse_another_size(camera, points)
     if points.unit != camera.unit:
         raise InputError(
             f"{points.source} is in {points.unit}, but the calibration in {camera.unit}; give both in one "

@@ -71,12 +71,6 @@ class RigProblem:
     flat: NDArray[np.bool_]
 
     @property
-    def own_cost(self) -> tuple[Array, Array]:
-        """Whitened squared residuals of each view in its camera alone, two (V_c,) arrays."""
-        left, right = self.own_normal
-        return left[:, -1, -1], right[:, -1, -1]
-
-    @property
     def pairs(self) -> list[tuple[str, str]]:
         """Left and right names of the paired views."""
         left, right = self.names

@@ -126,6 +126,7 @@ class _RigAssembly:
                 self.covariance = _widened(self.covariance, self.covariance.shared + more)
 
     def rig(self, left_out: Mapping[tuple[str, str], str]) -> Rig:
+        """The rig in pixels and world units, with the pairs left out and why."""
         state, frames = self.adjusted.state, self.problem.frames
         errors = [
             _squared_errors(observed, state.camera_with_poses(side, frames, observed))

@@ -116,11 +116,11 @@ class Rig:
 
 
 def essential_matrix(pose: Pose) -> Array:
-    """Essential matrix ``[t]x R`` of ``X_right = R X_left + t``: x_right^T E x_left = 0."""
+    """Essential matrix (3, 3) ``[t]x R`` of ``X_right = R X_left + t``: x_right^T E x_left = 0."""
     return np.asarray(cross_matrix(pose.t) @ pose.R)
 
 
 def fundamental_matrix(left: Intrinsics, right: Intrinsics, pose: Pose) -> Array:
-    """Fundamental matrix ``A_right^-T E A_left^-1`` of unit Frobenius norm: m_right^T F m_left = 0."""
+    """Fundamental matrix (3, 3) ``A_right^-T E A_left^-1`` of unit norm: m_right^T F m_left = 0."""
     F = np.linalg.solve(right.A.T, essential_matrix(pose)) @ np.linalg.inv(left.A)
     return np.asarray(F / np.linalg.norm(F))

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from neurocal_cli.calibration import Calibration, camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
-from neurocal_cli.errors import InputError, UsageError
+from neurocal_cli.errors import InputError, check_choice
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.two_view_points import PointBatch
@@ -100,8 +100,7 @@ def triangulate(
     InputError
         Arrays of different lengths.
     """
-    if method not in METHODS:
-        raise UsageError(f"method must be one of {', '.join(METHODS)}, not {method!r}")
+    check_choice("method", method, METHODS)
     pixels = _pixels(left_pixels), _pixels(right_pixels)
     n = len(pixels[0])
     if len(pixels[1]) != n:
@@ -152,6 +151,7 @@ class _Rigs:
 
     @classmethod
     def of(cls, poses: Sequence[Pose], which: NDArray[np.intp] | None, n: int) -> _Rigs:
+        """Rigs with these poses, for n points."""
         if len(poses) != 1 and (which is None or len(which) != n):
             raise InputError(f"with several rigs, give the number of the rig of each of the {n} points")
         R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.projection import image_points_with_jacobian, nearly_rays
+from neurocal_cli.camera.monotonic import nearly_undistorted
+from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 from neurocal_cli.geometry import Array
 
 __all__ = ["PointBatch"]
@@ -70,7 +71,7 @@ class PointBatch:
     def optimal(self) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
         """Least-squares points (n, 3), covariances (n, 6), epipolar errors, and which points are behind."""
         (x, y), right = (
-            nearly_rays(camera.entries, camera.distortion, *pixels)
+            nearly_undistorted(camera.distortion, *normalised_points(camera.entries, *pixels))
             for camera, pixels in zip(self.cameras, self.pixels, strict=True)
         )
         w = self._nearest_w(x, y, *right)

@@ -180,6 +180,7 @@ class _BestStarts:
             )
 
     def result(self) -> Learnt:
+        """The best start of each view."""
         return Learnt(
             self.W, self.V, self.rms, self.starts, self.agreed, self.iterations, self.in_front, self.curve
         )

@@ -177,6 +177,7 @@ class _AtMinimum:
         return weighed(self.points, -self._residuals())
 
     def evidence(self) -> Evidence:
+        """Everything that the rules look at."""
         views = self.views
         precision, contradiction = self._precision()
         # Where a target was found, what it does not explain differs from view to view: it bends anew.

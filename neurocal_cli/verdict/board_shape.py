@@ -174,6 +174,7 @@ class _Frame:
 
     @classmethod
     def of(cls, views: Views) -> _Frame | None:
+        """Axes of the points of all views, None where they lie in no plane."""
         world = views.local * np.repeat(views.scale, views.counts)[:, None]
         world += np.repeat(views.centre, views.counts, axis=0)
         centre = world.mean(axis=0)

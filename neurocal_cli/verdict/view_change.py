@@ -175,6 +175,7 @@ class _ScoreTest:
 
     @classmethod
     def of(cls, scores: Quadratics, step: Array, variance: float) -> _ScoreTest:
+        """Scores of the parameter that moves the free ones by a step (f,)."""
         B = scores.S @ step
         return cls(scores.g @ step, B @ step, B, inverse_or_nan(scores.S.sum(axis=0)), variance)
 

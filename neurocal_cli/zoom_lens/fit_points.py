@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.camera.distortion import MODELS, WIDE, WITH_PRISM
-from neurocal_cli.errors import UsageError
-from neurocal_cli.target import TARGETS
+from neurocal_cli.errors import check_choice
+from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.zoom_lens.committee import Budget
 from neurocal_cli.zoom_lens.cross_validation import left_out_errors
 from neurocal_cli.zoom_lens.distortion_selection import choose_model
@@ -93,37 +93,34 @@ def fit_lens(
     InputError, DegenerateGeometryError
         The points do not determine a zoom lens; the message says why.
     """
-    for name, value, choices in (
-        ("distortion", distortion, DISTORTIONS),
-        ("training", training, TRAININGS),
-        ("outliers", outliers, OUTLIERS),
-        ("camera", camera, CAMERAS),
-        ("target", target, TARGETS),
-    ):
-        if value not in choices:
-            raise UsageError(f"{name} must be one of {', '.join(choices)}, not {value!r}")
+    check_choice("distortion", distortion, DISTORTIONS)
+    check_choice("training", training, TRAININGS)
+    check_choice("outliers", outliers, OUTLIERS)
+    check_choice("camera", camera, CAMERAS)
+    check_choice("target", target, TARGETS)
     report = progress or (lambda stage, share: None)
     lens = points.varying()
     check_settings(lens.n_settings, len(lens.controls), lens.points.source)
-    one_view = np.bincount(lens.view_setting).max() == 1
-    budget = Budget(topologies=topologies)
-    options = FitOptions(
-        training, camera == "still" or (camera == "auto" and bool(one_view)), skew, budget, seed
-    )
+    still = camera == "still" or (camera == "auto" and bool(np.bincount(lens.view_setting).max() == 1))
+    options = FitOptions(training, still, skew, Budget(topologies=topologies), seed)
     reject = outliers == "reject"
-    found = None if options.still else lens_target(lens, target, distortion, skew, seed, report)
+    found = None if still else lens_target(lens, target, distortion, skew, seed, report)
     lens = on_target(lens, found)
     if distortion == "auto":
         start = choose_model(lens, options, reject, report)
     else:
         start = calibrate_settings(lens, distortion, options, reject, report)
     start, joints = _train(start, options, reject, report)
-    if found is None:
-        return assemble(start, joints, options)
+    fitted = assemble(start, joints, options)
+    return fitted if found is None else _with_target(fitted, start, found)
+
+
+def _with_target(fitted: ZoomLens, start: CalibratedSettings, found: Target) -> ZoomLens:
+    """The lens with its target, and what the target's uncertainty makes of its own."""
     coupling = None
     with suppress(np.linalg.LinAlgError):  # a pose that nothing determines
         coupling = target_coupling(start.data, start.tables, found, start.variance)
-    return replace(assemble(start, joints, options), target=found, target_coupling=coupling)
+    return replace(fitted, target=found, target_coupling=coupling)
 
 
 def _train(

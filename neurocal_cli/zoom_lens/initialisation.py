@@ -117,7 +117,7 @@ def may_reject(rejected: Sequence[RejectedSetting], lens: LensPoints) -> bool:
 def without(
     lens: LensPoints, static: StaticFit, keep: NDArray[np.bool_], model: str, options: FitOptions
 ) -> tuple[LensPoints, PixelData, StaticFit]:
-    """The data without some settings. Nothing is calibrated again."""
+    """The data of the settings to keep (S,). Nothing is calibrated again."""
     views = keep[lens.view_setting]
     rest = lens.select(keep)
     check_settings(rest.n_settings, len(rest.controls), lens.points.source)

@@ -23,17 +23,17 @@ def grid_axes(x: Array) -> list[Array] | None:
 
 
 def lookup_matrix(axes: list[Array], x: Array) -> Array:
-    """Linear (bilinear) interpolation in a grid; the outermost cells extrapolate."""
+    """Matrix (n, nodes) of linear (bilinear) interpolation in a grid at x (n, D); the rim extrapolates."""
     return _tensor([_spline(axis, column, 1) for axis, column in zip(axes, x.T, strict=True)])
 
 
 def spline_matrix(axes: list[Array], x: Array) -> Array:
-    """Cubic (bicubic) not-a-knot splines through a grid; polynomials through fewer than 4 values."""
+    """Matrix (n, nodes) of cubic (bicubic) not-a-knot splines at x (n, D); of a few values, polynomials."""
     return _tensor([_spline(axis, column, 3) for axis, column in zip(axes, x.T, strict=True)])
 
 
 def thin_plate_matrix(nodes: Array, x: Array) -> Array:
-    """Thin-plate splines through settings anywhere; cubic in one dimension.
+    """Matrix (n, nodes) of thin-plate splines through nodes (nodes, D) anywhere, at x (n, D).
 
     The solution has the smallest norm, as all settings of two controls may be on one line. SciPy's
     `RBFInterpolator` refuses those as singular.

@@ -173,6 +173,7 @@ class _NetworkStack:
         self.diagonal = range(topology.n_weights)
 
     def set_priors(self, precision: Array | None, scatter: Array | None) -> None:
+        """Begin with precisions (B, groups) of the weights and scatters (B,), or with their usual values."""
         B = len(self.w)
         self.a = np.full((B, self.topology.n_groups), 0.3) if precision is None else precision
         # For targets without a variance, a thousandth of their spread until the noise is estimated.
@@ -244,6 +245,7 @@ class _NetworkStack:
         self.tau2 = np.where(self.tau2 < least, 0.0 if known else least, self.tau2)
 
     def result(self) -> TrainedNets:
+        """The networks as they are, with the logarithm of their evidence (B,)."""
         sign, volume = np.linalg.slogdet(self._normal())
         volume = np.where(sign > 0, volume, np.inf)
         log_prior = 0.5 * np.log(self.prior).sum(axis=1)

@@ -28,7 +28,7 @@ def bad_pixels(rms: Array) -> tuple[int, str] | None:
 
 
 def most_suspect(pixels: Array, normalised: Array) -> int | None:
-    """The setting that the others predict worst, if far worse than the rest; see `LeftOutErrors`."""
+    """The setting that the others predict worst, if far worse than the rest; of (S,) `LeftOutErrors`."""
     worst = int((normalised * pixels).argmax())
     return worst if pixels[worst] > _SUSPECT * np.median(pixels) else None
 

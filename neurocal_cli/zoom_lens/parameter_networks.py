@@ -32,7 +32,7 @@ SCALES = ("log", "linear", "inverse")
 
 
 def to_scale(scale: str, alpha: Array) -> tuple[Array, Array]:
-    """Values on a scale and their derivatives by the value."""
+    """Values on one of `SCALES`, and their derivatives by the value; of the shape of alpha."""
     if scale == "log":
         return np.log(alpha), 1 / alpha
     if scale == "inverse":
@@ -41,7 +41,7 @@ def to_scale(scale: str, alpha: Array) -> tuple[Array, Array]:
 
 
 def from_scale(scale: str, y: Array) -> tuple[Array, Array]:
-    """Values from a scale and their derivatives by y."""
+    """Values from one of `SCALES`, and their derivatives by y; of the shape of y."""
     if scale == "log":
         alpha = np.exp(y)
         return alpha, alpha
@@ -164,6 +164,6 @@ def local_to_outputs(scale: str, local: Array) -> tuple[Array, Array]:
 
 
 def split(nets: Sequence[ParameterNet], weights: Array) -> list[Array]:
-    """Split the vector of all weights into those of each network."""
+    """Split the vector (P,) of all weights into those of each network."""
     ends = np.cumsum([net.topology.n_weights for net in nets])
     return np.split(weights, ends[:-1])

@@ -116,10 +116,10 @@ class LensPoints:
 
 
 def describe(controls: tuple[str, ...], setting: Array) -> str:
-    """Text of a setting, such as ``zoom 250 focus 4``."""
+    """Text of a setting (D,), such as ``zoom 250 focus 4``."""
     return " ".join(f"{name} {value:.10g}" for name, value in zip(controls, setting, strict=True))
 
 
 def scaled_controls(settings: Array, low: Array, high: Array) -> Array:
-    """Scale settings to -1 to 1 over the calibrated range."""
+    """Scale settings (..., D) to -1 to 1 over the calibrated range from low to high (D,)."""
     return 2 * (np.asarray(settings, dtype=float) - low) / (high - low) - 1

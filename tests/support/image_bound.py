@@ -12,9 +12,8 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.simulation.rendering import Scene
-from neurocal_cli.simulation.rendering.bound import shift_gradients
 from neurocal_cli.simulation.rendering.layers import BoardLayer
-from neurocal_cli.simulation.rendering.sensor import noise_variance
+from support.picture_bound import noise_variance, shift_gradients
 
 _TO_RIM = 0.9  # squares beyond the outermost vertices; where the board ends is not part of its file
 _STEP = 1e-5

@@ -20,10 +20,7 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import (
-    Background,
-    Disc,
     Illumination,
-    Rectangle,
     Rendered,
     Scene,
     Sensor,
@@ -32,11 +29,12 @@ from neurocal_cli.simulation.rendering import (
     ground_truth,
     render,
 )
-from neurocal_cli.simulation.rendering.scene import CLUTTER_KINDS
+from support.clutter import KINDS, Clutter
+from support.occluders import Disc, Rectangle
 
 IMAGES = 8  # per condition, by default
 SQUARE = 28.0  # mm
-PLAIN = Background()
+PLAIN = Clutter()
 EVEN = Illumination()
 
 
@@ -56,7 +54,7 @@ class Recipe:
     margin: float = 0.5  # white paper, in squares
     black: float = 30 / 255
     white: float = 226 / 255
-    background: Background = PLAIN
+    background: Clutter = PLAIN
     illumination: Illumination = EVEN
     psf: float = 0.8
     noise: float = 2.0
@@ -186,7 +184,7 @@ def look_at(middle: Array, towards: Array, distance: float, roll: float) -> Pose
     return Pose(R, np.array([0.0, 0.0, distance]) - R @ middle)
 
 
-CLUTTER = Background(clutter=CLUTTER_KINDS)
+CLUTTER = Clutter(kinds=KINDS)
 STRONG = Illumination(0.7, (0.75, -0.45))
 FIVE_MEGAPIXELS = 4.05
 MIX = Recipe(
@@ -229,7 +227,7 @@ RECIPES: dict[str, Recipe] = {
     "illumination": Recipe(illumination=STRONG),
     "vignetting": Recipe(illumination=Illumination(1.0, (0.2, 0.1), 0.6)),
     "low contrast": Recipe(black=0.44, white=0.44 + 30 / 255),
-    "narrow margin": Recipe(margin=0.15, background=Background(level=0.12)),
+    "narrow margin": Recipe(margin=0.15, background=Clutter(level=0.12)),
     "clutter": Recipe(background=CLUTTER),
     "mix": MIX,
     "board cut": Recipe(framing="cut", square=46),
@@ -284,7 +282,7 @@ def stress(rng: np.random.Generator, hard: bool) -> Scene:
         margin=float(rng.uniform(0.15 if hard else 0.4, 1.0)),
         black=float(black),
         white=float(black + contrast),
-        background=CLUTTER if rng.uniform() < 0.6 else Background(level=float(rng.uniform(0.05, 0.95))),
+        background=CLUTTER if rng.uniform() < 0.6 else Clutter(level=float(rng.uniform(0.05, 0.95))),
         illumination=Illumination(
             float(rng.uniform(0.6, 1.0)),
             (float(rng.uniform(-0.8, 0.8)), float(rng.uniform(-0.6, 0.6))),

@@ -10,20 +10,17 @@ from neurocal_cli.board import Plane
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering import (
-    Background,
     Illumination,
-    ImageCircle,
     Rendered,
     Scene,
     Sensor,
     Sides,
     Target,
-    WideCamera,
     ground_truth,
     render,
 )
-from neurocal_cli.simulation.rendering.scene import CLUTTER_KINDS
-from neurocal_cli.simulation.rendering.wide import Law
+from support.clutter import KINDS, Clutter
+from support.wide_camera import ImageCircle, Law, WideCamera
 
 SQUARE = 30.0  # mm
 
@@ -65,9 +62,7 @@ def wide_scene(recipe: WideRecipe, seed: int) -> Scene:
     camera = replace(plain, focal=radius / plain.radius, centre=centre)
     plane = Plane("", recipe.cols, recipe.rows, SQUARE)
     target = Target(plane, recipe.black, recipe.white, bool(rng.integers(2)), margin=Sides.all(0.5))
-    strewn = Background(
-        level=0.4, clutter=CLUTTER_KINDS if recipe.clutter else (), seed=int(rng.integers(2**31))
-    )
+    strewn = Clutter(0.4, KINDS if recipe.clutter else (), seed=int(rng.integers(2**31)))
     scene = Scene(
         camera,
         Pose(np.eye(3), np.zeros(3)),

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+from simulated_zoom import see
 
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.zoom_lens import see
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 

@@ -235,6 +235,7 @@ class _State:
 
     @classmethod
     def of(cls, model: Callable[[Array], Linearised], values: Array, prior: LevelPrior) -> _State:
+        """Fits before their first step, at values (n, P)."""
         linear = model(values)
         products, none = linear.products(values.shape[1]), np.zeros(len(values))
         return cls(values, linear, products, _cost(products, values, prior), none, none)

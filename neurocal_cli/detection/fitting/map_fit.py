@@ -123,7 +123,7 @@ class MapFit:
         return self.map.models.index((self.map.radial, self.map.degree))
 
 
-def fit_map(start: SmoothMap, observations: Observations, shift: Array, steps: int = STEPS) -> MapFit:
+def fit_map(start: SmoothMap, observations: Observations, shift: Array) -> MapFit:
     """Levenberg-Marquardt with Tukey's weights, from a start that is nearly right.
 
     Parameters
@@ -133,10 +133,8 @@ def fit_map(start: SmoothMap, observations: Observations, shift: Array, steps: i
     observations : Observations
     shift : (K,) array [px]
         Start of the shifts.
-    steps : int
-        At most.
     """
-    return with_covariance(solve_map(start, observations, shift, steps), observations)
+    return with_covariance(solve_map(start, observations, shift, STEPS), observations)
 
 
 @frozen_dataclass(eq=False)
@@ -199,7 +197,7 @@ def solve_map(
 
 
 def loss_of(z: Array) -> float:
-    """Chi2 with every term limited to 100, for outliers."""
+    """Chi2 of normalised residuals z (N,) with every term limited to 100, for outliers."""
     return float(np.minimum(z * z, 100.0).sum())
 
 

@@ -104,6 +104,8 @@ class SmoothMap:
         (0, 0), (1, 0), (2, 0), (3, 0), (3, 3), (3, 4), (3, 5), (3, 6)
     )  # fmt: skip
     richest_lens: ClassVar[int] = 3  # index of the richest model without a polynomial
+    lenses: ClassVar[tuple[tuple[int, ...], ...]] = _FREE_LENS  # free parameters of each, by their positions
+    rest: ClassVar[int] = _REST  # position of the first coefficient of the polynomial
 
     frame: Frame
     parameters: Array
@@ -114,7 +116,7 @@ class SmoothMap:
     @property
     def free(self) -> NDArray[np.intp]:
         """Positions of the free parameters."""
-        free = (*range(_HOMOGRAPHY), *_FREE_LENS[self.radial], *range(_REST, len(self.parameters)))
+        free = (*range(_HOMOGRAPHY), *self.lenses[self.radial], *range(self.rest, len(self.parameters)))
         return np.array(free, dtype=np.intp)
 
     @property
@@ -128,34 +130,40 @@ class SmoothMap:
 
     def with_model(self, radial: int, degree: int) -> SmoothMap:
         """The map with other free parameters; new ones are 0, and old ones are dropped."""
-        old = self.parameters[_REST:].reshape(2, -1)
+        old = self.parameters[self.rest :].reshape(2, -1)
         rest = np.zeros((2, len(polynomial_orders(degree, self.frame))))
         common = min(old.shape[1], rest.shape[1])
         rest[:, :common] = old[:, :common]
-        values = np.concatenate([self.parameters[:_REST], rest.reshape(-1)])
-        values[[k for k in range(_HOMOGRAPHY, _REST) if k not in _FREE_LENS[radial]]] = 0.0
+        values = np.concatenate([self.parameters[: self.rest], rest.reshape(-1)])
+        values[[k for k in range(_HOMOGRAPHY, self.rest) if k not in self.lenses[radial]]] = 0.0
         return replace(self, parameters=values, radial=radial, degree=degree, covariance=None)
 
     def moved(self, which: NDArray[np.intp], values: Array) -> SmoothMap:
         """The map with other values of some parameters."""
         parameters = self.parameters.copy()
         parameters[which] = values
-        return SmoothMap(self.frame, parameters, self.radial, self.degree)
+        return replace(self, parameters=parameters, covariance=None)
 
     def at(self, grid: Array) -> Array:
         """Pixels of grid coordinates; (..., 2) -> (..., 2)."""
-        frame, values = self.frame, self.parameters
+        frame = self.frame
         ground = np.ones((3, grid.size // 2))
         ground[:2] = ((grid - frame.origin) / frame.half).reshape(-1, 2).T
-        homogeneous = self._homography @ ground
+        q = self._through_lens(ground)
+        if self.degree:
+            coefficients = self.parameters[self.rest :].reshape(2, -1)
+            q += coefficients @ polynomials(self.degree, frame, ground[0], ground[1]).T
+        return np.asarray(frame.centre + frame.unit * q.T).reshape(grid.shape)
+
+    def _through_lens(self, ground: Array) -> Array:
+        """The map without its polynomial, of scaled coordinates (3, N); (2, N) [half diagonals]."""
+        values, homogeneous = self.parameters, self._homography @ ground
         q = homogeneous[:2] / homogeneous[2]
         if self.radial:
             e = q - values[8:10, None]
             rho = (e * (self._metric @ e)).sum(axis=0)
             q += e * (rho * (values[10] + values[11] * rho))
-        if self.degree:
-            q += values[_REST:].reshape(2, -1) @ polynomials(self.degree, frame, ground[0], ground[1]).T
-        return np.asarray(frame.centre + frame.unit * q.T).reshape(grid.shape)
+        return np.asarray(q)
 
     def bend(self, grid: Array) -> float:
         """Greatest displacement by the lens at grid points (N, 2), over the distance from its centre."""

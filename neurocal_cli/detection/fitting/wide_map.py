@@ -14,13 +14,12 @@ at any angle from the axis. `wide_start` gives the start; everything else is as 
 
 from __future__ import annotations
 
-from dataclasses import field, replace
+from dataclasses import field
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.smooth_map import Frame, Places, SmoothMap, polynomial_orders, polynomials
+from neurocal_cli.detection.fitting.smooth_map import Frame, Places, SmoothMap
 from neurocal_cli.detection.wide_lens import fit_wide_lens
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -63,15 +62,11 @@ class WideMap(SmoothMap):
         *((len(_LENSES) - 1, degree) for degree in (3, 4, 5, 6)),
     )
     richest_lens: ClassVar[int] = len(_LENSES) - 1
+    lenses: ClassVar[tuple[tuple[int, ...], ...]] = _LENSES
+    rest: ClassVar[int] = _REST
 
     turn: Array = field(default_factory=lambda: np.eye(3))
     widest: float = 1.0
-
-    @property
-    def free(self) -> NDArray[np.intp]:
-        """Positions of the free parameters."""
-        free = (*range(_HOMOGRAPHY), *_LENSES[self.radial], *range(_REST, len(self.parameters)))
-        return np.array(free, dtype=np.intp)
 
     @property
     def prior(self) -> Array:
@@ -81,33 +76,12 @@ class WideMap(SmoothMap):
         sigma[_SQUARE], sigma[_REST:] = _SQUARE_PRIOR, _REST_PRIOR
         return np.asarray(1 / sigma**2)
 
-    def with_model(self, radial: int, degree: int) -> WideMap:
-        """The map with other free parameters; new ones are 0, and old ones are dropped."""
-        old = self.parameters[_REST:].reshape(2, -1)
-        rest = np.zeros((2, len(polynomial_orders(degree, self.frame))))
-        common = min(old.shape[1], rest.shape[1])
-        rest[:, :common] = old[:, :common]
-        values = np.concatenate([self.parameters[:_REST], rest.reshape(-1)])
-        values[[k for k in range(_HOMOGRAPHY, _REST) if k not in _LENSES[radial]]] = 0.0
-        return replace(self, parameters=values, radial=radial, degree=degree, covariance=None)
-
-    def moved(self, which: NDArray[np.intp], values: Array) -> WideMap:
-        """The map with other values of some parameters."""
-        parameters = self.parameters.copy()
-        parameters[which] = values
-        return replace(self, parameters=parameters, covariance=None)
-
-    def at(self, grid: Array) -> Array:
-        """Pixels of grid coordinates; (..., 2) -> (..., 2)."""
-        frame, values = self.frame, self.parameters
-        ground = np.ones((3, grid.size // 2))
-        ground[:2] = ((grid - frame.origin) / frame.half).reshape(-1, 2).T
+    def _through_lens(self, ground: Array) -> Array:
+        """The map without its polynomial; see `SmoothMap`."""
+        values = self.parameters
         direction, across, angle = self._seen(ground)
         stretch = angle * (values[_FIRST : _SQUARE.start] @ self._profile(angle)[0]) / across
-        q = values[_CENTRE, None] + self._squared @ (stretch * direction[:2])
-        if self.degree:
-            q += values[_REST:].reshape(2, -1) @ polynomials(self.degree, frame, ground[0], ground[1]).T
-        return np.asarray(frame.centre + frame.unit * q.T).reshape(grid.shape)
+        return np.asarray(values[_CENTRE, None] + self._squared @ (stretch * direction[:2]))
 
     def along(self, places: Places) -> tuple[Array, Array]:
         """Pixels along the places' directions, and their derivatives; see `SmoothMap.along`."""

@@ -13,9 +13,8 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.projection import Rays
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.layers import BoardLayer, occluder_cover
+from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.scene import Occluder, Scene
-from neurocal_cli.simulation.rendering.wide import WideCamera, WideRays
 
 __all__ = ["Composition"]
 
@@ -29,12 +28,12 @@ class Composition:
 
     Parameters
     ----------
-    camera : Camera or WideCamera
+    camera : Camera
     boards : tuple of BoardLayer
-    occluders : tuple of Rectangle or Disc
+    occluders : tuple of Occluder
     """
 
-    camera: Camera | WideCamera
+    camera: Camera
     boards: tuple[BoardLayer, ...]
     occluders: tuple[Occluder, ...]
 
@@ -45,7 +44,7 @@ class Composition:
         return cls(scene.camera, boards, scene.occluders)
 
     def light(
-        self, rays: Rays | WideRays, behind: Array, cell: float, slack: float = 0.0
+        self, rays: Rays, behind: Array, cell: float, slack: float = 0.0
     ) -> tuple[Array, NDArray[np.int8]]:
         """Mean reflectance of cells and the number of edges in each.
 
@@ -57,7 +56,7 @@ class Composition:
         cell, slack : float [px]
             See `BoardLayer.cover`.
         """
-        covers = [occluder_cover(occluder, rays, cell, slack) for occluder in self.occluders]
+        covers = [occluder.cover(rays, cell, slack) for occluder in self.occluders]
         covers += [board.cover(rays, cell, slack) for board in self.boards]
         edges = np.zeros(len(behind), dtype=np.int8)
         light, open_share = np.zeros(len(behind)), np.ones(len(behind))
@@ -77,7 +76,7 @@ class Composition:
             open_share -= taken
         return light + open_share * behind, edges
 
-    def pixels(self, u: Array, v: Array, behind: Array) -> tuple[Array, NDArray[np.bool_], Rays | WideRays]:
+    def pixels(self, u: Array, v: Array, behind: Array) -> tuple[Array, NDArray[np.bool_], Rays]:
         """Reflectance at pixels' centres, and which pixels have edges in them.
 
         Parameters
@@ -125,7 +124,7 @@ class Composition:
 
     def _cut(
         self, u: Array, v: Array, start: tuple[Array, Array], behind: Array, side: float, parts: int
-    ) -> tuple[Array, NDArray[np.int8], Rays | WideRays]:
+    ) -> tuple[Array, NDArray[np.int8], Rays]:
         """Light of the parts x parts cells of squares with a given side; all flat."""
         offsets = ((np.arange(parts) + 0.5) / parts - 0.5) * side
         shape = (len(u), parts, parts)

@@ -1,16 +1,39 @@
-"""How much of a small square cell lies on one side of a straight edge, exactly."""
+"""How much of a small square cell is covered, or lies on one side of a straight edge, exactly."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["half_plane"]
+__all__ = ["Cover", "half_plane"]
 
 # Below this an edge counts as parallel to the cell's side; the area is then off by less than 1e-5.
 _LEAST_COMPONENT = 1e-5
+
+
+class Cover(NamedTuple):
+    """What a layer covers of each cell.
+
+    Attributes
+    ----------
+    alpha : array
+        Covered share of the cell.
+    light : array
+        Reflectance, integrated over the covered share.
+    depth : array [world unit]
+        Along the camera's axis; infinite where nothing is covered.
+    edges : int array
+        How many edges run through the cell.
+    """
+
+    alpha: Array
+    light: Array
+    depth: Array
+    edges: NDArray[np.int8]
 
 
 def half_plane(

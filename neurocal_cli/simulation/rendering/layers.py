@@ -1,4 +1,4 @@
-"""What each thing in a scene contributes to small square cells of the image: boards and occluders."""
+"""What each thing in a scene contributes to small square cells of the image."""
 
 from __future__ import annotations
 
@@ -11,35 +11,13 @@ from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.coverage import half_plane
-from neurocal_cli.simulation.rendering.scene import Disc, Occluder, Rectangle, Scene, Target
-from neurocal_cli.simulation.rendering.wide import WideRays
+from neurocal_cli.simulation.rendering.coverage import Cover, half_plane
+from neurocal_cli.simulation.rendering.scene import Scene, Target
 
-__all__ = ["BoardLayer", "Cover", "occluder_cover"]
+__all__ = ["BoardLayer"]
 
 # Cells further than this from the paper [squares] are not looked at; also keeps off the horizon.
 _NEARBY = 2.0
-
-
-class Cover(NamedTuple):
-    """What a layer covers of each cell.
-
-    Attributes
-    ----------
-    alpha : array
-        Covered share of the cell.
-    light : array
-        Reflectance, integrated over the covered share.
-    depth : array [world unit]
-        Along the camera's axis; infinite where nothing is covered.
-    edges : int array
-        How many edges run through the cell.
-    """
-
-    alpha: Array
-    light: Array
-    depth: Array
-    edges: NDArray[np.int8]
 
 
 @frozen_dataclass(eq=False)
@@ -74,31 +52,27 @@ class BoardLayer:
             )
         return cls(target, np.asarray(np.linalg.inv(matrix), dtype=float))
 
-    def grid(self, rays: Rays | WideRays) -> tuple[Array, Array, Array]:
+    def grid(self, rays: Rays) -> tuple[Array, Array, Array]:
         """Grid coordinates a, b [squares] and w = 1 / depth where rays meet the target's plane."""
-        N, x, y = self.inverse, rays.x, rays.y
-        z = rays.z if isinstance(rays, WideRays) else 1.0
+        N, x, y, z = self.inverse, rays.x, rays.y, rays.z
         w = N[2, 0] * x + N[2, 1] * y + N[2, 2] * z
         with np.errstate(divide="ignore", invalid="ignore"):
             a = (N[0, 0] * x + N[0, 1] * y + N[0, 2] * z) / w
             b = (N[1, 0] * x + N[1, 1] * y + N[1, 2] * z) / w
         return a, b, w
 
-    def slopes(
-        self, rays: Rays | WideRays, a: Array, b: Array, w: Array
-    ) -> tuple[Array, Array, Array, Array]:
+    def slopes(self, rays: Rays, a: Array, b: Array, w: Array) -> tuple[Array, Array, Array, Array]:
         """Derivatives au, av, bu, bv of the grid coordinates by the pixel [squares / px]."""
         N = self.inverse
+        by_pixel = (rays.xu, rays.yu, rays.zu), (rays.xv, rays.yv, rays.zv)
         ax, ay = (N[0, 0] - a * N[2, 0]) / w, (N[0, 1] - a * N[2, 1]) / w
         bx, by = (N[1, 0] - b * N[2, 0]) / w, (N[1, 1] - b * N[2, 1]) / w
-        au, av = ax * rays.xu + ay * rays.yu, ax * rays.xv + ay * rays.yv
-        bu, bv = bx * rays.xu + by * rays.yu, bx * rays.xv + by * rays.yv
-        if isinstance(rays, WideRays):
-            az, bz = (N[0, 2] - a * N[2, 2]) / w, (N[1, 2] - b * N[2, 2]) / w
-            au, av, bu, bv = au + az * rays.zu, av + az * rays.zv, bu + bz * rays.zu, bv + bz * rays.zv
+        az, bz = (N[0, 2] - a * N[2, 2]) / w, (N[1, 2] - b * N[2, 2]) / w
+        au, av = (ax * dx + ay * dy + az * dz for dx, dy, dz in by_pixel)
+        bu, bv = (bx * dx + by * dy + bz * dz for dx, dy, dz in by_pixel)
         return au, av, bu, bv
 
-    def cover(self, rays: Rays | WideRays, cell: float, slack: float = 0.0) -> Cover:
+    def cover(self, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
         """What the target covers of cells around rays given as flat arrays.
 
         Parameters
@@ -119,9 +93,8 @@ class BoardLayer:
         at = np.flatnonzero(near)
         if not at.size:
             return Cover(alpha, light, depth, edges)
-        part = type(rays)(*(getattr(rays, name)[at] for name in rays._fields))
         a, b, w = a[at], b[at], w[at]
-        au, av, bu, bv = self.slopes(part, a, b, w)
+        au, av, bu, bv = self.slopes(rays.some(at), a, b, w)
         paper, pattern = self.target.paper_box, self.target.pattern_box
         along_x = _axis(a, au, av, pattern[:2], paper[:2], cell, slack)
         along_y = _axis(b, bu, bv, pattern[2:], paper[2:], cell, slack)
@@ -170,29 +143,3 @@ def _axis(
 def _inward(a: Array, ends: tuple[float, float]) -> Array:
     """Distance from the nearer end, positive between the ends."""
     return np.minimum(a - ends[0], ends[1] - a)
-
-
-def occluder_cover(occluder: Occluder, rays: Rays | WideRays, cell: float, slack: float = 0.0) -> Cover:
-    """What an occluder covers of cells around rays; see `BoardLayer.cover`."""
-    du, dv = rays.u - occluder.centre[0], rays.v - occluder.centre[1]
-    if isinstance(occluder, Disc):
-        radius = np.maximum(np.hypot(du, dv), 1e-9)
-        alpha, touched = half_plane(occluder.radius - radius, du / radius, dv / radius, cell, slack)
-        edges = touched.astype(np.int8)
-    else:
-        alpha, edges = _rectangle(occluder, du, dv, cell, slack)
-    depth = np.where(alpha > 0, 0.0, np.inf)
-    return Cover(alpha, occluder.level * alpha, depth, edges)
-
-
-def _rectangle(
-    rectangle: Rectangle, du: Array, dv: Array, cell: float, slack: float
-) -> tuple[Array, NDArray[np.int8]]:
-    c, s = np.cos(rectangle.angle), np.sin(rectangle.angle)
-    alpha, edges = np.ones_like(du), np.zeros(len(du), dtype=np.int8)
-    for length, nu, nv in ((rectangle.size[0], c, s), (rectangle.size[1], -s, c)):
-        inward = 0.5 * length - np.abs(nu * du + nv * dv)
-        share, touched = half_plane(inward, np.full_like(du, nu), np.full_like(du, nv), cell, slack)
-        alpha *= share
-        edges += touched
-    return alpha, edges

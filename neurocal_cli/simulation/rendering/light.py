@@ -7,11 +7,10 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.blur import Blur
-from neurocal_cli.simulation.rendering.clutter import background_image
 from neurocal_cli.simulation.rendering.composition import Composition
-from neurocal_cli.simulation.rendering.scene import Illumination, ImageCircle, Scene
+from neurocal_cli.simulation.rendering.scene import Illumination, Scene
 
-__all__ = ["enough_parts", "illuminated", "image_light"]
+__all__ = ["enough_parts", "image_light"]
 
 # Cells along a pixel's side, times the blur: what keeps the picture within 0.0005 of full scale.
 _PARTS_BY_BLUR = 8.0
@@ -39,7 +38,7 @@ def image_light(scene: Scene, parts: int | None = None) -> Array:
     blur = Blur(scene.psf, parts or enough_parts(scene))
     pad = blur.radius
     composition = Composition.of(scene)
-    level = background_image(scene.background, scene.size, pad)
+    level = scene.background.image(scene.size, pad)
     residual = np.zeros((height + 4 * pad, width + 4 * pad))
     edged = np.zeros(level.shape, dtype=bool)
     for rows in _strips(level.shape):
@@ -47,7 +46,7 @@ def image_light(scene: Scene, parts: int | None = None) -> Array:
     image = blur.convolve(*_shaded(scene, level, edged, pad))
     image += residual[2 * pad : height + 2 * pad, 2 * pad : width + 2 * pad]
     image = image * _vignetting(scene)
-    return image if scene.circle is None else _in_circle(scene.circle, image)
+    return image if scene.circle is None else scene.circle(image)
 
 
 def illuminated(light: Illumination, size: tuple[int, int], u: Array, v: Array) -> Array:
@@ -136,13 +135,3 @@ def _vignetting(scene: Scene) -> Array | float:
     u, v = np.arange(width) - 0.5 * (width - 1), np.arange(height) - 0.5 * (height - 1)
     corner = max(0.25 * ((width - 1) ** 2 + (height - 1) ** 2), 1.0)
     return np.asarray(1 - strength * (u**2 + v[:, None] ** 2) / corner)
-
-
-def _in_circle(circle: ImageCircle, image: Array) -> Array:
-    height, width = image.shape
-    u, v = np.arange(width) - circle.centre[0], np.arange(height)[:, None] - circle.centre[1]
-    radius = np.hypot(u, v)
-    away = (radius - circle.radius) / circle.soft
-    share = 1 / (1 + np.exp(np.clip(4 * away, -50, 50)))
-    fading = 1 - circle.vignetting * np.minimum(radius / circle.radius, 1) ** 4
-    return np.asarray(image * share * fading + circle.ring * np.exp(-0.5 * away**2))

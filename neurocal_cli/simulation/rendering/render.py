@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.light import image_light
 from neurocal_cli.simulation.rendering.scene import Scene
-from neurocal_cli.simulation.rendering.sensor import Image, digitised, response, signal
+from neurocal_cli.simulation.rendering.sensor import Image, digitised
 from neurocal_cli.simulation.rendering.truth import Truth, ground_truth
 
-__all__ = ["Rendered", "noise_free", "render"]
+__all__ = ["Rendered", "render"]
 
 
 @frozen_dataclass(eq=False)
@@ -38,8 +37,3 @@ def render(scene: Scene, rng: np.random.Generator) -> Rendered:
         Of the noise; everything else is in the scene.
     """
     return Rendered(digitised(scene.sensor, image_light(scene), rng), ground_truth(scene))
-
-
-def noise_free(scene: Scene) -> Array:
-    """Picture without noise, rounding and clipping by the converter; (height, width) array [DN]."""
-    return response(scene.sensor, signal(scene.sensor, image_light(scene))) * scene.sensor.white_dn

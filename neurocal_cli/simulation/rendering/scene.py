@@ -6,34 +6,30 @@ package's convention: the centre of the top-left pixel is (0, 0).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import field
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.wide import WideCamera
+from neurocal_cli.simulation.rendering.coverage import Cover
 
 __all__ = [
     "Background",
-    "Disc",
     "Illumination",
-    "ImageCircle",
     "Occluder",
-    "Rectangle",
     "Scene",
     "Sensor",
     "Sides",
     "Target",
 ]
-
-ClutterKind = Literal["blocks", "lines", "gradients", "discs", "decoys"]
-CLUTTER_KINDS: tuple[ClutterKind, ...] = ("blocks", "lines", "gradients", "discs", "decoys")
 
 
 @frozen_dataclass
@@ -96,36 +92,11 @@ class Target:
         return x_low - margin.x_low, x_high + margin.x_high, y_low - margin.y_low, y_high + margin.y_high
 
 
-@frozen_dataclass
-class Rectangle:
-    """Something rectangular in front of everything, in image coordinates.
+class Occluder(Protocol):
+    """Something in front of everything."""
 
-    Parameters
-    ----------
-    centre : (u, v) [px]
-    size : (width, height) [px]
-    angle : float [rad]
-        From u towards v.
-    level : float
-        Reflectance.
-    """
-
-    centre: tuple[float, float]
-    size: tuple[float, float]
-    angle: float = 0.0
-    level: float = 0.35
-
-
-@frozen_dataclass
-class Disc:
-    """Something round in front of everything, in image coordinates [px]."""
-
-    centre: tuple[float, float]
-    radius: float
-    level: float = 0.35
-
-
-Occluder = Rectangle | Disc
+    def cover(self, rays: Rays, cell: float, slack: float = 0.0) -> Cover:
+        """What it covers of cells around rays; see `layers.BoardLayer.cover`."""
 
 
 @frozen_dataclass
@@ -135,27 +106,14 @@ class Background:
     Parameters
     ----------
     level : float
-        Reflectance of the empty background.
-    clutter : tuple of str
-        Kinds of things to strew over it, from ``CLUTTER_KINDS``; none leaves it plain.
-    amount : int
-        Things of each kind in 640 x 480 pixels at a scale of 40 px; they cover the same share of
-        any image at any scale.
-    scale : float [px]
-        Typical size of a thing; 0 takes 1/12 of the image's height.
-    seed : int
+        Reflectance.
     """
 
     level: float = 0.45
-    clutter: tuple[ClutterKind, ...] = ()
-    amount: int = 25
-    scale: float = 0.0
-    seed: int = 0
 
-    def __post_init__(self) -> None:
-        unknown = set(self.clutter) - set(CLUTTER_KINDS)
-        if unknown:
-            raise InputError(f"there is no clutter {sorted(unknown)}; there are {list(CLUTTER_KINDS)}")
+    def image(self, size: tuple[int, int], pad: int) -> Array:
+        """Reflectance of the pixels of an image and of a border around it; (H + 2 pad, W + 2 pad) array."""
+        return np.full((size[1] + 2 * pad, size[0] + 2 * pad), float(self.level))
 
 
 @frozen_dataclass
@@ -173,33 +131,6 @@ class Illumination:
     def __post_init__(self) -> None:
         if self.level <= 0 or abs(self.gradient[0]) + abs(self.gradient[1]) >= 2:
             raise InputError("illumination must stay positive: level > 0 and |gx| + |gy| < 2")
-
-
-@frozen_dataclass
-class ImageCircle:
-    """The round image of a fisheye that does not fill the picture; it is dark outside.
-
-    Parameters
-    ----------
-    centre : (u, v) [px]
-    radius : float [px]
-    soft : float [px]
-        Width over which the light fades at the rim.
-    vignetting : float
-        Share of the light that is lost at the rim.
-    ring : float
-        Light of a bright ring at the rim, as some lenses have, 1 being full scale.
-    """
-
-    centre: tuple[float, float]
-    radius: float
-    soft: float = 3.0
-    vignetting: float = 0.0
-    ring: float = 0.0
-
-    def __post_init__(self) -> None:
-        if self.radius <= 0 or self.soft <= 0 or not 0 <= self.vignetting <= 1:
-            raise InputError("an image circle needs a radius, a soft rim, and vignetting from 0 to 1")
 
 
 @frozen_dataclass
@@ -246,25 +177,26 @@ class Scene:
 
     Parameters
     ----------
-    camera : Camera or WideCamera
-        With the size of its images.
+    camera : Camera
+        With the size of its images. Of other kinds of cameras `rays`, `project` and `sees` are enough.
     pose : Pose
         World to camera.
     targets : tuple of Target
         Where they overlap in the image, the nearer one hides the other.
     background : Background
-    occluders : tuple of Rectangle or Disc
-        In front of everything; the first is foremost.
+    occluders : tuple of Occluder
+        The first is foremost.
     illumination : Illumination
     psf : float [px]
         Standard deviation of the Gaussian blur, to which the pixel's box is added.
     sensor : Sensor
     unit : str
         Of the world.
-    circle : ImageCircle, optional
+    circle : callable, optional
+        What the round image of a fisheye leaves of the (height, width) light.
     """
 
-    camera: Camera | WideCamera
+    camera: Camera
     pose: Pose
     targets: tuple[Target, ...] = ()
     background: Background = field(default_factory=Background)
@@ -273,7 +205,7 @@ class Scene:
     psf: float = 0.8
     sensor: Sensor = field(default_factory=Sensor)
     unit: str = "mm"
-    circle: ImageCircle | None = None
+    circle: Callable[[Array], Array] | None = None
 
     def __post_init__(self) -> None:
         if not 0 <= self.psf <= 50:

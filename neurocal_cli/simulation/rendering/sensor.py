@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.scene import Sensor
 
-__all__ = ["digitised", "noise_variance", "response", "response_slope", "signal"]
+__all__ = ["digitised", "response", "signal"]
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
@@ -33,26 +33,6 @@ def response(sensor: Sensor, linear: Array) -> Array:
     if sensor.response == "srgb":
         return np.where(x <= _SRGB_LINEAR, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)
     return np.asarray(x ** (1 / float(sensor.response))) if sensor.response != 1 else x
-
-
-def response_slope(sensor: Sensor, linear: Array) -> Array:
-    """Derivative of `response`; 0 where it clips."""
-    x = np.clip(linear, 1e-6, 1.0)
-    if sensor.response == "srgb":
-        slope = np.where(x <= _SRGB_LINEAR, 12.92, 1.055 / 2.4 * x ** (1 / 2.4 - 1))
-    else:
-        slope = x ** (1 / float(sensor.response) - 1) / float(sensor.response)
-    return np.where((linear > 0) & (linear < 1), slope, 0.0)
-
-
-def noise_variance(sensor: Sensor, linear: Array) -> Array:
-    """Variance of each pixel's value, rounding included [DN^2]."""
-    read = sensor.read_noise * sensor.white_dn / 255
-    variance = np.full(np.shape(linear), read**2 + 1 / 12)
-    if sensor.full_well is not None:
-        shot = np.clip(linear, 0, 1) / sensor.full_well
-        variance += (response_slope(sensor, linear) * sensor.white_dn) ** 2 * shot
-    return variance
 
 
 def digitised(sensor: Sensor, light: Array, rng: np.random.Generator) -> Image:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.board import Plane
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering.layers import BoardLayer, occluder_cover
+from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.scene import Scene, Target
 
 __all__ = ["PlaneTruth", "Truth", "ground_truth"]
@@ -30,14 +28,12 @@ class PlaneTruth:
     plane : Plane
     vertices : (rows, cols, 2) array [px]
         Exact positions; NaN where the camera cannot project.
-    vertices_world : (rows, cols, 3) array [world unit]
     vertex_ids : tuple of rows x cols str
         Row by row.
     vertices_visible : (rows, cols) bool array
         In front of the camera, in the frame, and nothing in front, all with a clearance.
     midpoints : (N, 2) array [px]
         Projections of the mid-points in space, in the order of `Plane.midpoint_grid`.
-    midpoints_world : (N, 3) array [world unit]
     midpoint_ids : tuple of N str
     midpoints_visible : (N,) bool array
     edges_visible : (N,) bool array
@@ -54,11 +50,9 @@ class PlaneTruth:
 
     plane: Plane
     vertices: Array
-    vertices_world: Array
     vertex_ids: tuple[str, ...]
     vertices_visible: Mask
     midpoints: Array
-    midpoints_world: Array
     midpoint_ids: tuple[str, ...]
     midpoints_visible: Mask
     edges_visible: Mask
@@ -82,11 +76,6 @@ class Truth:
 
     planes: tuple[PlaneTruth, ...]
     clearance: float
-
-    @cached_property
-    def by_name(self) -> dict[str, PlaneTruth]:
-        """The planes by their names."""
-        return {truth.plane.name: truth for truth in self.planes}
 
 
 def ground_truth(scene: Scene, clearance: float | None = None) -> Truth:
@@ -121,11 +110,9 @@ def _plane_truth(scene: Scene, sight: _Sight, index: int) -> PlaneTruth:
     return PlaneTruth(
         plane=plane,
         vertices=vertices,
-        vertices_world=plane.vertices(),
         vertex_ids=plane.vertex_ids(),
         vertices_visible=vertices_visible,
         midpoints=midpoints,
-        midpoints_world=plane.at(grid),
         midpoint_ids=plane.midpoint_ids(),
         midpoints_visible=midpoints_visible,
         edges_visible=edges_visible,
@@ -192,7 +179,7 @@ class _Sight:
             depth = np.where(w > 0, 1 / w, np.inf)
         hidden = np.zeros(len(depth), dtype=bool)
         for occluder in self.scene.occluders:
-            hidden |= occluder_cover(occluder, rays, _TINY_CELL).alpha > 0
+            hidden |= occluder.cover(rays, _TINY_CELL).alpha > 0
         for k, layer in enumerate(self.layers):
             if k != index:
                 hidden |= layer.cover(rays, _TINY_CELL).depth < depth * (1 - 1e-9)

@@ -6,42 +6,49 @@ from collections.abc import Callable
 
 import numpy as np
 
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.coverage import half_plane
-from neurocal_cli.simulation.rendering.scene import Background, ClutterKind
-
-__all__ = ["background_image"]
+from neurocal_cli.simulation.rendering.scene import Background
 
 _REFERENCE_AREA = 640 * 480  # px^2
 _REFERENCE_SCALE = 40  # px
 
 
-def background_image(background: Background, size: tuple[int, int], pad: int) -> Array:
-    """Reflectance of the background, a border included.
+@frozen_dataclass
+class Clutter(Background):
+    """A background with things strewn over it.
 
     Parameters
     ----------
-    background : Background
-    size : (width, height) [px]
-    pad : int [px]
-        Width of the border.
-
-    Returns
-    -------
-    image : (height + 2 pad, width + 2 pad) array
-        The same inside whatever the border.
+    kinds : tuple of str
+        Of things, from ``KINDS``; none leaves it plain.
+    amount : int
+        Things of each kind in 640 x 480 pixels at a scale of 40 px; they cover the same share of
+        any image at any scale.
+    scale : float [px]
+        Typical size of a thing; 0 takes 1/12 of the image's height.
+    seed : int
     """
-    width, height = size
-    image = np.full((height + 2 * pad, width + 2 * pad), float(background.level))
-    rng = np.random.default_rng(background.seed)
-    scale = background.scale or height / 12
-    count = round(background.amount * (width * height / _REFERENCE_AREA) * (_REFERENCE_SCALE / scale) ** 2)
-    for kind in background.clutter:
-        for _ in range(max(count, 1)):
-            # Drawn somewhat beyond the frame too, so that its borders are no emptier.
-            place = rng.uniform(-0.1, 1.1, 2) * size
-            _DRAW[kind](_Canvas(image, pad), rng, place, scale)
-    return image
+
+    kinds: tuple[str, ...] = ()
+    amount: int = 25
+    scale: float = 0.0
+    seed: int = 0
+
+    def image(self, size: tuple[int, int], pad: int) -> Array:
+        """Reflectance, a border included; the same inside whatever the border."""
+        width, height = size
+        image = super().image(size, pad)
+        rng = np.random.default_rng(self.seed)
+        scale = self.scale or height / 12
+        count = round(self.amount * (width * height / _REFERENCE_AREA) * (_REFERENCE_SCALE / scale) ** 2)
+        for kind in self.kinds:
+            for _ in range(max(count, 1)):
+                # Drawn somewhat beyond the frame too, so that its borders are no emptier.
+                place = rng.uniform(-0.1, 1.1, 2) * size
+                _DRAW[kind](_Canvas(image, pad), rng, place, scale)
+        return image
 
 
 class _Canvas:
@@ -138,10 +145,11 @@ def _decoy(canvas: _Canvas, rng: np.random.Generator, place: Array, scale: float
             canvas.rectangle(where, size, angle + turn, dark if (i + j) % 2 else bright)
 
 
-_DRAW: dict[ClutterKind, Callable[[_Canvas, np.random.Generator, Array, float], None]] = {
+_DRAW: dict[str, Callable[[_Canvas, np.random.Generator, Array, float], None]] = {
     "blocks": _block,
     "lines": _line,
     "gradients": _gradient,
     "discs": _disc,
     "decoys": _decoy,
 }
+KINDS = tuple(_DRAW)

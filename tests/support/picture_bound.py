@@ -5,28 +5,26 @@ Levels, shading and blur are taken as known; not knowing them costs 5 to 10 % mo
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.camera.pinhole import Intrinsics
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.light import enough_parts, image_light
-from neurocal_cli.simulation.rendering.scene import Scene
-from neurocal_cli.simulation.rendering.sensor import noise_variance, response, signal
-from neurocal_cli.simulation.rendering.wide import WideCamera
+from neurocal_cli.simulation.rendering.scene import Scene, Sensor
+from neurocal_cli.simulation.rendering.sensor import response, signal
+from support.wide_camera import WideCamera
 
-__all__ = ["Bound", "edge_bound", "scene_bound", "shift_gradients", "vertex_bound"]
-
+_SRGB_LINEAR = 0.0031308
 _NOTHING = 1e-7  # of full scale per px
 # Two lines that cross blur each other: together they tell as much as if shorter by this many sigma_t.
 _CROSSING_LOSS = 2.26
 
 
-@frozen_dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Bound:
     """Least standard deviations for the points of one plane; infinite where nothing can be seen.
 
@@ -43,6 +41,11 @@ class Bound:
     vertex: Array
     vertex_covariance: Array
     edge: Array
+
+
+def noise_free(scene: Scene) -> Array:
+    """Picture without noise, rounding and clipping by the converter; (height, width) array [DN]."""
+    return response(scene.sensor, signal(scene.sensor, image_light(scene))) * scene.sensor.white_dn
 
 
 def edge_bound(noise: float, contrast: float, sigma_t: float, length: float) -> float:
@@ -94,6 +97,26 @@ def scene_bound(scene: Scene) -> tuple[Bound, ...]:
         on = np.flatnonzero((w > 0) & (a > -1) & (a < cols) & (b > -1) & (b < rows))
         bounds.append(_plane_bound(cols, rows, *(x[on] for x in (a, b, *slopes, *information))))
     return tuple(bounds)
+
+
+def response_slope(sensor: Sensor, linear: Array) -> Array:
+    """Derivative of `response`; 0 where it clips."""
+    x = np.clip(linear, 1e-6, 1.0)
+    if sensor.response == "srgb":
+        slope = np.where(x <= _SRGB_LINEAR, 12.92, 1.055 / 2.4 * x ** (1 / 2.4 - 1))
+    else:
+        slope = x ** (1 / float(sensor.response) - 1) / float(sensor.response)
+    return np.where((linear > 0) & (linear < 1), slope, 0.0)
+
+
+def noise_variance(sensor: Sensor, linear: Array) -> Array:
+    """Variance of each pixel's value, rounding included [DN^2]."""
+    read = sensor.read_noise * sensor.white_dn / 255
+    variance = np.full(np.shape(linear), read**2 + 1 / 12)
+    if sensor.full_well is not None:
+        shot = np.clip(linear, 0, 1) / sensor.full_well
+        variance += (response_slope(sensor, linear) * sensor.white_dn) ** 2 * shot
+    return variance
 
 
 def shift_gradients(scene: Scene) -> tuple[Array, Array, Array]:

@@ -12,21 +12,18 @@ With z and f the zoom and focus encoders as shares of their range:
 
 from __future__ import annotations
 
-from dataclasses import field
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from neurocal_cli.camera.pinhole import Pose, entries_of
 from neurocal_cli.camera.projection import image_points
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.zoom_lens.settings import LensPoints
 
-__all__ = ["SimulatedZoom", "see"]
 
-
-@frozen_dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class SimulatedZoom:
     """A camera with a zoom lens; lengths in mm unless named otherwise.
 

@@ -9,17 +9,15 @@ or one of the classic laws: 2 sin(t / 2) keeps areas, 2 tan(t / 2) keeps shapes.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Literal, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.camera.projection import Rays
 from neurocal_cli.errors import InputError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-
-__all__ = ["Law", "WideCamera", "WideRays"]
 
 Law = Literal["equidistant", "equisolid", "stereographic"]
 
@@ -27,23 +25,7 @@ _STEPS = 12  # of Newton's method for the angle, from the table
 _TABLE = 512
 
 
-class WideRays(NamedTuple):
-    """Unit directions (x, y, z) of pixels, with derivatives by u and v; see `camera.projection.Rays`."""
-
-    u: Array
-    v: Array
-    x: Array
-    y: Array
-    z: Array
-    xu: Array
-    xv: Array
-    yu: Array
-    yv: Array
-    zu: Array
-    zv: Array
-
-
-@frozen_dataclass
+@dataclass(frozen=True)
 class WideCamera:
     """A camera with a fisheye lens.
 
@@ -95,7 +77,7 @@ class WideCamera:
         across = np.hypot(points[..., 0], points[..., 1])
         return np.asarray(np.arctan2(across, points[..., 2]) <= self._widest)
 
-    def rays(self, u: Array, v: Array, near: tuple[Array, Array] | None = None) -> WideRays:
+    def rays(self, u: Array, v: Array, near: tuple[Array, Array] | None = None) -> Rays:
         """Directions of pixels with derivatives; nan outside the image circle. `near` is not needed."""
         away_u, away_v = (np.asarray(x, dtype=float) - c for x, c in zip((u, v), self.centre, strict=True))
         radius = np.maximum(np.hypot(away_u, away_v), 1e-9)
@@ -104,12 +86,13 @@ class WideCamera:
         cos_a, sin_a = away_u / radius, away_v / radius
         sine, cosine = np.sin(angle), np.cos(angle)
         along, around = cosine * slope, sine / radius
-        return WideRays(
-            u, v, sine * cos_a, sine * sin_a, cosine,
+        return Rays(
+            u, v, sine * cos_a, sine * sin_a,
             along * cos_a**2 + around * sin_a**2,
             (along - around) * cos_a * sin_a,
             (along - around) * cos_a * sin_a,
             along * sin_a**2 + around * cos_a**2,
+            cosine,
             -sine * slope * cos_a,
             -sine * slope * sin_a,
         )  # fmt: skip
@@ -144,3 +127,40 @@ class WideCamera:
             if np.abs(step).max(initial=0.0) < 1e-13:
                 break
         return np.where(radius <= radii[-1], angle, np.nan)
+
+
+@dataclass(frozen=True)
+class ImageCircle:
+    """The round image of a fisheye that does not fill the picture; it is dark outside.
+
+    Parameters
+    ----------
+    centre : (u, v) [px]
+    radius : float [px]
+    soft : float [px]
+        Width over which the light fades at the rim.
+    vignetting : float
+        Share of the light that is lost at the rim.
+    ring : float
+        Light of a bright ring at the rim, as some lenses have, 1 being full scale.
+    """
+
+    centre: tuple[float, float]
+    radius: float
+    soft: float = 3.0
+    vignetting: float = 0.0
+    ring: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.radius <= 0 or self.soft <= 0 or not 0 <= self.vignetting <= 1:
+            raise InputError("an image circle needs a radius, a soft rim, and vignetting from 0 to 1")
+
+    def __call__(self, image: Array) -> Array:
+        """What it leaves of the light of an image; (height, width) array."""
+        height, width = image.shape
+        u, v = np.arange(width) - self.centre[0], np.arange(height)[:, None] - self.centre[1]
+        radius = np.hypot(u, v)
+        away = (radius - self.radius) / self.soft
+        share = 1 / (1 + np.exp(np.clip(4 * away, -50, 50)))
+        fading = 1 - self.vignetting * np.minimum(radius / self.radius, 1) ** 4
+        return np.asarray(image * share * fading + self.ring * np.exp(-0.5 * away**2))

@@ -1,0 +1,64 @@
+"""A camera that the user has a file of, with the points that it is used on."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from neurocal_cli.commands.streams import note
+from neurocal_cli.errors import FormatError, InputError
+
+if TYPE_CHECKING:
+    from neurocal_cli.calibration import Calibration
+    from neurocal_cli.camera.camera import Camera
+    from neurocal_cli.points import Correspondences
+
+__all__ = ["calibration_or_camera", "given_camera"]
+
+
+def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera]:
+    """Read a known camera; give the points its image size if they have none.
+
+    Raises
+    ------
+    InputError
+        A camera of another image size.
+    """
+    from neurocal_cli.io.camera_files import read_intrinsics
+
+    camera = read_intrinsics(path)
+    if camera.image_size is not None:
+        if points.image_size is None:
+            points = replace(points, image_size=camera.image_size)
+        elif points.image_size != tuple(camera.image_size):
+            raise InputError(
+                f"{path}: the camera is for images of {camera.image_size[0]} x {camera.image_size[1]} px, "
+                f"but {points.source} has {points.image_size[0]} x {points.image_size[1]} px; give a camera "
+                "for this image size"
+            )
+    return points, camera
+
+
+def calibration_or_camera(
+    name: str, points: Correspondences | None, besides: str = ""
+) -> tuple[Calibration | Camera, Correspondences | None]:
+    """A calibration or, to be used on points, any camera file, which may know the size of their images.
+
+    Raises
+    ------
+    FormatError
+        The file is neither; it tells why it is no calibration.
+    """
+    from neurocal_cli.io.calibration_yaml import read_calibration
+
+    try:
+        return read_calibration(name), points
+    except FormatError as error:
+        if points is None or name == "-":
+            raise
+        try:
+            points, camera = given_camera(name, points)
+        except FormatError:
+            raise error from None
+        note([f"only the intrinsic parameters and the distortion are used{besides}: {error}"])
+    return camera, points

@@ -1,0 +1,84 @@
+"""Where the results of ``neurocal undistort`` go."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+
+from neurocal_cli.commands.streams import is_terminal
+from neurocal_cli.errors import UsageError
+
+__all__ = ["check_distinct", "places_of"]
+
+
+def places_of(paths: Sequence[str], output: str) -> tuple[str | None, list[str]]:
+    """The folder that the output names, if it names one, and the place of each file's result.
+
+    Raises
+    ------
+    UsageError
+        Several files, or an image, where there can be none.
+    """
+    if not paths:
+        return None, []
+    folder = _folder(paths, output)
+    return folder, [output] if folder is None else [os.path.join(folder, _name(path)) for path in paths]
+
+
+def _folder(paths: Sequence[str], output: str) -> str | None:
+    from neurocal_cli.io.image_paths import is_image
+
+    several = len(paths) > 1
+    if output == "-":
+        if several:
+            raise UsageError("several files cannot go to standard output; give a folder, -o DIR")
+        if is_image(paths[0]) and is_terminal(sys.stdout):
+            raise UsageError("an image cannot be shown on a terminal; give a file, -o FILE")
+        return None
+    unlike = is_image(paths[0]) and not is_image(output)
+    if not (several or os.path.isdir(output) or output.endswith(os.sep) or unlike):
+        return None
+    if os.path.exists(output) and not os.path.isdir(output):
+        raise UsageError(f"-o {output} is a file; give a folder")
+    return output
+
+
+def _name(path: str) -> str:
+    from neurocal_cli.io.image_paths import is_image
+
+    if path == "-":
+        return "points.csv"
+    name = os.path.basename(path)
+    return os.path.splitext(name)[0] + ".png" if is_image(path) else name
+
+
+def check_distinct(
+    inputs: Iterable[str], outputs: Sequence[str], paths: Sequence[str], others: Mapping[str, str | None]
+) -> None:
+    """Refuse to overwrite inputs, or to write two files to one place.
+
+    Parameters
+    ----------
+    inputs : iterable of str
+    outputs, paths : sequences of str of one length
+        Where the results go, and what they are made of.
+    others : dict
+        Further places by what is written there.
+
+    Raises
+    ------
+    UsageError
+        The two that are in each other's way.
+    """
+    read = {os.path.realpath(path) for path in inputs if path != "-"}
+    taken: dict[str, str] = {}
+    targets = list(zip(outputs, paths, strict=True))
+    targets += [(place, what) for what, place in others.items() if place is not None]
+    for target, source in targets:
+        place = os.path.realpath(target) if target != "-" else "-"
+        if place in read:
+            raise UsageError(f"{target} is an input and would be overwritten; give another output")
+        if place in taken:
+            raise UsageError(f"{taken[place]} and {source} would both be written to {target}; rename one")
+        taken[place] = source
