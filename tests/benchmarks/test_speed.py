@@ -16,6 +16,7 @@ from support.distorted import through
 from support.made_calibration import made_calibration
 from support.plain_projection import project
 from support.scenes import random_flat_set, table_1
+from support.targets import COLS, photographed
 
 from neurocal_cli import Correspondences, calibrate, read_points, write_points
 from neurocal_cli.io.calibration_yaml import format_calibration
@@ -76,6 +77,38 @@ def test_opencv_on_the_same_views(benchmark: BenchmarkFixture, n_views: int, mod
     result = benchmark(lambda: cv2.calibrateCamera(world, pixels, points.image_size, None, None, flags=flags))
     same = calibrate(points, skew=False, distortion=model, outliers="keep", target="given")
     assert result[0] == pytest.approx(same.rmse_px, rel=1e-3)
+
+
+BOARDS = [("flat", 0.0), ("parabola", 0.3), ("stretch", 0.0), ("both", 0.3), ("flexing", 0.3)]
+
+
+@pytest.mark.benchmark(group="views of 63 points of boards that are not as their file says")
+@pytest.mark.parametrize("target", ["given", "auto"])
+@pytest.mark.parametrize(("kind", "amount"), BOARDS)
+@pytest.mark.parametrize("n_views", VIEWS)
+def test_neurocal_on_a_board(
+    benchmark: BenchmarkFixture, n_views: int, kind: str, amount: float, target: str
+) -> None:
+    points, _ = photographed(kind, 3, n_views, amount)
+    assert benchmark(lambda: calibrate(points, distortion="k1k2", target=target)).converged
+
+
+@pytest.mark.benchmark(group="views of 63 points of boards that are not as their file says")
+@pytest.mark.parametrize(("kind", "amount"), BOARDS)
+@pytest.mark.parametrize("n_views", VIEWS)
+def test_opencv_with_free_points_on_a_board(
+    benchmark: BenchmarkFixture, n_views: int, kind: str, amount: float
+) -> None:
+    cv2 = pytest.importorskip("cv2")
+    cv2.setNumThreads(1)
+    points, _ = photographed(kind, 3, n_views, amount)
+    world = list(points.world.reshape(n_views, -1, 3).astype(np.float32))
+    pixels = list(points.pixels.reshape(n_views, -1, 2).astype(np.float32))
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    found = benchmark.pedantic(
+        lambda: cv2.calibrateCameraRO(world, pixels, points.image_size, COLS - 1, None, None, flags=flags)
+    )
+    assert found[0] < 0.5
 
 
 @pytest.mark.benchmark(group="one view")
