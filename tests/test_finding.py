@@ -174,6 +174,25 @@ def test_vertices_are_good_to_a_few_tenths_of_a_pixel(name: str) -> None:
     assert missed(name, range(FIRST, FIRST + 2), within=0.3) == []
 
 
+def test_vertices_off_to_alternate_sides_are_no_fold() -> None:
+    """Seen on an overexposed board; few rows have none afar to compare with."""
+    fine = 8
+    row, col = np.mgrid[-1:6, -1:5].astype(float)
+    off = np.where((row + col) % 2 == 0, 0.3, -0.3)
+    x, y = col - 1.5, row - 2
+    place = np.stack([150 + 19.5 * x - 19.5 * y, 75 + 9.0 * x + 7.4 * y], axis=-1)
+    place[..., 1] += off
+    large = np.full((150 * fine, 300 * fine), 230, np.uint8)
+    for r, c in np.argwhere((row + col)[:-1, :-1] % 2 == 0):
+        square = place[[r, r, r + 1, r + 1], [c, c + 1, c + 1, c]]
+        corners = np.rint(16 * ((square + 0.5) * fine - 0.5)).astype(np.int32)
+        cv2.fillConvexPoly(large, corners, (20.0,), shift=4)
+    image = cv2.GaussianBlur(cv2.resize(large, (300, 150), interpolation=cv2.INTER_AREA), (0, 0), 0.7)
+    grids = find_grids(image)
+    assert [sorted(x.pixels.shape[:2]) for x in grids] == [[4, 5]]
+    assert grids[0].seen.all()
+
+
 def test_grids_are_oriented_as_promised() -> None:
     shot = picture("base", FIRST + 3)
     (grid,) = find_grids(shot.image)
