@@ -8,8 +8,6 @@ import signal
 import sys
 import warnings
 
-__all__ = ["main"]
-
 
 def main() -> None:
     """Run the command line and leave with its exit code."""

@@ -13,9 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, plane_axes
-
-__all__ = ["N_SHAPES", "Bends", "Surface", "surface_of"]
+from neurocal_cli.geometry import Array
 
 N_SHAPES = 3
 
@@ -85,7 +83,11 @@ def surface_of(given: Array) -> Surface:
     """Shapes for a flat board with these points (n, 3)."""
     centre = given.mean(axis=0)
     normal = np.linalg.svd(given - centre, full_matrices=False)[2][2]
-    axes = plane_axes(normal)
+    normal = normal * np.sign(normal[np.argmax(np.abs(normal))])
+    x = np.eye(3)[np.argmin(np.abs(normal))]  # not the principal axes: a square board has none
+    x = x - (x @ normal) * normal
+    x /= np.linalg.norm(x)
+    axes = np.column_stack([x, np.cross(normal, x), normal])
     places = (given - centre) @ axes[:, :2]
     half = 0.5 * float(np.ptp(places, axis=0).max())
     places = places / half

@@ -17,8 +17,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Board", "Plane", "smooth_between"]
-
 Triple = tuple[float, float, float]
 
 _AXIS_TOLERANCE = 1e-6

@@ -19,17 +19,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
 
-__all__ = [
-    "Calibration",
-    "NetworkRecord",
-    "Rejected",
-    "StopReason",
-    "StraightLines",
-    "Verdict",
-    "ViewResult",
-    "camera_of",
-]
-
 
 class StopReason(str, Enum):
     """Why training stopped; the value is the sentence to show."""

@@ -11,8 +11,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["NO_SCALE", "Distance", "Scale", "fitted_scale", "grid_place"]
-
 _NUMBER = r"-?(?:[0-9]+\.?[0-9]*|\.[0-9]+)"
 _LABEL = rf"(?:(?P<plane>.*)/)?(?P<c>{_NUMBER}):(?P<r>{_NUMBER})"
 _ANOTHER_UNIT = 0.1  # a scale further from 1 is no print of the stated board

@@ -8,16 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-__all__ = [
-    "CoincidentCamerasError",
-    "DegenerateGeometryError",
-    "FormatError",
-    "InputError",
-    "NeurocalError",
-    "UsageError",
-    "check_choice",
-]
-
 
 class NeurocalError(Exception):
     """Root of all errors that a caller of neurocal may want to catch."""

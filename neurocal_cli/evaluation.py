@@ -23,8 +23,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.given_points import GivenPoints
 
-__all__ = ["CameraEvaluation", "ViewEvaluation", "evaluate_camera", "refuse_another_size"]
-
 # Most points of the same image lie within these of where the calibration sees them: a user's own noise and
 # small edits do, another image of the board does not. Repeated by tests/test_evaluation.py.
 _NEAR_PX = 2.0

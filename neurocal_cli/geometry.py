@@ -21,24 +21,6 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-__all__ = [
-    "Array",
-    "cross_matrix",
-    "distinct_rows",
-    "euler_jacobian",
-    "euler_to_rotation",
-    "nearest_rotation",
-    "nearest_similarity",
-    "orthonormalised",
-    "plane_axes",
-    "rotation_step",
-    "rotation_to_axis",
-    "rotation_to_euler",
-    "rotation_vector",
-    "rq",
-    "similarity",
-]
-
 # Below this cosine of R_y the x and z axes coincide and only R_x -/+ R_z is defined.
 _GIMBAL_COSINE = 1e-12
 _SINGULAR = 1e-9  # below it only the combination is taken to move with a rotation
@@ -221,18 +203,6 @@ def distinct_rows(table: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.int
     label = np.empty(len(table), dtype=np.intp)
     label[order] = np.cumsum(new) - 1
     return order[new], label
-
-
-def plane_axes(normal: Array) -> Array:
-    """Axes (3, 3) of a plane as columns: the world's axis nearest to it, the one beside that, the normal.
-
-    Unlike principal axes, they do not depend on rounding where the plane's points reach as far both ways.
-    """
-    normal = normal * np.sign(normal[np.argmax(np.abs(normal))])
-    x = np.eye(3)[np.argmin(np.abs(normal))]
-    x = x - (x @ normal) * normal
-    x /= np.linalg.norm(x)
-    return np.column_stack([x, np.cross(normal, x), normal])
 
 
 def similarity(points: Array) -> tuple[Array, float]:

@@ -6,8 +6,6 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["median"]
-
 
 def median(values: Array) -> Array:
     """Median along the first axis; of no values or with nan, not what NumPy makes of them."""

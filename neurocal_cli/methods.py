@@ -28,8 +28,6 @@ from neurocal_cli.verdict.repeated_views import repeated_views
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions
 
-__all__ = ["DISTORTIONS", "METHODS", "OUTLIERS", "TRAINERS", "calibrate", "fit_poses"]
-
 METHODS = ("neuro", "linear", "nonlinear", "tsai")
 TRAINERS = ("lm", "backprop")
 DISTORTIONS = ("auto", *MODELS, "plumb-line")

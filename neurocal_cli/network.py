@@ -24,17 +24,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "Patterns",
-    "e_2d",
-    "e_orth",
-    "e_orth_gradient",
-    "optimal_gamma",
-    "output",
-    "random_weights",
-    "residual_jacobian",
-]
-
 
 @frozen_dataclass(eq=False)
 class Patterns:

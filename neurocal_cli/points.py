@@ -14,8 +14,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Correspondences"]
-
 _ONLY_VIEW = "view"  # the name of the single view of points that name none
 _LARGEST = 1e100  # squares of coordinates beyond this overflow; no camera sees such a point
 

@@ -13,8 +13,6 @@ from typing import TypeVar
 
 from neurocal_cli.errors import NeurocalError
 
-__all__ = ["start_worker", "usable_cores", "work_through"]
-
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 

@@ -22,22 +22,6 @@ from neurocal_cli.verdict.report import verdict_json, verdict_lines
 if TYPE_CHECKING:
     from neurocal_cli.evaluation import CameraEvaluation
 
-__all__ = [
-    "align",
-    "calibration_json",
-    "calibration_report",
-    "evaluation_json",
-    "evaluation_report",
-    "evaluation_tables",
-    "number_or_none",
-    "parameter_rows",
-    "plural",
-    "printable",
-    "rounded",
-    "target_json",
-    "target_lines",
-]
-
 _MOST_VIEWS = 20  # rows of a table that still fit on a screen
 _MOST_DECIMALS = 9  # digits beyond these are noise of the arithmetic, not of the data
 _GIVEN = {

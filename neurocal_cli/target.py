@@ -19,17 +19,6 @@ if TYPE_CHECKING:
     from neurocal_cli.bends import Bends
     from neurocal_cli.board import Board, Plane
 
-__all__ = [
-    "TARGETS",
-    "Target",
-    "board_of",
-    "distinct_points",
-    "is_flat",
-    "planes_of",
-    "scale_of",
-    "scale_of_points",
-]
-
 TARGETS = ("auto", "given", "flat", "free")
 
 _DIGITS = 9  # of a coordinate over the target's size: the same point is written alike in all views

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_target"]
-
 _LONGEST = 0.12  # of the plane's size, for the longest arrow
 _LEVELS = 13
 _WIDTH, _HEIGHT = 5.5, 4.5  # inches of a panel

@@ -511,8 +511,8 @@ def test_numba_is_imported_only_by_the_compiled_kernel() -> None:
 def test_without_numba_training_goes_in_blocks() -> None:
     code = (
         "import sys; sys.modules['numba'] = None\n"
-        "from neurocal_cli.training import backprop, backprop_kernel, backprop_blocks as blocks\n"
-        "print(backprop_kernel.COMPILING, backprop._presenter('auto')[0] is blocks.present,"
+        "from neurocal_cli.training import backprop, backprop_kernel, backprop_blocks as blocks, compile\n"
+        "print(compile.COMPILING, backprop._presenter('auto')[0] is blocks.present,"
         " backprop._presenter('patterns')[0] is backprop_kernel.present)"
     )
     assert run(code) == "False True True\n"

@@ -12,11 +12,11 @@ from support.decomposition import decompose
 from support.distorted import LENSES
 from support.plain_projection import project
 
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
 from neurocal_cli.calibration import camera_of
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion, distort
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.geometry import Array, euler_to_rotation
 

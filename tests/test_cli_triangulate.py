@@ -17,7 +17,8 @@ from support.rigs import RigScene, random_rig
 from neurocal_cli import calibrate, write_calibration
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.rig_yaml import read_rig, write_rig
-from neurocal_cli.io.table import Schema, stream_table
+from neurocal_cli.io.table import stream_table
+from neurocal_cli.io.table_header import Schema
 from neurocal_cli.stereo.fit_rig import fit_rig
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.triangulation import triangulate

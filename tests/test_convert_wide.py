@@ -16,7 +16,8 @@ from support.made_calibration import made_calibration
 from support.wide_cameras import SIZE, WIDE_LENSES, plainly_projected, wide_camera, wide_points
 
 from neurocal_cli import Camera, Intrinsics, Pose, read_calibration, write_calibration
-from neurocal_cli.camera.distortion import MODELS, WIDE, Distortion
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.commands.convert import convert
 from neurocal_cli.distortion.nearest_camera import nearest_camera, with_model
 from neurocal_cli.errors import FormatError, InputError

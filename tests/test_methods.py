@@ -15,9 +15,9 @@ from support.scenes import FEWEST, Scene, pinhole, random_flat_set, random_solid
 
 from neurocal_cli import Correspondences, Intrinsics, Pose
 from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.geometry import Array
 
 CAMERA = Intrinsics(800.0, 820.0, 330.0, 250.0)

@@ -10,7 +10,7 @@ from support.scenes import pinhole, table_1
 
 from neurocal_cli import Correspondences, Intrinsics, Pose, calibrate
 from neurocal_cli.bundle_adjustment.problem import problem_for
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import InputError, NeurocalError, UsageError
 
 SCENE = table_1()

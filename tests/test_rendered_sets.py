@@ -14,7 +14,8 @@ from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
-from neurocal_cli.detection.detect import Points, gather
+from neurocal_cli.detection.detect import gather
+from neurocal_cli.detection.measuring import Points
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.simulation.rendering import (
     Background,

@@ -24,8 +24,6 @@ from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.pipeline.result import calibration_of
 
-__all__ = ["BASELINES", "as_posed", "calibrate_by"]
-
 BASELINES: dict[str, Callable[[Problem], Found]] = {
     "linear": linear,
     "nonlinear": nonlinear,

@@ -9,8 +9,6 @@ import numpy as np
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["smallest"]
-
 _SINGULAR = 1e-12  # of a diagonal entry over the largest, below which rounding rules
 
 

@@ -6,8 +6,6 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 
-__all__ = ["Found", "as_seen"]
-
 
 @frozen_dataclass(eq=False)
 class Found:

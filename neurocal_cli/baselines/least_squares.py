@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Least", "Parts", "least_squares"]
-
 _DENSE = 150  # unknowns up to which MINPACK is quicker than a sparse trust region
 _TOLERANCE = 1e-12
 _MOST = 200  # steps

@@ -30,15 +30,14 @@ from neurocal_cli.baselines.constrained_least_squares import smallest
 from neurocal_cli.baselines.found import Found, as_seen
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import translations_normalised
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.cameras_from_networks import cameras_from_products
 from neurocal_cli.initialisation.view_networks import Group, begin_flat
-
-__all__ = ["linear", "linear_state", "whole_groups"]
 
 _FEWEST = 4, 6  # points of a flat and of a solid view
 

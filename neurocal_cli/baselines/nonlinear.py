@@ -21,8 +21,6 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.distortion import pinhole_coefficients
 from neurocal_cli.geometry import Array
 
-__all__ = ["descend", "nonlinear", "view_of_residual", "whitened_residuals"]
-
 
 def nonlinear(problem: Problem) -> Found:
     """Minimise the pixel error from the linear answer.

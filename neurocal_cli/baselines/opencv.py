@@ -14,12 +14,11 @@ import numpy as np
 from neurocal_cli.baselines.found import Found
 from neurocal_cli.bundle_adjustment.observability import check_points
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.camera.distortion import WITH_PRISM
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
-
-__all__ = ["opencv", "without_skew"]
 
 _EPOCHS, _EPSILON = 1000, 1e-14
 _COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6

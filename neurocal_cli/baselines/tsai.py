@@ -42,8 +42,6 @@ from neurocal_cli.errors import DegenerateGeometryError, UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 
-__all__ = ["tsai", "with_known_centre"]
-
 _FEWEST = 5, 7  # points of a flat and of a solid view: one equation each
 _DISTORTIONS = ("none", "k1")
 

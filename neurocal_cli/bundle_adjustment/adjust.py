@@ -24,8 +24,6 @@ from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minim
 from neurocal_cli.least_squares.normal_equations import damped_step
 from neurocal_cli.least_squares.schur_complement import schur_step
 
-__all__ = ["Adjusted", "Restraint", "adjust"]
-
 # A share of 1e-9 of the cost is 2e-4 standard deviations of one of ten unknowns for a thousand equations.
 # test_refine.py holds the minimum against SciPy's.
 OPTIONS = DescentOptions(damping=1e-4, tolerance=1e-9, flat=1e-6, max_iterations=200)

@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Ambiguity"]
-
 
 @frozen_dataclass(eq=False)
 class Ambiguity:

@@ -35,8 +35,6 @@ from neurocal_cli.bundle_adjustment.measured_directions import (
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Noise", "common_share", "measured", "noise_of", "with_common_share"]
-
 # Repeated by tests/test_common_noise.py and tests/test_measured_directions.py: with these, true covariances
 # lower the errors of the camera and wrong ones do no harm; boards that are not flat have levels of 4 and
 # more, rendered ones of about 1.

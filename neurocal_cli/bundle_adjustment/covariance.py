@@ -16,8 +16,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import inverse_scaled
 from neurocal_cli.least_squares.schur_complement import schur_covariance
 
-__all__ = ["Covariance", "covariance"]
-
 
 @frozen_dataclass(eq=False)
 class Covariance:

@@ -23,8 +23,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics, folds_of, inverse_or_nan, solve_or_nan
 from neurocal_cli.least_squares.schur_complement import eliminate
 
-__all__ = ["FOLDS", "Minimum", "disagreement", "held_out", "held_out_points", "held_out_views", "reduced"]
-
 FOLDS = 5
 _RIDGE = 1e-13  # on the scaled diagonal: one view's pose that nothing holds must not spoil the others
 _GOLDEN = 0.6180339887498949

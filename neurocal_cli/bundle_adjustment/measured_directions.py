@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["LEAST", "equations", "loosened", "measured_part", "rounded", "single", "unit", "variance_across"]
-
 LEAST = 0.01  # of an equation
 
 

@@ -13,8 +13,6 @@ from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 
-__all__ = ["check_points", "is_weak", "refuse_undetermined", "relative_std_of_scale"]
-
 # Repeated by tests/test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal
 # matrix.
 _COLLINEAR = 1e-6  # second extent as a share of the first

@@ -33,19 +33,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 
-__all__ = [
-    "OpenCoefficients",
-    "OpenPrior",
-    "SpreadOfOpen",
-    "corner_radius",
-    "fisheye_sizes",
-    "open_coefficients",
-    "open_of_calibration",
-    "radius",
-    "spread_of_open",
-    "wide_covariance",
-]
-
 # Groups that come and go together, the power of the radius, and the std of their terms' share of the radius
 # where the lens reaches farthest, in a corner of the image. At the farthest points of four real cameras these
 # are 0.03-0.14, 0.001-0.035, 0.0001-0.001 and 0.0015-0.007; corners have up to three times as much.

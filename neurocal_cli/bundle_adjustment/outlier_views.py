@@ -20,14 +20,6 @@ from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.median import median
 
-__all__ = [
-    "conditions_on_views",
-    "find_outlier_view",
-    "free_networks",
-    "least_of_free_networks",
-    "seen_from_behind",
-]
-
 # Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones,
 # none blamed) and tests/test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
 _FEWEST = 4  # views, of which the others must outvote one

@@ -15,8 +15,6 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
 from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
 
-__all__ = ["parameter_covariance", "parameter_warnings", "pose_std", "with_scale"]
-
 # What users are warned of; no result depends on it.
 # A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
 _POOR = 0.05

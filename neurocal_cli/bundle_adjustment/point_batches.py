@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["PointBatches", "batches_of", "products"]
-
 # The fastest of 512 to 4096 points on 13 to 1000 views of 54; tests/benchmarks/test_speed.py repeats it.
 _LARGEST_BATCH = 512
 _POINTS_AT_ONCE = 4096  # about 1.5 MB of derivatives, a share of the second-level cache

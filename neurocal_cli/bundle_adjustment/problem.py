@@ -13,19 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted, Restraint, adjust
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
-from neurocal_cli.camera.projection import image_points, undistorted_pixels
+from neurocal_cli.camera.projection import ENTRIES, image_points, undistorted_pixels
 from neurocal_cli.camera.rich_lens import FIRST_NODE
 from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_to_axis
 from neurocal_cli.points import Correspondences
-
-__all__ = ["Problem", "intrinsic_matrix", "problem_for"]
 
 _LEAST_DEPTH = 0.1  # of a ray: 84 degrees from a view's middle
 _LARGEST = 1e9  # px; no image is larger

@@ -19,8 +19,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.least_squares.leave_out import folds_of
 
-__all__ = ["RepeatedPoses", "repeated_poses"]
-
 # Repeated by tests/test_repeated_poses.py: copies with 0.01 to 0.1 px of motion are found, and no two of a
 # thousand random views are called the same.
 _STILL = 1.0  # px that the target's points may move, or

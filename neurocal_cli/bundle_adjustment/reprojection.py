@@ -18,21 +18,9 @@ from neurocal_cli.bundle_adjustment.point_batches import PointBatches, products
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WITH_XI
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.projection import ENTRIES, project_points, project_with_jacobian
+from neurocal_cli.camera.projection import project_points, project_with_jacobian
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_step
-
-__all__ = [
-    "ENTRIES",
-    "POSE",
-    "CameraState",
-    "camera_columns",
-    "derivatives",
-    "farthest_angle",
-    "normal_blocks",
-    "predicted_pixels",
-    "residuals",
-]
 
 POSE = slice(5, 11)  # omega, tau
 _OMEGA, _TAU = slice(5, 8), slice(8, 11)

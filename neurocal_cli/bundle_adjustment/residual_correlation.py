@@ -14,8 +14,6 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, residuals
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
 
-__all__ = ["correlation", "effective_number", "point_residuals"]
-
 _SOME_SAY = 0.5  # from which on what points say along their edges counts
 
 

@@ -8,8 +8,6 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.points import Correspondences
 
-__all__ = ["of_few_views", "restarted"]
-
 
 def restarted(solution: Solution, points: Correspondences) -> Solution:
     """Adjust a solution to other points of the same views, or of some of them."""

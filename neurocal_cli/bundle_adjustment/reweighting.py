@@ -11,8 +11,6 @@ from neurocal_cli.bundle_adjustment.views import Views, arrange, noise_model
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["reweighted", "weighed"]
-
 _PASSES = 10
 _SETTLED = 0.005  # change of the share that no result depends on
 

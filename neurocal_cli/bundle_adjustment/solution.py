@@ -21,8 +21,6 @@ from neurocal_cli.target import Target
 if TYPE_CHECKING:
     from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 
-__all__ = ["Solution", "TrainingRecord"]
-
 
 @frozen_dataclass(eq=False)
 class TrainingRecord:

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.geometry import Array
-
-__all__ = ["in_pixels", "normalised", "translations", "translations_normalised"]
 
 
 def in_pixels(problem: Problem, state: CameraState) -> CameraState:

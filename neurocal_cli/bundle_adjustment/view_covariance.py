@@ -31,8 +31,6 @@ from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan, solve_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 
-__all__ = ["counting_views", "scores_of_poses"]
-
 _CHANCE = 1.645  # sigmas: one clean set in twenty
 _TOLD = 1e-10  # least eigenvalue of a normal matrix with a unit diagonal that rounding leaves alone
 # Variance by the jackknife over that of the normal matrix, from which on it is believed where boards bend

@@ -16,8 +16,6 @@ from neurocal_cli.geometry import Array, similarity
 from neurocal_cli.network import Patterns
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Views", "arrange", "noise_model"]
-
 # Repeated by tests/test_convergence.py, with targets of every thickness.
 # A target thinner than this share of its length is a plane up to rounding ...
 _EXACTLY_FLAT = 1e-6

@@ -29,8 +29,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Camera"]
-
 
 @frozen_dataclass(eq=False)
 class Camera:

@@ -28,8 +28,6 @@ from neurocal_cli.camera import rich_lens
 from neurocal_cli.camera.polynomial import Coefficients, distorted_with_jacobian
 from neurocal_cli.geometry import Array
 
-__all__ = ["WIDE", "WITH_XI", "Direction", "project_directions", "xi_is_flat"]
-
 WIDE = {
     "fisheye": ("k1", "k2", "k3", "k4"),
     "omnidir": ("xi", "k1", "k2", "p1", "p2"),

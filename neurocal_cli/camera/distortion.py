@@ -19,19 +19,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "MODELS",
-    "NOT_RADIAL",
-    "WIDE",
-    "WITH_PRISM",
-    "Coefficients",
-    "Distortion",
-    "coefficient_names",
-    "distort",
-    "distort_with_jacobian",
-    "pinhole_coefficients",
-]
-
 MODELS = {
     "none": (),
     "k1": ("k1",),

@@ -21,8 +21,6 @@ from neurocal_cli.camera.tilt import untilted
 from neurocal_cli.camera.unprojection import first_root, largest_angle, unproject_directions
 from neurocal_cli.geometry import Array
 
-__all__ = ["is_monotonic", "monotonic_radius", "nearly_undistorted", "radial_slope", "reaches", "undistort"]
-
 # Where Newton's method starts, and when it ends: random models of tests/test_monotonic.py, up to 95 % of
 # the radius where they cease to be monotonic, come back to 1e-8.
 _FARTHEST = 1e3  # undistorted radius that no image reaches

@@ -15,14 +15,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation, rotation_to_euler
 
-__all__ = [
-    "INTRINSIC_NAMES",
-    "POSE_NAMES",
-    "Intrinsics",
-    "Pose",
-    "entries_of",
-]
-
 INTRINSIC_NAMES = ("alpha_u", "alpha_v", "u0", "v0", "theta")
 POSE_NAMES = ("R_x", "R_y", "R_z", "t_x", "t_y", "t_z")
 

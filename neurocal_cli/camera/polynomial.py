@@ -18,8 +18,6 @@ import numpy as np
 from neurocal_cli.camera.tilt import tilted, tilted_with_jacobian
 from neurocal_cli.geometry import Array
 
-__all__ = ["Coefficients", "Distorted", "distorted", "distorted_with_jacobian"]
-
 # A number, or an array that broadcasts against the points.
 Coefficients = Sequence[Any] | Array
 

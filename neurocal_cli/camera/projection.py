@@ -18,25 +18,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.camera.directions import project_directions
-from neurocal_cli.camera.distortion import WIDE, Distortion, distort, distort_with_jacobian
+from neurocal_cli.camera.directions import WIDE, project_directions
+from neurocal_cli.camera.distortion import Distortion, distort, distort_with_jacobian
 from neurocal_cli.camera.monotonic import undistort
 from neurocal_cli.camera.polynomial import Coefficients
 from neurocal_cli.geometry import Array
-
-__all__ = [
-    "ENTRIES",
-    "Entries",
-    "ImagePoints",
-    "Rays",
-    "image_points",
-    "image_points_with_jacobian",
-    "normalised_points",
-    "project_points",
-    "project_with_jacobian",
-    "rays_of",
-    "undistorted_pixels",
-]
 
 # Rows and columns of A's free entries, in the order of every vector of intrinsics: A11, A12, A22, A13, A23.
 ENTRIES = (np.array([0, 0, 1, 0, 1]), np.array([0, 1, 1, 2, 2]))

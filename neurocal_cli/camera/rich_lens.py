@@ -20,8 +20,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["FIRST_NODE", "GRID", "NAMES", "NODES", "RADII", "REACHES", "Displacement", "displacement"]
-
 RADII, GRID = 16, 12  # nodes of the profile, and of the field in each direction
 REACHES = ("reach", "reach_x", "reach_y")  # they are never estimated
 NODES = (

@@ -15,8 +15,6 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["sensor_rotation", "tilted", "tilted_with_jacobian", "untilted"]
-
 # Derivatives of x' by x and y, of y' by x and y.
 _ByPoint = tuple[Array, Array, Array, Array]
 

@@ -9,8 +9,6 @@ from neurocal_cli.camera.directions import project_directions
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.geometry import Array
 
-__all__ = ["first_root", "largest_angle", "unproject_directions"]
-
 # Held by tests/test_directions.py: random lenses of all models, up to 99 % of their largest angle, come back
 # to 1e-9.
 _TABLE = 4096  # angles

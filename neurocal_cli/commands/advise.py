@@ -16,8 +16,6 @@ from neurocal_cli.commands.options import (
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.summaries import print_summary
 
-__all__ = ["advise"]
-
 
 @click.command(cls=Command)
 @input_argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from neurocal_cli.board import Board
     from neurocal_cli.printing.sheet import Sheet
 
-__all__ = ["board"]
-
 _ENDINGS = (".svg", ".pdf", ".png")
 
 

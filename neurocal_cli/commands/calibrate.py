@@ -27,8 +27,6 @@ from neurocal_cli.plots import CAMERA_PANELS
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
 
-__all__ = ["calibrate"]
-
 _NOT_CONVERGED = 3
 
 

@@ -19,12 +19,6 @@ if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
     from neurocal_cli.training.backprop import BackpropOptions
 
-__all__ = [
-    "Estimation",
-    "estimation_options",
-    "estimation_options_without_files",
-]
-
 _BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-gamma"}
 
 

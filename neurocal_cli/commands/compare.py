@@ -17,8 +17,6 @@ from neurocal_cli.commands.threads import compute_in_one_thread
 if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
 
-__all__ = ["compare"]
-
 
 @click.command(cls=Command)
 @input_argument("points", "POINTS.csv", "Points of a camera, as for calibrate; - is standard input.")

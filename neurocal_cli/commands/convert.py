@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.points import Correspondences
 
-__all__ = ["convert"]
-
 _FORMATS = ("neurocal", "opencv", "ros", "kalibr", "colmap", "mrcal", "matlab", "json", "npz")
 _MODELS = (
     "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir",

@@ -29,10 +29,7 @@ if TYPE_CHECKING:
 
     from neurocal_cli.board import Board
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
-    from neurocal_cli.detection.detect import Points
-
-__all__ = ["detect"]
-
+    from neurocal_cli.detection.measuring import Points
 
 _SECOND = 2  # images of another size, from which on it is no single one that strayed in
 

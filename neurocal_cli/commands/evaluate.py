@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from neurocal_cli.evaluation import CameraEvaluation
     from neurocal_cli.points import Correspondences
 
-__all__ = ["evaluate"]
-
 
 @click.group()
 def evaluate() -> None:

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from neurocal_cli.stereo.evaluation import StereoEvaluation
     from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["stereo"]
-
 
 @click.command(cls=Command)
 @input_argument(

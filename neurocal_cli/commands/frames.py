@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import note
 
-__all__ = ["videos_as_frames"]
-
 
 @contextmanager
 def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[str, ...], str]]:

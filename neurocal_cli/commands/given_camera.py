@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
 
-__all__ = ["calibration_or_camera", "given_camera"]
-
 
 def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera]:
     """Read a known camera; give the points its image size if they have none.

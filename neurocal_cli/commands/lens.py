@@ -28,8 +28,6 @@ from neurocal_cli.commands.threads import compute_in_one_thread
 if TYPE_CHECKING:
     from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["lens"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 _NOT_CONVERGED = 3

@@ -12,8 +12,6 @@ import click
 from neurocal_cli import __version__
 from neurocal_cli.commands.options import Argument
 
-__all__ = ["man", "man_pages"]
-
 _EXIT_STATUS = (
     ("0", "Done."),
     ("1", "The data give no answer: they are unreadable, malformed or degenerate. No file was changed."),

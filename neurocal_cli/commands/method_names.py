@@ -7,8 +7,6 @@ from typing import Any, TypeVar
 
 import click
 
-__all__ = ["methods_option"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 # Those of `comparison.by_method`, which a test compares.

@@ -9,8 +9,6 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from neurocal_cli.detection.batch import Outcome
 
-__all__ = ["of_one_size"]
-
 
 def of_one_size(outcomes: list[tuple[str, Outcome]]) -> list[tuple[str, Outcome]]:
     """Leave out boards in images of another size than most have; of two sizes alike, none.

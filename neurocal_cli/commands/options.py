@@ -12,25 +12,6 @@ from click.types import FloatParamType
 
 from neurocal_cli.errors import UsageError
 
-__all__ = [
-    "INPUT",
-    "Argument",
-    "Command",
-    "FiniteNumber",
-    "alpha_option",
-    "camera_name_option",
-    "check_alpha",
-    "check_camera_name",
-    "check_plot",
-    "input_argument",
-    "interpolation_option",
-    "json_option",
-    "lean_option",
-    "output_option",
-    "plot_option",
-    "points_argument",
-]
-
 _PICTURES = (".png", ".pdf", ".svg")
 
 F = TypeVar("F", bound=Callable[..., Any])

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["html_option", "write_page"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 

@@ -10,8 +10,6 @@ import click
 
 from neurocal_cli.commands.options import check_plot
 
-__all__ = ["Plots", "check_plots", "panels_option", "write_plots"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
 

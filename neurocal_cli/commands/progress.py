@@ -15,8 +15,6 @@ from neurocal_cli.errors import FormatError, InputError, NeurocalError
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-__all__ = ["ProgressBar", "each_of"]
-
 T = TypeVar("T")
 
 _PATIENCE = 0.5  # seconds before the bar appears; shorter work shows nothing

@@ -28,8 +28,6 @@ if TYPE_CHECKING:
     from neurocal_cli.stereo.rectified_pair import RectifiedPair
     from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["rectify"]
-
 _SIDES = ("left", "right")
 
 

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.io.tree_fields import Field
 
-__all__ = ["report"]
-
 _MOST_BYTES = 1_400_000  # of all photographs; as text in the page they take a third more
 
 

@@ -19,8 +19,6 @@ from neurocal_cli.errors import DegenerateGeometryError, UsageError
 if TYPE_CHECKING:
     from neurocal_cli.simulation.scenes import SimulatedScene
 
-__all__ = ["simulate"]
-
 _SIGMA = (0.1, 0.2, 0.5, 1.0, 2.0)
 _DEFAULT_METHODS = "neuro,nonlinear,linear,tsai"
 _FLAT_VIEWS = 10

@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
     from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["stereo"]
-
 _NOT_CONVERGED = 3
 
 

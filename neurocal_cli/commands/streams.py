@@ -10,21 +10,6 @@ import click
 
 from neurocal_cli.errors import UsageError
 
-__all__ = [
-    "TYPED",
-    "check_one_stdin",
-    "complain",
-    "is_terminal",
-    "note",
-    "one_line",
-    "say",
-    "set_verbosity",
-    "tell_more",
-    "verbose",
-    "warn",
-]
-
-
 TYPED = "neurocal.typed"  # where a context keeps the words of the command line
 
 # -1: warnings only, -2: not even these, 1: how the work goes as well. Errors are always told.

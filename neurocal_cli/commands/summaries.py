@@ -9,8 +9,6 @@ import click
 
 from neurocal_cli.errors import UsageError
 
-__all__ = ["check_summary", "print_summary", "summary_option"]
-
 summary_option = click.option(
     "--json",
     "as_json",

@@ -9,8 +9,6 @@ import click
 
 from neurocal_cli.commands.streams import is_terminal
 
-__all__ = ["show"]
-
 _WIDEST = 10_000  # characters; no table is wider
 
 

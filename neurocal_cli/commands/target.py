@@ -18,8 +18,6 @@ from neurocal_cli.commands.streams import say
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.errors import InputError
 
-__all__ = ["target"]
-
 
 @click.command(cls=Command)
 @input_argument(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import os
 
-__all__ = ["compute_in_one_thread"]
-
 
 def compute_in_one_thread() -> None:
     """Keep the linear algebra to one thread, for this process and those it starts.

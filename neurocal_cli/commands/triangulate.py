@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from neurocal_cli.stereo.rig import Rig
     from neurocal_cli.stereo.triangulation import Triangulated
 
-__all__ = ["triangulate"]
-
 _USUAL_SIGMA = 0.5  # of a rig without points [px]
 _LARGEST_SIGMA = 1e6  # px; no image is that large
 _MANY_OFF = 0.5  # share of the points that no bad luck explains

@@ -20,8 +20,6 @@ from neurocal_cli.commands.summaries import check_summary, print_summary, summar
 from neurocal_cli.commands.undistorted_places import check_distinct, places_of
 from neurocal_cli.errors import UsageError
 
-__all__ = ["undistort"]
-
 
 @click.command(cls=Command)
 @input_argument("camera", "CAMERA.yaml", "The camera, a neurocal, ROS or OpenCV file; - is standard input.")

@@ -9,8 +9,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from neurocal_cli.commands.streams import is_terminal
 from neurocal_cli.errors import UsageError
 
-__all__ = ["check_distinct", "places_of"]
-
 
 def places_of(paths: Sequence[str], output: str) -> tuple[str | None, list[str]]:
     """The folder that the output names, if it names one, and the place of each file's result.

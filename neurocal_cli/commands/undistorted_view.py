@@ -10,8 +10,6 @@ from neurocal_cli.distortion.panorama import Panorama
 from neurocal_cli.distortion.undistorted_view import Undistorted, field_of_view
 from neurocal_cli.io.writing import write_whole
 
-__all__ = ["summary", "tell_loss", "write_camera", "write_maps"]
-
 _UNTOLD = 2.0  # degrees that nobody misses
 
 

@@ -18,8 +18,6 @@ from neurocal_cli.io.writing import write_whole
 if TYPE_CHECKING:
     from neurocal_cli.distortion.remapping import Remapping
 
-__all__ = ["Undistorting"]
-
 
 @dataclass
 class Undistorting:

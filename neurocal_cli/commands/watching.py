@@ -14,8 +14,6 @@ from neurocal_cli.errors import FormatError, NeurocalError
 if TYPE_CHECKING:
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
 
-__all__ = ["watch"]
-
 _PAUSE = 0.3  # seconds between two looks; a file that is still copied grows in this time
 
 

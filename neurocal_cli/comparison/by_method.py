@@ -9,8 +9,6 @@ from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
 
-__all__ = ["METHODS", "calibrate_with"]
-
 METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 
 

@@ -15,8 +15,6 @@ from neurocal_cli.methods import calibrate
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.evaluation import StereoEvaluation, evaluate_stereo
 
-__all__ = ["Compared", "Comparison", "compare"]
-
 _FOLDS = 5
 
 Progress = Callable[[str, float], None]

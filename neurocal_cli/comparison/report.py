@@ -11,8 +11,6 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
 from neurocal_cli.comparison.compare import Compared, Comparison
 from neurocal_cli.report import align, number_or_none, rounded
 
-__all__ = ["comparison_json", "comparison_report"]
-
 _MODELS = {"none": "no distortion"}
 _SIDES = "left", "right"
 

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 
 from neurocal_cli.board import Board
-from neurocal_cli.detection.detect import Detection, Points, detect_points, wanted_sizes
+from neurocal_cli.detection.detect import Detection, detect_points, wanted_sizes
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.identity.messages import NoBoardError
+from neurocal_cli.detection.measuring import Points
 from neurocal_cli.detection.memory import Memory, Remembered
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
@@ -19,8 +20,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.images import Image, encode_png, parse_image
 from neurocal_cli.processes import start_worker, usable_cores, work_through
-
-__all__ = ["DetectionOptions", "Outcome", "default_jobs", "detect_file", "detect_files", "keep_memory"]
 
 _WORTH_A_PROCESS = 4  # images; fewer take less time than the start of a process
 _KEPT = 31 << 20  # bytes; glibc learns nothing from blocks of 32 MiB and more

@@ -23,8 +23,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Detection", "Labels", "Points", "detect_points", "gather", "label", "wanted_sizes"]
-
 _FEWEST = 8  # points; fewer determine hardly more than the pose
 _STEPS = np.array([[1, 0], [0, 1], [0, 0]])  # by kind: from a point's index to the other end of its edge
 _PREFIXES = ("h:", "v:", "")  # by kind: of a point's id

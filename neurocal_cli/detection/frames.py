@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["choose_frames"]
-
 _STRETCH = 0.25  # seconds: of a hand that shakes, some moment is still
 _LONGEST = 60  # frames
 _WIDTH = 640  # px; sharpness is seen there as well, and costs less

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["EDGE_H", "EDGE_V", "VERTEX", "Grid", "Measured", "joined"]
-
 # Kinds of points: the mid-point of the edge from (c, r) to (c + 1, r), from (c, r) to (c, r + 1),
 # and the vertex (c, r) itself.
 EDGE_H, EDGE_V, VERTEX = 0, 1, 2

@@ -31,8 +31,6 @@ from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured, 
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
-__all__ = ["Points", "measure"]
-
 Points: TypeAlias = Literal["midpoints", "edges", "vertices"]
 
 _ROUNDING = 1 / 12  # DN^2

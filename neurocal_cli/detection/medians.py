@@ -9,8 +9,6 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["CHI2_MEDIAN", "MAD_TO_SIGMA", "median", "quantile", "upper_median"]
-
 MAD_TO_SIGMA = 1.4826  # standard deviation over the median absolute deviation, of normal numbers
 CHI2_MEDIAN = 0.455  # of chi-squared with one degree of freedom
 

@@ -23,8 +23,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.writing import write_whole
 
-__all__ = ["Memory", "Remembered"]
-
 _FORMAT = 1
 
 Remembered = dict[str, Any]  # fields of `batch.Outcome`, its problem without the image's name

@@ -6,8 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["other_target"]
-
 # Repeated by tests/test_other_targets.py: none is seen in noise, in blurred boards and in the sample images.
 _LONGEST = 1000  # px of the image that is looked at; markers and circles of a target are no smaller
 _MARKERS = 3  # of one family; noise shows one at times

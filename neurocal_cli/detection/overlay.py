@@ -14,8 +14,6 @@ from neurocal_cli.detection.identity.identify import Located
 from neurocal_cli.detection.plane_residuals import plane_residuals
 from neurocal_cli.geometry import Array
 
-__all__ = ["draw_detection", "draw_failure"]
-
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 

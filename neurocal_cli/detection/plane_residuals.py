@@ -9,8 +9,6 @@ from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Measured
 from neurocal_cli.detection.wide_lens import fit_wide_lens
 from neurocal_cli.geometry import Array
 
-__all__ = ["plane_residuals"]
-
 _FEWEST_WIDE = 12  # points for the lens of equal angles
 _POINTS_A_TERM = 6  # least number of points for each coefficient of the polynomial; for pictures only
 

@@ -13,8 +13,6 @@ import numpy as np
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["WideFit", "WideLens", "fit_wide_lens"]
-
 # Angle of the outermost vertex from the axis, where the search for a focal length begins [rad].
 _ANGLES = np.geomspace(0.12, 2.1, 16)
 _STEPS = 15  # Levenberg-Marquardt steps from there, at most

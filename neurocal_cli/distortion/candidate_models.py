@@ -28,16 +28,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
-__all__ = [
-    "Candidate",
-    "as_fisheye",
-    "falls_short",
-    "fit_candidates",
-    "judged_again",
-    "supported",
-    "worth",
-]
-
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
 # tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
 # the tightest with which all of these end as they do; penalties and tests against 0 are chi-squared levels,

@@ -15,8 +15,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["FEWEST_ON_LINE", "CollinearPoints", "find_lines"]
-
 FEWEST_ON_LINE = 4
 _FEWEST_OF_EDGES = 3  # the same for points that are measured across edges, on lines along these edges
 

@@ -16,8 +16,6 @@ from neurocal_cli.bundle_adjustment.residual_correlation import correlation, eff
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 
-__all__ = ["DENOMINATOR", "with_denominator_if_told"]
-
 DENOMINATOR = frozenset({"k4", "k5", "k6"})
 _STEPS = 150  # the coefficients all but compensate each other
 # Repeated by tests/test_prism_and_tilt.py (slow): 100 lenses without a denominator and with one.

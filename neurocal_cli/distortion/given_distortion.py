@@ -13,8 +13,6 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.distortion.monotonic_fit import fit_monotonic, where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 
-__all__ = ["check_distortion"]
-
 
 def check_distortion(solution: Solution) -> Solution:
     """Put a given distortion back, and check that the distortion is monotonic.

@@ -31,7 +31,8 @@ from neurocal_cli.bundle_adjustment.residual_correlation import correlation, poi
 from neurocal_cli.bundle_adjustment.restart import of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion import MODELS, WIDE
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import MODELS
 from neurocal_cli.distortion.candidate_models import (
     Candidate,
     falls_short,
@@ -41,8 +42,6 @@ from neurocal_cli.distortion.candidate_models import (
 )
 from neurocal_cli.distortion.multi_start import VIEWS_THAT_TELL
 from neurocal_cli.geometry import Array
-
-__all__ = ["predicts_decidedly_better", "select_model"]
 
 Starts = Callable[[Problem], Iterable[CameraState]]
 

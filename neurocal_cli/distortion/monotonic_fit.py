@@ -35,8 +35,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["MonotonicFit", "fit_monotonic", "normal_part", "where_not_monotonic"]
-
 # Repeated by tests/test_monotonic_fit.py and, for the tie, tests/test_model_selection.py: lenses that are
 # not monotonic in unseen corners predict new views 5 to 16 % better with these.
 _BORDER = 17  # points along each side of the image at which it is checked

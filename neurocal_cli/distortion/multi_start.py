@@ -22,10 +22,9 @@ from neurocal_cli.bundle_adjustment.residual_correlation import correlation, poi
 from neurocal_cli.bundle_adjustment.restart import of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion import WIDE, WITH_PRISM
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.distortion.denominator import DENOMINATOR
-
-__all__ = ["VIEWS_THAT_TELL", "with_more_starts"]
 
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
 # showed more.

@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.directions import WITH_XI
-from neurocal_cli.camera.distortion import WIDE, Distortion, coefficient_names, pinhole_coefficients
+from neurocal_cli.camera.directions import WIDE, WITH_XI
+from neurocal_cli.camera.distortion import Distortion, coefficient_names, pinhole_coefficients
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-
-__all__ = ["Distance", "NearestCamera", "image_rays", "nearest_camera", "with_model"]
 
 _GRID = 25  # pixels along each side of the image
 _FEWEST = 50  # of them must see something

@@ -22,8 +22,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["PANORAMAS", "Panorama"]
-
 PANORAMAS = ("cylinder", "equirectangular")
 
 

@@ -37,8 +37,6 @@ from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minim
 from neurocal_cli.least_squares.normal_equations import damped_step, unit_diagonal
 from neurocal_cli.points import Correspondences
 
-__all__ = ["PlumbLine", "fit_plumb_line", "lines_in_pixels"]
-
 _MODEL = "k1k2"
 _CENTRE, _COEFFICIENTS = [3, 4], [5, 6]  # columns of the derivatives
 # Starting values of k1, in units of s. The strongest barrel distortion is a fisheye whose circle is half the

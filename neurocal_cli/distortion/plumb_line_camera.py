@@ -53,8 +53,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 from neurocal_cli.points import Correspondences
 
-__all__ = ["MODEL", "distortion_and_camera"]
-
 MODEL = "k1k2p1p2"
 
 _ITERATIONS = 50

@@ -18,8 +18,6 @@ import numpy as np
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 
-__all__ = ["averaged_over_sizes"]
-
 
 def averaged_over_sizes(
     covariance: Array, H: Array, right: Array, profile: slice, value: Array, priors: tuple[Array, Array]

@@ -16,8 +16,6 @@ from neurocal_cli.distortion.undistortion import chosen_view, sources
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
-__all__ = ["INTERPOLATIONS", "Remapping", "undistort_image"]
-
 INTERPOLATIONS = {
     "nearest": cv2.INTER_NEAREST,
     "linear": cv2.INTER_LINEAR,

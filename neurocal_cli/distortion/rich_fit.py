@@ -37,8 +37,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
-__all__ = ["promised", "with_displacement"]
-
 _N = len(NODES)
 # Of the coefficients, k1 to k4 and the nodes; and the parts of these.
 _UNKNOWNS = np.r_[:4, FIRST_NODE : FIRST_NODE + _N]

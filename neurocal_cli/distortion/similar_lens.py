@@ -20,8 +20,6 @@ from neurocal_cli.camera.projection import ENTRIES, project_points
 from neurocal_cli.camera.tilt import sensor_rotation
 from neurocal_cli.geometry import Array
 
-__all__ = ["similar_states", "tilted_states"]
-
 # Repeated by tests/test_wide_lenses.py (slow): random lenses of all models arrive at the minimum from here.
 _ANGLES = 60
 _LEAST_ANGLE, _SPARE = 0.05, 1e-3  # [rad]

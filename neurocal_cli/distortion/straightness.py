@@ -24,8 +24,6 @@ from neurocal_cli.distortion.collinear_points import CollinearPoints
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["CAMERA", "DistortedLines", "LineImages", "distorted_lines", "straightness_error"]
-
 CAMERA = 5  # columns of A's entries A11, A12, A22, A13, A23, before the coefficients
 
 _SETTLED = 1e-10  # a step of feet and lines below this, in normalised image units, ends the iteration

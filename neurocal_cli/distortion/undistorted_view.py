@@ -18,8 +18,6 @@ from neurocal_cli.distortion.panorama import PANORAMAS, Panorama
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
-__all__ = ["SHAPES", "Field", "Undistorted", "field_of_view", "plane_like", "undistorted_view"]
-
 SHAPES = ("plane", *PANORAMAS)
 Undistorted = Camera | Panorama
 

@@ -29,17 +29,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = [
-    "chosen_view",
-    "map_points",
-    "new_matrix",
-    "shown",
-    "sources",
-    "undistort_pixels",
-    "undistort_points",
-    "undistorted_camera",
-]
-
 # With these, no pixel at alpha 0 comes from more than 0.02 px outside; tests/test_undistortion.py repeats it.
 _BORDER = 401  # samples along each side of the image
 _GRID = 41  # samples along each axis inside it

@@ -27,8 +27,6 @@ from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import ROUNDING, unit_diagonal
 
-__all__ = ["with_all_minima", "with_xi_held_if_flat"]
-
 # Repeated by tests/test_wide_lenses.py (slow: a thousand cameras): all at the lowest minimum, their errors
 # as large as their standard deviations.
 _GRID = {"omnidir": np.linspace(0.0, 3.0, 31), "double_sphere": np.linspace(-0.6, 1.0, 33)}

@@ -13,8 +13,6 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["enlargement", "error_bars", "residual_map", "scatter"]
-
 _MOST = 4000  # vectors of one drawing
 _LONG = 0.04  # of the image's width, for a residual of three times the rms
 

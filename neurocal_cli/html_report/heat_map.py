@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["heat_map"]
-
 _LEVELS = 8
 _CELLS = 120  # across, about
 _MOST_DOTS = 1500

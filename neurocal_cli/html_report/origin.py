@@ -10,8 +10,6 @@ from importlib.metadata import PackageNotFoundError, version
 from neurocal_cli import __version__
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 
-__all__ = ["Origin", "versions"]
-
 
 @frozen_dataclass
 class Origin:

@@ -8,8 +8,6 @@ from html import escape
 from neurocal_cli import __version__
 from neurocal_cli.calibration import Verdict
 
-__all__ = ["definitions", "figure", "page", "section", "table", "verdict_block"]
-
 _LONG = 40  # characters of a cell, beyond which it is a text
 
 _STYLE = """

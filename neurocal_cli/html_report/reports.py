@@ -23,8 +23,6 @@ from neurocal_cli.zoom_lens.judgement import judge_lens
 from neurocal_cli.zoom_lens.report import lens_report
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["calibration_page", "lens_page", "rig_page"]
-
 _MOST_REJECTED = 200  # rows
 _SETTINGS = 25  # along a control
 

@@ -13,8 +13,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.orthogonality import pose_from_product, shared_intrinsics
 from neurocal_cli.initialisation.view_networks import Group
 
-__all__ = ["cameras_from_products", "candidate_intrinsics"]
-
 # Repeated by tests/test_convergence.py: the wrong minima of the conditions that its 1300 scenes show, and
 # depths that keep all their points in front of the first camera.
 _MOST_CANDIDATES = 4

@@ -26,8 +26,6 @@ from neurocal_cli.network import Patterns, random_weights
 from neurocal_cli.training import Task
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
 
-__all__ = ["Consensus", "find_consensus", "find_consensus_through_wide_lens"]
-
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view, each within 3 standard deviations of clean data): starts and rounds are what the last
 # scene needed, the limits lie between the clean and the wrong views of these sets.

@@ -10,12 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.geometry import nearest_rotation
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.training import Task
-
-__all__ = ["train_constrained"]
 
 
 def train_constrained(problem: Problem, options: Options, state: CameraState) -> tuple[CameraState, int]:

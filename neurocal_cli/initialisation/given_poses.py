@@ -5,18 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution, TrainingRecord
 from neurocal_cli.bundle_adjustment.units import translations_normalised
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.network import Patterns
 from neurocal_cli.training.starts import FixedWeights, learn
-
-__all__ = ["solve_given_poses"]
 
 # With a wide lens: the depth of a point that trains the network, as a share of its distance (60 degrees from
 # the axis), and the fewest of them.

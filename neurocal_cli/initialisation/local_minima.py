@@ -23,16 +23,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.view_networks import Group
 from neurocal_cli.least_squares.leave_out import solve_or_nan
 
-__all__ = [
-    "OnlyMirroredError",
-    "better_by_view",
-    "reaches_bound",
-    "refuse_mirrored",
-    "short_of_bound",
-    "try_mirrored",
-    "try_start",
-]
-
 # Repeated by tests/test_convergence.py (1000 solid and 300 flat scenes, three seeds) and
 # tests/test_refusals.py: in these no start that won was behind after so many steps, no mirrored pose won
 # from farther off, and no camera of right data was ever called mirrored.

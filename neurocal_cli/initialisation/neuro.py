@@ -43,8 +43,6 @@ from neurocal_cli.initialisation.view_networks import (
     train_networks,
 )
 
-__all__ = ["solve"]
-
 # Repeated by tests/test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
 # starts.
 _FEW_POINT_STARTS = 100

@@ -14,8 +14,6 @@ from neurocal_cli.training.starts import Agreement
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions
 
-__all__ = ["Options", "Progress", "options_for"]
-
 # Called with the name of a stage and the share of it that is done.
 Progress = Callable[[str, float], None]
 

@@ -17,8 +17,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 
-__all__ = ["SharedIntrinsics", "pose_from_product", "shared_intrinsics"]
-
 # Bundle adjustment goes on from here, so a gain of 1e-4 of the loss is the last worth having. Starts are
 # random, so it is the real gain that counts; test_orthogonality.py holds the share of starts that arrive.
 _OPTIONS = DescentOptions(

@@ -34,8 +34,6 @@ from neurocal_cli.initialisation.options import Options, options_for
 from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
 
-__all__ = ["middle_of_image", "radial_start"]
-
 # lambda_1 = -0.8 is a barrel that shows 5 times the radius of a pinhole at the farthest point, 0.3 a
 # pincushion. Repeated by tests/test_radial_networks.py and the campaign of tests/test_campaign.py (slow).
 _STRENGTHS = (-0.8, -0.65, -0.5, -0.38, -0.27, -0.17, -0.08, 0.08, 0.17, 0.3)

@@ -19,8 +19,6 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.network import Patterns
 
-__all__ = ["Found", "find_camera", "find_poses"]
-
 # Repeated by tests/test_convergence.py, whose scenes of 3 to 8 points begin here.
 _MOST_POINTS = 64
 _NEAREST = 1.2  # depth of the nearest point's side of the target, in target radii

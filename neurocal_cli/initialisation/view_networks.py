@@ -18,8 +18,6 @@ from neurocal_cli.network import Patterns, residual_jacobian
 from neurocal_cli.training import Task
 from neurocal_cli.training.starts import FixedWeights, learn
 
-__all__ = ["Group", "begin_flat", "refuse_few_conditions", "train_networks"]
-
 # Eigenvalue of the product's normal matrix, as a share of the largest, that rounding leaves of 0.
 _NO_CONDITION = 1e-13
 _SMALL = 1500  # patterns in all up to which fewer of them save no time (tests/benchmarks/test_speed.py)

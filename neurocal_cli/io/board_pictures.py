@@ -17,8 +17,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.printing.sheet import Line, Sheet, Text
 
-__all__ = ["board_pdf", "board_png", "board_svg"]
-
 _POINT = 72 / 25.4  # points of a millimetre
 _DASH = 1.0  # mm
 _MOST_PIXELS = 200_000_000

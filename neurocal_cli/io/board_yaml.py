@@ -16,8 +16,6 @@ from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import parse_yaml, read_yaml
 
-__all__ = ["format_board", "parse_board", "read_board", "write_board"]
-
 _COUNTS = ("cols", "rows")
 _VECTORS = ("origin", "x_axis", "y_axis")
 _DISTANCE_KEYS = ("from", "to", "length", "std")

@@ -20,14 +20,6 @@ from neurocal_cli.io.verdict_yaml import read_verdict
 from neurocal_cli.io.views_yaml import read_views
 from neurocal_cli.points import Correspondences
 
-__all__ = [
-    "calibration_from_field",
-    "distortion_from_field",
-    "intrinsics_from_field",
-    "neurocal_block",
-    "poses_from_field",
-]
-
 # camera_matrix repeats the parameters for ROS; a difference beyond rounding means an edit of one.
 _SAME = 1e-6
 

@@ -33,15 +33,6 @@ from neurocal_cli.io.yaml_text import flow, flows, mapping, number, quoted, text
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = [
-    "FORMATS",
-    "HEADER",
-    "calibration_lines",
-    "format_calibration",
-    "read_calibration",
-    "write_calibration",
-]
-
 FORMATS = (1, 2)  # of the neurocal block: tables by rows, and of long files by columns
 
 # Without these two lines OpenCV 4 opens no YAML; 1.1 is the version that PyYAML and ROS read.

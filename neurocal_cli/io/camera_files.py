@@ -12,8 +12,6 @@ from neurocal_cli.io.exchange.reading import read_cameras
 from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.files import one_line
 
-__all__ = ["read_extrinsics", "read_intrinsics"]
-
 
 def read_intrinsics(path: str | Path) -> Camera:
     """Read a camera without its poses.

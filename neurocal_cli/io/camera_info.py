@@ -14,8 +14,6 @@ from neurocal_cli.io.yaml_text import flow, mapping, number, text
 if TYPE_CHECKING:
     from neurocal_cli.distortion.panorama import Panorama
 
-__all__ = ["camera_info_lines", "format_camera_info", "format_panorama"]
-
 _FORMULAS = {
     "cylinder": "u = f atan2(X, Z) + u0, v = f Y / hypot(X, Z) + v0",
     "equirectangular": "u = f atan2(X, Z) + u0, v = f atan2(Y, hypot(X, Z)) + v0",

@@ -17,8 +17,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.distortion_names import from_ros
 from neurocal_cli.io.tree_fields import Field
 
-__all__ = ["boofcv_camera", "camera_from_tree", "has_matrix", "image_size", "matrix_data"]
-
 # Ours and ROS's first; a stereo file of OpenCV's sample has M1, D1 for the left camera.
 _MATRIX_KEYS = (
     "camera_matrix",

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.camera.distortion import WIDE, WITH_PRISM, coefficient_names
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import WITH_PRISM, coefficient_names
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
-
-__all__ = ["from_ros", "own_length", "to_ros"]
 
 # ROS's names of our models: a plumb_bob has 5 coefficients, of which the simpler models use the first.
 _ROS = {"rational": "rational_polynomial", "fisheye": "equidistant"}

@@ -12,8 +12,6 @@ from neurocal_cli.io.files import read_text
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_tree import parse_yaml, plain_value
 
-__all__ = ["parse_tree", "read_tree"]
-
 _DEEPEST = 40
 
 

@@ -12,8 +12,6 @@ import numpy as np
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.yaml_text import number, quoted
 
-__all__ = ["storage_text"]
-
 _PER_LINE = 4  # numbers; OpenCV's reader takes no line of more than some thousand characters
 
 

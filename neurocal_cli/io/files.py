@@ -14,8 +14,6 @@ from neurocal_cli.io.outputs import held_back
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["decode", "one_line", "read_blocks", "read_bytes", "read_text", "reason"]
-
 _WIDE_MARKS = (
     (b"\xff\xfe\x00\x00", "UTF-32"),  # begins like UTF-16's mark, so it is tried first
     (b"\x00\x00\xfe\xff", "UTF-32"),

@@ -16,8 +16,6 @@ from collections.abc import Callable, Iterator
 from neurocal_cli.errors import FormatError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 
-__all__ = ["Header", "is_video_header", "read_header"]
-
 _EXIF_MARK = b"Exif\0\0"
 _ORIENTATION, _WIDTH, _HEIGHT = 274, 256, 257
 _STRIPS = ((273, 279), (324, 325))  # offsets and lengths of strips, of batches

@@ -12,8 +12,6 @@ from pathlib import Path
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.files import one_line
 
-__all__ = ["find_images", "is_image", "natural_order", "view_names"]
-
 _ENDINGS = (".png", ".jpg", ".jpeg", ".jpe", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".pnm")
 
 

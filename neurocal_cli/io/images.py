@@ -18,19 +18,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.image_headers import Header, read_header
 
-__all__ = [
-    "MOST_PIXELS",
-    "Image",
-    "Picture",
-    "captured_stderr",
-    "encode_image",
-    "encode_png",
-    "parse_image",
-    "read_image",
-    "read_picture",
-    "shrink",
-]
-
 MOST_PIXELS = 200_000_000  # larger than any camera's; a file that states more is refused
 
 _TURNS = {

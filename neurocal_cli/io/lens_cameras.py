@@ -13,11 +13,10 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_files import read_intrinsics
-from neurocal_cli.io.table import Schema, Table, parse_table
+from neurocal_cli.io.table import Table, parse_table
+from neurocal_cli.io.table_header import Schema
 from neurocal_cli.zoom_lens.fit_cameras import LensCameras
 from neurocal_cli.zoom_lens.settings import CONTROLS
-
-__all__ = ["names_cameras", "read_cameras", "require_setting"]
 
 _PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 _FILES = "camera"

@@ -21,8 +21,6 @@ from neurocal_cli.io.writing import write_whole
 from neurocal_cli.zoom_lens.fit_cameras import LensCameras
 from neurocal_cli.zoom_lens.settings import LensPoints, describe
 
-__all__ = ["read_lens_data", "read_lens_points", "write_lens_points"]
-
 
 def read_lens_data(
     paths: str | Path | Sequence[str | Path], *, notes: list[str] | None = None

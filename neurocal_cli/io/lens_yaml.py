@@ -23,8 +23,6 @@ from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables
 from neurocal_cli.zoom_lens.settings import CONTROLS
 from neurocal_cli.zoom_lens.zoom_lens import Member, RejectedSetting, ZoomLens
 
-__all__ = ["format_lens", "lens_from_field", "read_lens", "write_lens"]
-
 _FORMAT = 2
 _BLOCK = "neurocal_lens"
 _CAMERA = ("alpha_u", "alpha_v", "u0", "v0")

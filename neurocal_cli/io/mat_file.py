@@ -15,8 +15,6 @@ import numpy as np
 
 from neurocal_cli.errors import FormatError
 
-__all__ = ["read_variables"]
-
 _HEADER = 128  # bytes
 _MATRIX, _COMPRESSED = 14, 15
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}

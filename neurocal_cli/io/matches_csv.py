@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.io.table import Schema, stream_table
-
-__all__ = ["MATCHES", "Matches", "read_matches"]
+from neurocal_cli.io.table import stream_table
+from neurocal_cli.io.table_header import Schema
 
 MATCHES = Schema(
     kind="matches",

@@ -12,8 +12,6 @@ from collections.abc import Iterable, Iterator
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import quoted, text
 
-__all__ = ["named_lines", "read_named"]
-
 _KEY = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*").fullmatch
 
 

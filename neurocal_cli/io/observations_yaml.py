@@ -32,8 +32,6 @@ from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flow, number, quoted
 from neurocal_cli.points import Correspondences
 
-__all__ = ["observation_lines", "read_observations"]
-
 _PLACE = ("X", "Y", "Z")
 _PIXEL = ("u", "v")
 _COVARIANCE = ("suu", "suv", "svv")

@@ -13,8 +13,6 @@ from contextvars import ContextVar
 
 from neurocal_cli.errors import UsageError
 
-__all__ = ["Outputs", "all_or_none", "held_back"]
-
 _Identity = tuple[int, int]  # device and inode
 
 

@@ -11,11 +11,10 @@ import numpy as np
 
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.points_join import ACROSS, COVARIANCE, SETTINGS, WORLD_STD, correspondences
-from neurocal_cli.io.table import Schema, read_table
+from neurocal_cli.io.table import read_table
+from neurocal_cli.io.table_header import Schema
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
-
-__all__ = ["POINTS", "format_points", "read_points", "write_points"]
 
 POINTS = Schema(
     kind="points",

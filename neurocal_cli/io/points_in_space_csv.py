@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.stereo.triangulation import Triangulated
 
-__all__ = ["COLUMNS", "format_space_points"]
-
 COLUMNS = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ", "epipolar", "flag")
 FLAGS = np.array(["ok", "off", "behind"])
 

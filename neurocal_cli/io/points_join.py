@@ -13,8 +13,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.io.table import Table
 from neurocal_cli.points import Correspondences
 
-__all__ = ["ACROSS", "COVARIANCE", "SETTINGS", "WORLD_STD", "correspondences"]
-
 COVARIANCE = ("suu", "suv", "svv")
 ACROSS = ("nu", "nv")
 WORLD_STD = ("sX", "sY", "sZ")

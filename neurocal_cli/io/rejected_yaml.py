@@ -16,8 +16,6 @@ from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import quoted
 from neurocal_cli.points import Correspondences
 
-__all__ = ["read_rejected", "rejected_lines"]
-
 _NUMBERS = ("X", "Y", "Z", "u", "v", "error_px")
 
 

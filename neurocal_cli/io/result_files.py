@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["lean_calibration", "lean_rig", "write_result"]
-
 
 def write_result(
     result: Calibration | Rig, path: str | Path, *, lean: bool = False, alpha: float | None = None

@@ -23,8 +23,6 @@ from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["format_rig", "format_ros_pair", "read_rig", "rig_from_field", "write_rig"]
-
 FORMAT = 1  # of the stereo block; a change that older readers cannot follow makes it 2
 _GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
 _METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}

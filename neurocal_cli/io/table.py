@@ -35,16 +35,6 @@ from neurocal_cli.io.table_header import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = [
-    "Schema",
-    "Table",
-    "parse_table",
-    "read_in_bulk",
-    "read_line_by_line",
-    "read_table",
-    "stream_table",
-]
-
 _BLOCK = 1 << 22  # bytes of a stream at a time: some ten thousand rows
 # Printable ASCII without quotes, tabs and line ends: nothing here is blank in one reader's eyes only.
 _PLAIN = bytes(c for c in range(32, 127) if c != ord('"')) + b"\t\n"

@@ -15,16 +15,6 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import one_line
 
-__all__ = [
-    "Layout",
-    "Metadata",
-    "Schema",
-    "find_layout",
-    "is_decimal_comma",
-    "is_number",
-    "split_fields",
-]
-
 # What a number looks like in our files; Python's float() would also take 1_0 and other alphabets.
 is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 

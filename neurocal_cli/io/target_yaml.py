@@ -14,8 +14,6 @@ from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import mapping, number
 from neurocal_cli.target import Target
 
-__all__ = ["read_target", "target_lines"]
-
 _NUMBERS = ("X", "Y", "Z", "X_given", "Y_given", "Z_given", "sX", "sY", "sZ")
 _STATED = ("sX_stated", "sY_stated", "sZ_stated")
 _SHAPES = ("bowl", "saddle", "twist")

@@ -12,8 +12,6 @@ import re
 from binascii import crc32
 from contextlib import suppress
 
-__all__ = ["remove_stale", "temporary_name"]
-
 _NAME = r"\.neurocal-([0-9a-f]{8})-(\d{1,10})-[0-9a-f]{16}\.tmp"
 _seen: set[str] = set()  # folders that this process has cleared
 

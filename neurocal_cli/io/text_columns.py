@@ -19,21 +19,6 @@ from numpy.typing import NDArray
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flows, quoted
 
-__all__ = [
-    "LONGEST",
-    "column_lines",
-    "join_ranges",
-    "number_texts",
-    "number_words",
-    "packed_text",
-    "read_columns",
-    "read_numbers",
-    "read_packed",
-    "read_ranges",
-    "read_table",
-    "table_lines",
-]
-
 LONGEST = 160  # numbers in a text, each of 24 characters at most
 
 _PRIVATE = 0xF0000  # the first of 65536 characters that mean what programs agree on

@@ -11,8 +11,6 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.image_paths import find_images, view_names
 from neurocal_cli.io.images import encode_image, read_image, shrink
 
-__all__ = ["photographs_of", "thumbnails"]
-
 _WIDEST = 960  # px; a page shows no more of one
 _NARROWEST = 120
 

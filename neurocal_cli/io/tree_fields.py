@@ -12,8 +12,6 @@ import numpy as np
 from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
 
-__all__ = ["Field"]
-
 # YAML 1.1 takes 1e-05 for text, as it has no point; other programs write it for a number.
 _NUMBER_TEXT = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 

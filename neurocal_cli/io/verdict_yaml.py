@@ -8,8 +8,6 @@ from neurocal_cli.calibration import Verdict
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import mapping, number, quoted, text
 
-__all__ = ["read_verdict", "verdict_lines"]
-
 
 def verdict_lines(verdict: Verdict | None) -> Iterator[str]:
     """Lines of the block ``verdict``; none where there is no verdict."""

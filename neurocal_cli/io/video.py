@@ -16,8 +16,6 @@ from neurocal_cli.io.image_headers import is_video_header
 from neurocal_cli.io.images import captured_stderr, encode_png
 from neurocal_cli.io.writing import write_whole
 
-__all__ = ["frame_rate", "is_video", "save_frame", "video_frames"]
-
 _HEAD = 16  # bytes that tell a kind of file
 _USUAL, _FASTEST = 30.0, 1e4  # frames a second
 

@@ -15,8 +15,6 @@ from neurocal_cli.io.text_columns import column_lines, read_columns
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flows, text
 
-__all__ = ["alike", "read_views", "view_lines"]
-
 _NAME = "name"
 
 # Angles give R back but for the last bits; more means an edit of one.

@@ -21,8 +21,6 @@ from neurocal_cli.io.temporary_files import remove_stale, temporary_name
 if TYPE_CHECKING:
     from pathlib import Path
 
-__all__ = ["check_places", "write_chunks", "write_stdout", "write_whole"]
-
 # Opening these anew would truncate what the shell appends to, so they are written as stdout is.
 _STDOUT_NAMES = frozenset({"-", "/dev/stdout", "/dev/fd/1", "/proc/self/fd/1"})
 

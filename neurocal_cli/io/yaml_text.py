@@ -16,8 +16,6 @@ import numpy as np
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 
-__all__ = ["flow", "flows", "mapping", "number", "quoted", "text"]
-
 _PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_./+-]*").fullmatch
 _RESERVED = frozenset(("null", "true", "false", "yes", "no", "on", "off", "y", "n"))
 

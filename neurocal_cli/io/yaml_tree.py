@@ -23,8 +23,6 @@ import yaml
 from neurocal_cli.errors import FormatError
 from neurocal_cli.io.files import read_text
 
-__all__ = ["parse_yaml", "plain_value", "read_yaml"]
-
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _DEEPEST = 40
 

@@ -6,8 +6,6 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["chi_squared", "exceeded_by_chance"]
-
 _ROUNDING = 1e-15  # of the largest eigenvalue
 
 

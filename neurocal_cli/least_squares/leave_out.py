@@ -18,8 +18,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
-__all__ = ["Quadratics", "folds_of", "inverse_or_nan", "solve_or_nan"]
-
 _REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal; below, rounding has the say
 # What nothing determines is infinite or nan, and told so by the results.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")

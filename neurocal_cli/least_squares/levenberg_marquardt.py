@@ -36,8 +36,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["DescentOptions", "LeastSquaresProblem", "LevenbergMarquardt", "Outcome", "Stop", "minimise"]
-
 Step = TypeVar("Step")
 Trial = TypeVar("Trial")
 

@@ -6,8 +6,6 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["NOTHING", "ROUNDING", "damped_step", "inverse_scaled", "solve_scaled", "unit_diagonal"]
-
 NOTHING = 1e-300  # keeps an empty diagonal from dividing by 0
 ROUNDING = 1e-14  # a ridge that holds off a singular system and does not show in a regular one
 _ABSENT = 1e-30  # an eigenvalue this far below the diagonal is not there

@@ -14,8 +14,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import NOTHING, inverse_scaled, solve_scaled
 
-__all__ = ["SchurCovariance", "eliminate", "schur_covariance", "schur_step"]
-
 Columns = NDArray[np.intp]
 
 

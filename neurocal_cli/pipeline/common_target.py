@@ -18,8 +18,6 @@ from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 from neurocal_cli.target_shape.surveyed import find_surveyed
 
-__all__ = ["can_tell", "common_target", "on_one_target"]
-
 
 def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     """Find the target from all views of several cameras.

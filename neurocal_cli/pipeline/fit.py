@@ -14,7 +14,8 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_an
 from neurocal_cli.bundle_adjustment.restart import restarted
 from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.camera.distortion import WIDE, WITH_PRISM
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_told
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.multi_start import with_more_starts
@@ -23,8 +24,6 @@ from neurocal_cli.initialisation.local_minima import OnlyMirroredError, try_mirr
 from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.points import Correspondences
-
-__all__ = ["fit", "fit_again"]
 
 # Joins the pinhole's networks where a radial model leads to nothing, as with a centre of distortion far off.
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).

@@ -26,8 +26,6 @@ from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
 
-__all__ = ["may_be_bent", "why_odd"]
-
 _HOLDS = 2.0  # times the rms error of the other views
 _STEPS = 40
 _STARTS = 20

@@ -41,8 +41,6 @@ from neurocal_cli.pipeline.fit import fit, fit_again
 from neurocal_cli.pipeline.odd_views import why_odd
 from neurocal_cli.points import Correspondences
 
-__all__ = ["NO_WORSE", "fit_robustly", "judged_again", "rms"]
-
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
 # with one wrong view; clean data are the same to the last bit with and without) and
 # tests/test_wrong_inputs.py.

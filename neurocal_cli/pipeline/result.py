@@ -29,8 +29,6 @@ from neurocal_cli.target_shape.camera_covariance import CameraCovariance, Camera
 if TYPE_CHECKING:
     from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 
-__all__ = ["calibration_of"]
-
 _XI = 5  # place of xi behind A's entries
 _TOLD = 0.1  # range of xi that is worth a warning
 _NAMED = 5  # wrong points that the warning names

@@ -28,8 +28,6 @@ from neurocal_cli.initialisation.options import Options
 from neurocal_cli.pipeline.outlier_rejection import judged_again
 from neurocal_cli.verdict.view_groups import view_groups
 
-__all__ = ["with_rich_lens"]
-
 # Repeated by tests/test_rich_lens.py (slow): on views left out such lenses are better by 1.28 and more, with
 # residuals correlated by -0.05 and less; bent boards and two cameras by 1.0 at most; photographs of a board
 # that is not flat by up to 1.19, with residuals correlated by 0.5.

@@ -26,8 +26,6 @@ from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 from neurocal_cli.points import Correspondences
 from neurocal_cli.target_shape.surveyed import find_surveyed
 
-__all__ = ["with_survey"]
-
 _MEDIAN = 1.3863  # of chi-squared of two degrees of freedom
 _HALVINGS = 30
 _LEAST_NOISE = 1e-3  # of the residuals' level

@@ -33,8 +33,6 @@ from neurocal_cli.verdict.given_parameters import asked_for
 from neurocal_cli.verdict.stated_noise import stated_noise
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
-__all__ = ["lines_that_are_bent", "with_target"]
-
 _ROUNDS = 3
 _WORTH = 0.8  # of the views' number, where some repeat a pose
 _OF_LINES = "k1k2p1p2"  # as `plumb-line` finds

@@ -20,8 +20,6 @@ from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
 from neurocal_cli.verdict.projection_uncertainty import image_grid
 
-__all__ = ["Advice", "Candidate", "advise", "candidates", "uncertainty_with"]
-
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 _POSITIONS = (0.15, 0.325, 0.5, 0.675, 0.85)  # of the image's width and height
 _WIDTHS = (0.3, 0.5, 0.75)  # of the image's width, that the target takes

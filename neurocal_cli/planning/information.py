@@ -19,8 +19,6 @@ from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.geometry import Array, cross_matrix
 
-__all__ = ["pixel_changes", "view_information", "worst_std"]
-
 _SINGULAR = 1e-13  # a smaller eigenvalue of a matrix with unit diagonal is rounding
 
 

@@ -13,8 +13,6 @@ from neurocal_cli.plots.figure import picture, style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_advice"]
-
 _MOST_DOTS = 4000
 
 _COLOURS = ("#c0392b", "#1f4e79", "#1d7a3c", "#8a6100", "#6b3fa0", "#0f766e")

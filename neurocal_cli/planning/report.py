@@ -7,8 +7,6 @@ from typing import Any
 from neurocal_cli.planning.advice import Advice, Candidate
 from neurocal_cli.report import number_or_none
 
-__all__ = ["advice_json", "advice_lines"]
-
 _ACROSS = ("far left", "left", "middle", "right", "far right")
 _DOWN = ("very top", "top", "middle", "bottom", "very bottom")
 _SIDES = ("right", "lower right", "lower", "lower left", "left", "upper left", "upper", "upper right")

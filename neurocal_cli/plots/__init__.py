@@ -1,7 +1,5 @@
 """Pictures of results, as panels on one page or each by itself."""
 
-__all__ = ["CAMERA_PANELS", "RIG_PANELS", "SPACE_PANELS"]
-
 # What `--plot NAME=FILE` draws by itself, so that options can be checked before anything is loaded.
 CAMERA_PANELS = ("residuals", "coverage", "uncertainty", "scatter", "poses", "learning", "views")
 RIG_PANELS = ("residuals", "coverage", "uncertainty", "scatter", "poses", "learning", "views")

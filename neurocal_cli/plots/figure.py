@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["ACCENT", "INK", "check_available", "picture", "plain", "say", "style"]
-
 INK, ACCENT = "#1f4e79", "#c0392b"
 
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, FigureBase
 
-__all__ = ["draw_camera", "draw_points_in_space", "draw_rig"]
-
 _PAD = 0.12  # inches
 _PAGE = (16.0, 12.5)
 _PANEL = (6.4, 5.0)

@@ -13,8 +13,6 @@ from neurocal_cli.plots.subject import Subject
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_learning", "draw_residuals", "draw_scatter", "draw_views", "set_image"]
-
 _MOST_ARROWS = 500  # more cannot be told apart
 _MANY_DOTS = 2000  # from here on they overlap, and an .svg of them grows large
 _MOST_BARS = 40  # views that still have room for their names

@@ -16,8 +16,6 @@ from neurocal_cli.plots.figure import ACCENT, INK, style
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_poses"]
-
 _FLAT = 0.02  # of a target's size: a board that is bent a little has an outline too
 _MOST_NAMES = 8
 _SIZE = 0.12  # of the picture's, for a camera

@@ -12,8 +12,6 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.assessment import gather_evidence
 from neurocal_cli.verdict.evidence import Evidence
 
-__all__ = ["Subject"]
-
 
 @frozen_dataclass
 class Subject:

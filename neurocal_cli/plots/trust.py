@@ -13,8 +13,6 @@ from neurocal_cli.plots.subject import Subject
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-__all__ = ["draw_coverage", "draw_uncertainty"]
-
 _CELLS = 6  # across and down, as the verdict has them
 _MOST_DOTS = 5000
 _LEVELS = 12

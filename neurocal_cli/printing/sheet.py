@@ -15,8 +15,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.printing.unfolding import Laid, unfolded
 
-__all__ = ["PAPERS", "Line", "Sheet", "Text", "default_board", "millimetres", "on_paper", "paper_size"]
-
 # Width and height [mm], upright.
 PAPERS = {
     "A0": (841.0, 1189.0),

@@ -13,8 +13,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Fold", "Laid", "unfolded"]
-
 _SAME = 1e-6  # of a square: lengths below are rounding
 _FARTHEST = 3.0  # squares from a board to a fold; beyond, the planes do not belong on one sheet
 _REACH = 1.0  # squares of the pattern beyond the outer vertices, one whole

@@ -28,8 +28,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
 
-__all__ = ["MethodErrors", "NoiseStudy", "cramer_rao", "parameter_names", "study_noise"]
-
 _BLOCK = 5  # trials of a task, of one sigma
 _HALF_TURN = np.pi
 _SINGULAR = 1e-13  # smallest eigenvalue of a normal matrix of unit diagonal that rounding leaves of 0

@@ -14,8 +14,6 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.simulation.rendering import Scene, Sides, Target, render
 from neurocal_cli.simulation.scenes import SimulatedScene
 
-__all__ = ["Picture", "pictures", "visible_points"]
-
 _MARGIN = 0.5  # squares of white paper around a board by itself
 
 

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_rates", "draw_simulation"]
-
 # Colours that people who do not see all colours tell apart (Okabe and Ito), and markers.
 _LOOK = {
     "neuro": ("#d55e00", "o", 8.0),

@@ -32,8 +32,6 @@ from neurocal_cli.training import Task
 from neurocal_cli.training.backprop import BackpropOptions, train_backprop
 from neurocal_cli.training.starts import learn
 
-__all__ = ["RATES_GAMMA", "RATES_WEIGHTS", "DataSet", "RateStudy", "data_set", "study_rates"]
-
 RATES_WEIGHTS = (0.003, 0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8)
 RATES_GAMMA = (0.05, 0.1, 0.2, 0.4, 0.8, 1.2, 1.6, 2.0)
 _SIGMA = 0.3  # px

@@ -12,8 +12,6 @@ from neurocal_cli.simulation.noise import MethodErrors, NoiseStudy
 from neurocal_cli.simulation.rates import RateStudy
 from neurocal_cli.simulation.starts import StartStudy
 
-__all__ = ["FIG_1", "noise_json", "rates_json", "rates_tables", "simulation_tables", "starts_json", "text_of"]
-
 Table = list[list[str]]
 
 FIG_1 = ("alpha_v", "alpha_u", "t_z", "t_x")

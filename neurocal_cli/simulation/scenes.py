@@ -16,17 +16,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = [
-    "PAPER_BOARD",
-    "PAPER_CAMERA",
-    "PAPER_POSE",
-    "SimulatedScene",
-    "calibrated_scene",
-    "paper_scene",
-    "random_poses",
-    "scene_of",
-]
-
 # Table 1. Its theta of 1.5708 is a right angle, rounded.
 PAPER_CAMERA = Camera(Intrinsics(556.0, 549.0, 172.0, 121.0), image_size=(352, 240))
 PAPER_POSE = Pose.from_euler(0.09, 0.80, -0.03, np.array([-27.0, -28.0, 701.0]))

@@ -40,8 +40,6 @@ from neurocal_cli.network import random_weights
 from neurocal_cli.processes import work_through
 from neurocal_cli.simulation.scenes import SimulatedScene
 
-__all__ = ["STARTS", "StartStudy", "can_start", "reached", "single_start", "study_starts"]
-
 STARTS = ("lm", "backprop", "weights", "camera")
 _SAME = 1.001  # times the best rms error
 _FLOOR = 1e-9  # normalised pixels: without noise the best error is rounding

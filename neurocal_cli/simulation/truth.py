@@ -7,8 +7,6 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
 from neurocal_cli.simulation.scenes import SimulatedScene
 
-__all__ = ["true_calibration"]
-
 
 def true_calibration(scene: SimulatedScene) -> Calibration:
     """A calibration without any error, whose parameters are all given."""

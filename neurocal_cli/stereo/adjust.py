@@ -14,8 +14,6 @@ from neurocal_cli.least_squares.levenberg_marquardt import minimise
 from neurocal_cli.least_squares.schur_complement import schur_step
 from neurocal_cli.stereo.reprojection import Columns, Frames, Observations, RigState, rig_normal_blocks
 
-__all__ = ["AdjustedRig", "adjust_rig"]
-
 _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped
 
 

@@ -30,8 +30,6 @@ from neurocal_cli.stereo.rules import reach_rig_verdict
 from neurocal_cli.stereo.sound_pairs import MOVED
 from neurocal_cli.verdict.assessment import assess
 
-__all__ = ["assess_rig", "gather_rig_evidence"]
-
 _FOLDS = 5
 _MOST_POINTS = 400  # that are triangulated to find the uncertainty of depth
 

@@ -17,8 +17,6 @@ from neurocal_cli.stereo.pairing import pair_points, pair_views
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.target import Target
 
-__all__ = ["calibrate_stereo"]
-
 Progress = Callable[[str, float], None]
 
 _SIDES = ("left", "right")

@@ -24,8 +24,6 @@ from neurocal_cli.stereo.adjust import AdjustedRig
 from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import Columns, rig_normal_blocks
 
-__all__ = ["open_covariance"]
-
 
 def open_covariance(
     problem: RigProblem,

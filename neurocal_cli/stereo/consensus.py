@@ -15,8 +15,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation
 from neurocal_cli.stereo.problem import RigProblem
 
-__all__ = ["RigConsensus", "find_consensus"]
-
 # Two pairs agree if their targets differ in the image by less than this share of the target's size or by less
 # than so many standard deviations of a pixel. The tests of named faults in tests/test_stereo_evaluation.py
 # repeat that faults are found and sound pairs kept.

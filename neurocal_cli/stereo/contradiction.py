@@ -24,8 +24,6 @@ from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.stereo.odd_pairs import odd_pairs
 from neurocal_cli.stereo.relative_poses import RelativePoses
 
-__all__ = ["Contradiction", "contradiction", "is_significant"]
-
 # Kass and Raftery (1995) call a difference of 10 in the criterion very strong evidence.
 _VERY_STRONG = 10.0
 _LEVEL = 3.09  # standard deviations of the normal law, which luck exceeds once in 1000

@@ -14,8 +14,6 @@ from neurocal_cli.stereo.relative_poses import RelativePoses
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.triangulation import triangulate
 
-__all__ = ["depth_std"]
-
 _STEP = 1e-2  # standard deviations: small enough to be linear, large against rounding
 _LEAST_STEP = 1e-9
 

@@ -26,8 +26,6 @@ from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError, space_error
 from neurocal_cli.stereo.triangulation import triangulate
 
-__all__ = ["StereoEvaluation", "evaluate_rig", "evaluate_stereo"]
-
 
 @frozen_dataclass(eq=False)
 class StereoEvaluation:

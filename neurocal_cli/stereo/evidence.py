@@ -7,8 +7,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.contradiction import Contradiction
 
-__all__ = ["RigEvidence"]
-
 
 @frozen_dataclass(eq=False)
 class RigEvidence:

@@ -26,8 +26,6 @@ from neurocal_cli.stereo.sound_pairs import sound_pairs
 from neurocal_cli.stereo.stretch_covariance import stretched_rig
 from neurocal_cli.stereo.target_covariance import with_target_uncertainty
 
-__all__ = ["fit_rig", "poses_on_rig"]
-
 # The common fit may leave so many times the rms residual of both cameras alone. Beyond, errors of the pairs
 # would spoil both cameras: test_pairs_that_scatter_do_not_spoil_the_cameras.
 _SPOILS = 1.6

@@ -10,8 +10,6 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.median import median
 from neurocal_cli.stereo.relative_poses import RelativePoses
 
-__all__ = ["odd_pairs"]
-
 # The squared distance of a sound pair from the rig is a chi-squared variable of 6 degrees of freedom, whose
 # median is 5.35. Real cameras deviate from their models, so the median distance of all pairs replaces it
 # where it is larger. The limit of 60 has the probability 5e-11;

@@ -16,8 +16,6 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diago
 from neurocal_cli.stereo.contradiction import Contradiction, is_significant
 from neurocal_cli.stereo.relative_poses import RelativePoses
 
-__all__ = ["not_smaller", "rig_covariance"]
-
 _LEAST_PAIRS = 3  # that a jackknife needs; with two, all is widened by the scatter
 
 

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["pair_picture"]
-
 _LINES = 16  # over the images
 _COLOURS = ((255, 80, 60), (60, 200, 255), (120, 255, 120), (255, 220, 60))
 

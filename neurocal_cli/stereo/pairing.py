@@ -22,8 +22,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import name_some
 
-__all__ = ["Pairs", "ViewPairs", "pair_points", "pair_views"]
-
 _SIDES = (
     re.compile(r"(?<![a-z])(?:left|l(?![a-z])|cam(?:era)?[ _-]?0(?![0-9]))(?![a-z])", re.IGNORECASE),
     re.compile(r"(?<![a-z])(?:right|r(?![a-z])|cam(?:era)?[ _-]?1(?![0-9]))(?![a-z])", re.IGNORECASE),

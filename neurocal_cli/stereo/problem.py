@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.point_batches import batches_of
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.camera.pinhole import Pose
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.evaluation import evaluate_camera
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -21,8 +22,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.median import median
 from neurocal_cli.stereo.pairing import ViewPairs
 from neurocal_cli.stereo.reprojection import Frames, Observations, RigState
-
-__all__ = ["RigProblem", "estimated_parameters", "free_parameters", "rig_problem"]
 
 # Smaller noise, as a share of the other camera's and in normalised pixels, is rounding in data without noise;
 # test_without_noise_the_truth_comes_back checks such data.

@@ -16,8 +16,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, nearest_rotation
 from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["Rectification", "rectify"]
-
 _GRID = 9  # samples along each side of the image, as in OpenCV
 _WIDEST = 5.0  # tangent of 79 degrees: the widest angle that scales an image
 

@@ -18,15 +18,6 @@ from neurocal_cli.stereo.pairing import pair_points, pair_views
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
 
-__all__ = [
-    "RectifiedPair",
-    "RowError",
-    "rectified_pair",
-    "rectify_points",
-    "row_error",
-    "row_error_of_rig",
-]
-
 _ACROSS = 0.7  # least cosine of a measured direction to the one across the rows, 45 degrees
 
 

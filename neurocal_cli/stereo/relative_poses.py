@@ -30,8 +30,6 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import eliminate
 from neurocal_cli.stereo.problem import RigProblem
 
-__all__ = ["RelativePoses", "in_order", "relative_poses"]
-
 _POSE = np.arange(POSE.start, POSE.stop)
 # Smaller noise, in normalised pixels, is rounding; a pixel has about 0.004 of them.
 _MUCH_LARGER = 2.0  # times the variance of all views; of 50 equations of noise, one in 10 million has it

@@ -14,17 +14,6 @@ from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.space_error import SpaceError
 from neurocal_cli.verdict.report import verdict_json, verdict_lines
 
-__all__ = [
-    "camera_rows",
-    "rig_json",
-    "rig_report",
-    "rig_rows",
-    "stereo_evaluation_json",
-    "stereo_evaluation_report",
-    "stereo_evaluation_tables",
-    "views_alone",
-]
-
 _MUCH_WORSE = 1.3  # rms of the common fit over that of both cameras alone, of which the summary tells
 _NAMED = 10  # views named in a remark
 _MOST_VIEWS = 20  # rows of a table that still fit on a screen

@@ -22,8 +22,6 @@ from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, camer
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation_step
 
-__all__ = ["Columns", "Frames", "Observations", "RigState", "rig_jacobian", "rig_normal_blocks"]
-
 
 @frozen_dataclass(eq=False)
 class Frames:

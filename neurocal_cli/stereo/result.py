@@ -17,10 +17,11 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import (
 )
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.problem import intrinsic_matrix
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, POSE, CameraState, residuals
+from neurocal_cli.bundle_adjustment.reprojection import POSE, CameraState, residuals
 from neurocal_cli.calibration import Calibration, NetworkRecord, StopReason, ViewResult
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.camera.pinhole import POSE_NAMES, Intrinsics, Pose
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, euler_jacobian
@@ -33,8 +34,6 @@ from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import Columns, Observations, rig_jacobian
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.target import scale_of
-
-__all__ = ["assemble_rig", "non_monotonic_sides"]
 
 _SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal is rounding
 

@@ -13,8 +13,6 @@ from neurocal_cli.camera.pinhole import Intrinsics, Pose
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix
 
-__all__ = ["Rig", "essential_matrix", "fundamental_matrix"]
-
 
 @frozen_dataclass(eq=False)
 class Rig:

@@ -21,8 +21,6 @@ from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, rig_pr
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
 from neurocal_cli.verdict.findings import name_some
 
-__all__ = ["MOVED", "SoundPairs", "pair_name", "sound_pairs", "span", "told_of_faults", "told_of_move"]
-
 MOVED = "taken"  # the reason of a pair that shows the rig before or after it moved begins so
 _OTHER_SIZE = 1.2  # times; targets of one series are alike, and units differ by far more
 _AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and pairs, that agree by more than chance once shifted

@@ -15,8 +15,6 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["DepthError", "SpaceError", "space_error"]
-
 _MOST_DEPTHS = 5  # rows of the table of depths
 _POINTS_PER_DEPTH = 20
 

@@ -19,8 +19,6 @@ from neurocal_cli.stereo.reprojection import Columns, rig_jacobian
 from neurocal_cli.target import is_flat
 from neurocal_cli.target_shape.open_stretch import spread_of_stretch, stretched_blocks, stretches
 
-__all__ = ["StretchedRig", "stretched_rig"]
-
 
 @frozen_dataclass(eq=False)
 class StretchedRig:

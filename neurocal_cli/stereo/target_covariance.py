@@ -20,8 +20,6 @@ from neurocal_cli.target_shape.posterior import known_sizes
 from neurocal_cli.target_shape.prior import prior_of_target
 from neurocal_cli.target_shape.surveyed import noise_variance
 
-__all__ = ["with_target_uncertainty"]
-
 
 def with_target_uncertainty(
     target: Target, problem: RigProblem, adjusted: AdjustedRig, free: NDArray[np.bool_]

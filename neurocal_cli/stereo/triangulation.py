@@ -23,8 +23,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.stereo.two_view_points import PointBatch
 from neurocal_cli.stereo.wide_points import WidePointBatch
 
-__all__ = ["METHODS", "Triangulated", "epipolar_limit", "triangulate"]
-
 METHODS = ("optimal", "linear", "midpoint")
 
 _BLOCK = 4096  # points at a time, whose arrays stay in the processor's cache

@@ -18,8 +18,6 @@ from neurocal_cli.camera.monotonic import nearly_undistorted
 from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 from neurocal_cli.geometry import Array
 
-__all__ = ["PointBatch"]
-
 _MAX_STEPS = 30
 _SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
 _RISE, _ROUNDING = (

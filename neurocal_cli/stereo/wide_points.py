@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.geometry import Array
 
-__all__ = ["WidePointBatch"]
-
 _MAX_STEPS = 30
 _HALVINGS = 10
 _SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration

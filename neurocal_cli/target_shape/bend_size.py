@@ -12,8 +12,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.posterior import evidence_of_given
 
-__all__ = ["bends_of", "most_probable_precision"]
-
 _LEAST, _MOST = 1e-6, 1.0  # of the target's size, as if all errors were noise
 _GRID, _FINER = 12, (0.6, 0.3, 0.1)  # places, and the widths of the parabolas that follow; of logarithms
 

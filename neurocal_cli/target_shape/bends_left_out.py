@@ -15,8 +15,6 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.target_shape.information import Information, Sight, information_of, joined
 from neurocal_cli.target_shape.posterior import camera_step_of
 
-__all__ = ["bends_hold"]
-
 _FOLDS = 5
 _FAR = 6.0  # times the rms of the other views
 _COMMON = 30.0  # times the mean square of what differs: one set in 200 of views that are bent at random

@@ -13,8 +13,6 @@ from neurocal_cli.target_shape.bend_size import most_probable_precision
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, Search, searched
 from neurocal_cli.target_shape.posterior import evidence_of_given
 
-__all__ = ["find_bends"]
-
 _FEWEST = 4  # views
 _EARLY = 0.5  # of the least gain, that the first step must promise
 

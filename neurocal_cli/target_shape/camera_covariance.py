@@ -31,8 +31,6 @@ from neurocal_cli.target_shape.uncertainty import CovarianceBasis, covariance_ba
 if TYPE_CHECKING:
     from neurocal_cli.bundle_adjustment.open_coefficients import OpenCoefficients
 
-__all__ = ["CameraCovariance", "CameraSeen", "WideCovariance", "camera_covariance"]
-
 
 @frozen_dataclass(eq=False)
 class CameraSeen:

@@ -28,17 +28,6 @@ from neurocal_cli.target_shape.left_out import holds_for_views_left_out
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, given_posterior, posterior
 from neurocal_cli.target_shape.prior import prior_of
 
-__all__ = [
-    "LEAST_GAIN",
-    "Found",
-    "Search",
-    "at_world",
-    "enough_views",
-    "find_target",
-    "searched",
-    "sight_of",
-]
-
 _STEPS = 10
 # Unknowns of the dense system. From more on some views are taken; of far more no target is looked for.
 _DENSE, _MOST_DENSE = 600, 3000
@@ -129,15 +118,11 @@ def searched(search: Search, least_gain: float) -> Found | None:
 
 def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Problem, Adjusted]:
     """A part of the views, evenly among all: what so many views do not tell of a target is small."""
-    views = problem.views
-    if views.n_views <= most:
+    points = problem.points.of_few_views(most)
+    if points is problem.points:
         return problem, adjusted
-    which = np.linspace(0, views.n_views - 1, most).astype(np.intp)
-    names = {views.names[k] for k in which}
-    rows = np.array([name in names for name in problem.points.view_names])[problem.points.view_index]
     known = in_pixels(problem, adjusted.state)
-    points = problem.points.select(rows)
-    place = [views.names.index(name) for name in points.view_names]
+    place = [problem.views.names.index(name) for name in points.view_names]
     state = replace(known, R=known.R[place], t=known.t[place])
     return at_world(replace(problem, points=points), adjusted, state, points.world)
 

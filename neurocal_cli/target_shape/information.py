@@ -21,18 +21,6 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "Information",
-    "Sight",
-    "by_world",
-    "information_of",
-    "joined",
-    "labelled",
-    "point_terms",
-    "pose_columns",
-    "with_bends",
-]
-
 
 @frozen_dataclass(eq=False)
 class Sight:

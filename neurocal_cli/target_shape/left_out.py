@@ -20,8 +20,6 @@ from neurocal_cli.target_shape.information import Information, Sight, informatio
 from neurocal_cli.target_shape.posterior import cost_at, known_sizes
 from neurocal_cli.target_shape.prior import Prior
 
-__all__ = ["holds_for_views_left_out"]
-
 _FEWEST = 4  # views, so that the others determine a camera
 _FOLDS = 5
 

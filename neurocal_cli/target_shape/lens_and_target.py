@@ -17,8 +17,6 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.find import Found, find_target
 
-__all__ = ["find_lens_and_target"]
-
 # Each has the coefficients of the one before and more.
 _CHAIN = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")
 _RICHER = 4.0  # of the logarithm of the evidence: one in fifty

@@ -24,14 +24,6 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.target import is_flat
 from neurocal_cli.target_shape.prior import STRETCH
 
-__all__ = [
-    "StretchedCovariance",
-    "open_stretch",
-    "spread_of_stretch",
-    "stretched_blocks",
-    "stretches",
-]
-
 # That there is one, each. Larger odds make clean data less certain; with these, the std of few views grow by
 # less than 1 % in the median. Repeated by tests/test_open_stretch.py and tests/test_campaign.py (slow).
 _ODDS = 0.2

@@ -30,18 +30,6 @@ from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import STRETCH, Prior
 from neurocal_cli.target_shape.system import Solved, System
 
-__all__ = [
-    "Posterior",
-    "camera_step_of",
-    "cost_at",
-    "evidence_of_given",
-    "given_posterior",
-    "known_sizes",
-    "posterior",
-    "prior_covariance",
-    "quadratic_at",
-]
-
 
 @frozen_dataclass(eq=False)
 class Posterior:

@@ -24,8 +24,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target, is_flat
 
-__all__ = ["STRETCH", "Prior", "prior_of", "prior_of_target", "surveyed_prior"]
-
 _LENGTH = 0.35  # of a plane's size, as printed boards bend; tests/test_target_shape.py tries others
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are nothing
 _HELD = 1e-7  # of the target's size: a surveyed point that is exactly where it is stated

@@ -30,8 +30,6 @@ from neurocal_cli.target_shape.information import Information, information_of
 from neurocal_cli.target_shape.posterior import evidence_of_given, known_sizes, quadratic_at
 from neurocal_cli.target_shape.prior import Prior, surveyed_prior
 
-__all__ = ["find_surveyed", "noise_variance"]
-
 _STEPS = 10
 _SETTLED = 0.02  # of the standard deviations of cameras and points
 _MOST_DENSE = 3000  # unknowns

@@ -17,8 +17,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
 
-__all__ = ["Rest", "Solved", "System"]
-
 _SMALL = 48  # rows of a triangular matrix from which on its halves are inverted by themselves
 _RIDGE = 1e-10  # added to a unit diagonal where rounding has made a matrix indefinite
 

@@ -31,9 +31,6 @@ if TYPE_CHECKING:
     from neurocal_cli.target_shape.posterior import Posterior
     from neurocal_cli.target_shape.prior import Prior
 
-__all__ = ["CovarianceBasis", "covariance_basis"]
-
-
 _MOST_POSES = (
     24  # that are left out one by one, each with a target of its own; among more, one matters little
 )

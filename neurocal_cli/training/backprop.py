@@ -29,8 +29,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns, e_2d, e_orth, optimal_gamma, output
 from neurocal_cli.training.task import Task, Trained
 
-__all__ = ["BackpropOptions", "BackpropTrained", "train_backprop"]
-
 # test_noisy_scenes_reach_the_optimum and test_the_curve_stays_short_over_many_epochs in
 # tests/test_backprop.py check these numbers. The interval between checkpoints is 10 epochs at first, later
 # 1/40 of the epochs so far: 230 in 50,000.
@@ -152,8 +150,9 @@ def _presenter(method: str) -> tuple[_Present, _Bound | None]:
     """Functions that present the patterns and bound the rates; only this imports numba."""
     if method != "blocks":
         from neurocal_cli.training import backprop_kernel as kernel
+        from neurocal_cli.training.compile import COMPILING
 
-        if kernel.COMPILING or method == "patterns":
+        if COMPILING or method == "patterns":
             return kernel.present, None
     from neurocal_cli.training import backprop_blocks as blocks
 

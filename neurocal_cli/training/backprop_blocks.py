@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import e_orth_gradient
 
-__all__ = ["BLOCK", "present", "stable_rate"]
-
 BLOCK = 8
 
 # Steps of 2 over the curvature neither converge nor diverge; this is less, and the curvature an upper bound.

@@ -10,9 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
-from neurocal_cli.training.compile import COMPILING, jit
-
-__all__ = ["COMPILING", "present"]
+from neurocal_cli.training.compile import jit
 
 Mask = NDArray[np.bool_]
 

@@ -7,8 +7,6 @@ from importlib import import_module
 from types import ModuleType
 from typing import Any, TypeVar, cast
 
-__all__ = ["COMPILING", "jit"]
-
 
 def _importable() -> ModuleType | None:
     """Import numba if it is installed and not switched off by its own NUMBA_DISABLE_JIT."""

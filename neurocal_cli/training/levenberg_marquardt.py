@@ -30,8 +30,6 @@ from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, Leven
 from neurocal_cli.network import Patterns, optimal_gamma
 from neurocal_cli.training.task import Task, Trained
 
-__all__ = ["LMOptions", "train_lm"]
-
 
 @frozen_dataclass
 class LMOptions:

@@ -14,8 +14,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns, output, random_weights
 from neurocal_cli.training import Task, Trained, Trainer
 
-__all__ = ["Agreement", "FixedWeights", "Learnt", "learn"]
-
 
 @frozen_dataclass
 class Agreement:

@@ -11,8 +11,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns
 
-__all__ = ["Task", "Trained", "Trainer"]
-
 
 @frozen_dataclass(eq=False)
 class Task:

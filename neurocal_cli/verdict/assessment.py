@@ -41,7 +41,7 @@ from neurocal_cli.bundle_adjustment.reweighting import weighed
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.bundle_adjustment.view_covariance import scores_of_poses
 from neurocal_cli.bundle_adjustment.views import Views, arrange
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.directions import xi_is_flat
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES
@@ -62,12 +62,10 @@ from neurocal_cli.verdict.projection_uncertainty import (
     projection_uncertainty,
 )
 from neurocal_cli.verdict.repeated_views import repeated_views
-from neurocal_cli.verdict.rules import Verdict, reach_verdict
+from neurocal_cli.verdict.rules import reach_verdict
 from neurocal_cli.verdict.stated_noise import stated_noise, stated_survey
 from neurocal_cli.verdict.view_change import ViewChange, view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
-
-__all__ = ["assess", "gather_evidence", "uncertainty_over_image"]
 
 _STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
 _IN_PLANE = 1e-9  # depth over the largest one that rounding leaves of 0

@@ -28,8 +28,6 @@ from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 from neurocal_cli.least_squares.schur_complement import eliminate
 
-__all__ = ["BoardShape", "board_shape"]
-
 # Of x and y: what bends a board smoothly. Lower ones are its plane.
 _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 _BENT = np.arange(len(_POWERS))

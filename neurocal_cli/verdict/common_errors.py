@@ -14,8 +14,6 @@ from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
 
-__all__ = ["common_errors"]
-
 # Repeated by tests/test_view_change.py and tests/test_board_shape.py, with changes from 0.2 % and boards
 # bent by 0.2 mm and more. A result is off by half of a change; careful calibrations state 0.05 %.
 _CHANGED, _MUCH_CHANGED = 0.001, 0.05  # of the focal length

@@ -10,8 +10,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["Coverage", "cover"]
-
 _CELLS = 6  # across and down
 _THIRDS = (
     ("upper left", "upper", "upper right"),

@@ -11,8 +11,6 @@ from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
 
-__all__ = ["Evidence"]
-
 
 @frozen_dataclass(eq=False)
 class Evidence:

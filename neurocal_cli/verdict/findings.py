@@ -9,8 +9,6 @@ import numpy as np
 from neurocal_cli.calibration import Verdict
 from neurocal_cli.points import Correspondences
 
-__all__ = ["WORDS", "Finding", "image_diagonal", "name_some", "pixel_spread", "verdict_of"]
-
 WORDS = ("good", "usable", "poor")
 """By grade."""
 

@@ -14,8 +14,6 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 
-__all__ = ["AskedFor", "asked_for"]
-
 _NAMES = ("alpha_u", "alpha_v", "u0", "v0")
 _PLACES = (0, 2, 3, 4)  # among A's entries
 _THETA = 1  # stays as it is given

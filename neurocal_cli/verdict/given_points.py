@@ -13,8 +13,6 @@ from neurocal_cli.verdict.findings import WORDS, Finding, image_diagonal, pixel_
 from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.verdict.rules import ERROR, given_parameters
 
-__all__ = ["GivenPoints", "judged_by_points"]
-
 # Times the error of the calibration. Good cameras stay below on 200 sets of new views of their own:
 # tests/test_given_points.py.
 _LARGER = Limit(1.5, 4.0)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 
-__all__ = ["Limit"]
-
 
 @frozen_dataclass
 class Limit:

@@ -10,8 +10,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import Finding, name_some, pixel_spread
 
-__all__ = ["noise_shape"]
-
 # Real sets stay below 1.3 and 3: opencv_stereo, sony_chess, fisheye_stereo, Zhang's.
 _ONE_WAY = 2.5  # rms along u over that along v
 _VIEW = 4.0  # rms of a view over that of the lower quartile of views

@@ -11,8 +11,6 @@ from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import Finding, name_some
 
-__all__ = ["odd_pixels", "points_given_twice"]
-
 _FEWEST = 20  # points of which all are whole numbers: not by chance
 _ALIKE = 6  # points at the very same outermost coordinate, and this share of all
 _ALIKE_SHARE = 0.01

@@ -23,8 +23,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 
-__all__ = ["ProjectionUncertainty", "image_grid", "projection_uncertainty"]
-
 _ACROSS = 21  # points across the image
 # A wide lens may show this times the angle of the farthest point, and this angle in any case [rad].
 _BEYOND, _LEAST = 1.1, 1.2

@@ -11,8 +11,6 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import Finding, name_some
 from neurocal_cli.verdict.limits import Limit
 
-__all__ = ["rejected_points", "with_rejected"]
-
 _SHARE = Limit(0.02, 0.2)  # of the points
 _OF_A_VIEW = 0.2  # share of its points; clean views lose none
 _FEWEST = 4  # points of a view, or views of a point

@@ -7,8 +7,6 @@ import numpy as np
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["repeated_views"]
-
 _SAME = 1e-3  # px
 
 

@@ -7,8 +7,6 @@ from typing import Any
 
 from neurocal_cli.calibration import Verdict
 
-__all__ = ["verdict_json", "verdict_lines"]
-
 
 def verdict_lines(verdict: Verdict) -> list[str]:
     """The word, what it rests on, what speaks against it and what to do next."""

@@ -18,8 +18,6 @@ from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
 from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
 from neurocal_cli.verdict.units_of_views import views_of_another_scale
 
-__all__ = ["ERROR", "Verdict", "given_parameters", "reach_verdict"]
-
 # Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and tests/test_verdict.py, in
 # which real and simulated good data are; the errors, angles and shares are what a user would call large.
 ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480

@@ -12,8 +12,6 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
 from neurocal_cli.verdict.findings import Finding, name_some
 
-__all__ = ["stated_noise", "stated_survey"]
-
 _SHARE = 0.5  # of the noise that is the same for all points, whatever they state
 _FACTOR = 2.0  # between views whose sigma is too small and others; a std of 12 points is known to a fifth
 _FEWEST = 12

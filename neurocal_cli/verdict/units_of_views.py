@@ -15,8 +15,6 @@ from neurocal_cli.median import median
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import Finding, name_some
 
-__all__ = ["views_of_another_scale"]
-
 _SCALED = 1.1  # times the distance of neighbouring points; boards of one set are equal to rounding
 _SHARED = 0.5  # of a view's points, seen in other views too: the same target, only partly seen
 _MOST_POINTS = 400  # of a view that are looked at

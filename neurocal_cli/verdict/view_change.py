@@ -27,8 +27,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
 
-__all__ = ["ViewChange", "in_sequence", "view_change"]
-
 # Repeated by tests/test_view_change.py: on clean scenes less than one in a hundred is told, and on real
 # boards, whose views differ by more than noise, none is.
 _LINE = 3.5  # sigmas: one in 2000 for each

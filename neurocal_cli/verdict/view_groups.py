@@ -20,8 +20,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics
 
-__all__ = ["ViewGroups", "view_groups"]
-
 # By condition, in variances of the noise. Of 200 clean sets of 5 to 40 views none costs more than the first:
 # tests/test_view_groups.py repeats it.
 _CONTRADICTS = 5.0

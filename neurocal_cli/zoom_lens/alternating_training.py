@@ -23,8 +23,6 @@ from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.joint_training import JointLearner
 from neurocal_cli.zoom_lens.parameter_networks import LensNets, outputs_to_local
 
-__all__ = ["take_turns"]
-
 # test_alternating_ends_where_joint_training_ends in tests/test_zoom_lens_networks.py checks both.
 _RATE = 0.35  # eta: below 2 / (number of parameters that compensate for each other)
 _EPOCHS = 150  # most turns on one set of normal matrices

@@ -30,8 +30,6 @@ from neurocal_cli.zoom_lens.quadratic_error import QuadraticError, inverse
 from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["Baseline", "baselines_of"]
-
 _HIGHEST_DEGREE = 6
 
 # From scaled controls (n, D) to local parameters (n, L) and constants.

@@ -13,8 +13,6 @@ from neurocal_cli.zoom_lens.setting_normals import Constants
 from neurocal_cli.zoom_lens.settings import describe
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["camera_at"]
-
 _VIEW = "view"  # the default name of a view, so that points without a name are evaluated with this pose
 
 

@@ -26,8 +26,6 @@ from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, Paramete
 from neurocal_cli.zoom_lens.quadratic_error import inverse
 from neurocal_cli.zoom_lens.setting_normals import Normal
 
-__all__ = ["TOPOLOGIES", "Budget", "fit_committee", "suitable_topologies"]
-
 # Two slow tests of tests/test_zoom_lens.py, with 45 settings and of a real lens, measure the errors that
 # these choices, `Budget` and `Schedule` reach between settings.
 # (own, hidden): tanh units of the first layer for each control, units of the second.

@@ -15,8 +15,6 @@ from neurocal_cli.zoom_lens.initialisation import CalibratedSettings
 from neurocal_cli.zoom_lens.joint_training import Joint
 from neurocal_cli.zoom_lens.quadratic_error import inverse, with_scatter
 
-__all__ = ["LeftOutErrors", "left_out_errors"]
-
 
 @frozen_dataclass(eq=False)
 class LeftOutErrors:

@@ -12,8 +12,6 @@ from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions
 from neurocal_cli.zoom_lens.network_training import Schedule
 from neurocal_cli.zoom_lens.settings import LensPoints
 
-__all__ = ["choose_model"]
-
 LADDER = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")
 _QUICK_BUDGET = Budget(starts=3, best=6, members=2, schedule=Schedule(120, 30, 80))
 # A richer model must lower the cross-validation error to this share and the residual variance by so many

@@ -21,8 +21,6 @@ from neurocal_cli.zoom_lens.settings import LensPoints, describe
 from neurocal_cli.zoom_lens.target import on_target
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["LensEvaluation", "SettingError", "evaluate_lens"]
-
 
 @frozen_dataclass
 class SettingError:

@@ -17,8 +17,6 @@ from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, Tables
 from neurocal_cli.zoom_lens.settings import CONTROLS, scaled_controls
 from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 
-__all__ = ["LensCameras", "fit_lens_cameras"]
-
 _INTRINSIC = ("alpha_u", "alpha_v", "u0", "v0")
 _MEMBERS = 4  # test_a_real_lens_of_42_zooms_left_out_one_by_one measures the errors that they reach
 _LEAST_STD = 1e-6  # standard deviation of a parameter without scatter, as a share of the parameter

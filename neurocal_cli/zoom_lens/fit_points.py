@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.camera.distortion import MODELS, WIDE, WITH_PRISM
+from neurocal_cli.camera.directions import WIDE
+from neurocal_cli.camera.distortion import MODELS, WITH_PRISM
 from neurocal_cli.errors import check_choice
 from neurocal_cli.target import TARGETS, Target
 from neurocal_cli.zoom_lens.committee import Budget
@@ -31,8 +32,6 @@ from neurocal_cli.zoom_lens.target import lens_target, on_target
 from neurocal_cli.zoom_lens.target_coupling import target_coupling
 from neurocal_cli.zoom_lens.training import train_all
 from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting, ZoomLens
-
-__all__ = ["CAMERAS", "DISTORTIONS", "OUTLIERS", "TRAININGS", "fit_lens"]
 
 TRAININGS = ("joint", "alternating")
 OUTLIERS = ("reject", "keep")

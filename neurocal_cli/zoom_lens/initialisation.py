@@ -23,16 +23,6 @@ from neurocal_cli.zoom_lens.static_calibration import (
 )
 from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting
 
-__all__ = [
-    "CalibratedSettings",
-    "FitOptions",
-    "Progress",
-    "calibrate_settings",
-    "check_settings",
-    "may_reject",
-    "without",
-]
-
 Progress = Callable[[str, float], None]
 
 

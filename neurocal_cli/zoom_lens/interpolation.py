@@ -10,8 +10,6 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["grid_axes", "lookup_matrix", "monomials", "powers_up_to", "spline_matrix", "thin_plate_matrix"]
-
 
 def grid_axes(x: Array) -> list[Array] | None:
     """The values of each control if the sorted settings (S, D) are a full grid, else None."""

@@ -22,8 +22,6 @@ from neurocal_cli.zoom_lens.parameter_networks import LensNets
 from neurocal_cli.zoom_lens.quadratic_error import QuadraticError, gauss_newton, inverse, with_scatter
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData
 
-__all__ = ["Joint", "JointLearner", "posterior", "train_joint"]
-
 # 2 E is chi-squared: a change of 1 is one standard deviation of a single parameter. The training stops far
 # below that; test_alternating_ends_where_joint_training_ends checks that its end does not depend on the way.
 _ROUNDS = 16  # most sets of normal matrices

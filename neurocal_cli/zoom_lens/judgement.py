@@ -18,8 +18,6 @@ from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.zoom_lens.settings import describe
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["judge_lens"]
-
 # Repeated by test_the_verdict_on_a_lens. The networks of smooth lenses stay within 1.04 of the noise floor
 # even between settings (slow tests in tests/test_zoom_lens.py).
 _CONTRADICTION = Limit(1.3, 2.3)  # rms error over the noise floor

@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Topology", "respond", "respond_with_jacobian"]
-
 # Keeps the pole 1 % of half the range outside it or farther. The poles of
 # test_plane_and_rational_unit_are_any_homographic_function come as near as 2 %.
 _LARGEST_TILT = 0.99

@@ -18,8 +18,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 from neurocal_cli.zoom_lens.mlfn import Topology, respond_with_jacobian
 
-__all__ = ["Schedule", "TrainedNets", "prior_precision", "sparse_controls", "train", "updated_precision"]
-
 # Precisions of priors in units of the targets' spread; see `updated_precision`. The training tests in
 # tests/test_zoom_lens_networks.py and the tests of lenses with three values of a control repeat their effect.
 _FLAT = 1e-4  # of free weights: a standard deviation of 100

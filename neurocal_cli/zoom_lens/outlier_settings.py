@@ -8,8 +8,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.setting_normals import Tables
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["bad_pixels", "contradiction", "most_suspect"]
-
 # The limits are wide, as a lens may change sharply between two settings. The tests of settings that are left
 # out in tests/test_zoom_lens.py check both sides: wrong pixels and wrong names are found, and no setting of a
 # lens that changes sharply is rejected.

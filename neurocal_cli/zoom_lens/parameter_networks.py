@@ -17,17 +17,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.mlfn import Topology, respond, respond_with_jacobian
 from neurocal_cli.zoom_lens.network_training import prior_precision
 
-__all__ = [
-    "SCALES",
-    "LensNets",
-    "ParameterNet",
-    "from_scale",
-    "local_to_outputs",
-    "outputs_to_local",
-    "split",
-    "to_scale",
-]
-
 SCALES = ("log", "linear", "inverse")
 
 

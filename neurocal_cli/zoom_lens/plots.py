@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["draw_evaluation", "draw_lens"]
-
 _FINE = 121  # points of a curve
 _MOST_CURVES = 6  # values of the second control; more are not legible
 _COLUMNS = 3

@@ -21,8 +21,6 @@ from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, minim
 from neurocal_cli.least_squares.normal_equations import ROUNDING, damped_step, solve_scaled
 from neurocal_cli.zoom_lens.setting_normals import Normal
 
-__all__ = ["LocalModel", "QuadraticError", "gauss_newton", "inverse", "with_scatter"]
-
 Model = TypeVar("Model", bound="LocalModel")
 
 

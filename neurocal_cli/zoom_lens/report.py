@@ -17,8 +17,6 @@ from neurocal_cli.zoom_lens.judgement import judge_lens
 from neurocal_cli.zoom_lens.settings import CONTROLS
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 
-__all__ = ["camera_report", "evaluation_json", "evaluation_report", "lens_report"]
-
 _MOST_SETTINGS = 8
 _SCALES = {"log": "logarithmic", "linear": "linear", "inverse": "reciprocal"}
 _TRAININGS = {

@@ -16,8 +16,6 @@ from neurocal_cli.zoom_lens.settings import describe
 from neurocal_cli.zoom_lens.static_calibration import first_constants, fit_local
 from neurocal_cli.zoom_lens.zoom_lens import Member, ZoomLens
 
-__all__ = ["assemble", "provisional"]
-
 # Ratio of the error of the networks to that of the tables that gives a warning. The networks of smooth lenses
 # stay within 1.04 of the noise floor even between settings (slow tests in tests/test_zoom_lens.py).
 _POOR_FIT = 1.5

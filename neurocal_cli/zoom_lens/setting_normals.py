@@ -25,8 +25,6 @@ from neurocal_cli.geometry import Array, cross_matrix, orthonormalised, rotation
 from neurocal_cli.least_squares.schur_complement import eliminate
 from neurocal_cli.zoom_lens.settings import LensPoints
 
-__all__ = ["Constants", "Normal", "PixelData", "Tables"]
-
 _POSE_STEPS = 12  # most steps of the poses, which start at those of the last normal matrices
 
 

@@ -12,8 +12,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
-__all__ = ["CONTROLS", "LensPoints", "describe", "scaled_controls"]
-
 CONTROLS = ("zoom", "focus")
 
 

@@ -23,8 +23,6 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData, Tables
 from neurocal_cli.zoom_lens.settings import LensPoints, describe
 
-__all__ = ["StaticFit", "calibrate_each", "common_tables", "fit_local", "local_covariance"]
-
 # The static calibrations are near the minimum, but not at it.
 _OPTIONS = DescentOptions(damping=1e-3, largest_damping=1e12)
 

@@ -17,8 +17,6 @@ from neurocal_cli.pipeline.common_target import common_target
 from neurocal_cli.target import Target
 from neurocal_cli.zoom_lens.settings import LensPoints
 
-__all__ = ["lens_target", "on_target"]
-
 _SETTINGS = 12  # more tell little more of a target, and each has unknowns of its own
 _FEWEST = 2
 

@@ -21,8 +21,6 @@ from neurocal_cli.target_shape.posterior import prior_covariance
 from neurocal_cli.target_shape.prior import prior_of_target
 from neurocal_cli.zoom_lens.setting_normals import PixelData, Tables
 
-__all__ = ["target_coupling", "with_target_uncertain"]
-
 _MOST = 60  # directions of the offsets that are kept
 _NOTHING = 1e-6  # of the strongest direction
 _LEAST = 0.02  # of a direction's information, that cannot be lost

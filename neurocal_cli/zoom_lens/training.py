@@ -10,8 +10,6 @@ from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions, Progress
 from neurocal_cli.zoom_lens.joint_training import Joint, train_joint
 
-__all__ = ["train_all"]
-
 
 def train_all(
     start: CalibratedSettings, options: FitOptions, budget: Budget, report: Progress

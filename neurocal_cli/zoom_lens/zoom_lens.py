@@ -17,8 +17,6 @@ from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.settings import describe, scaled_controls
 from neurocal_cli.zoom_lens.target_coupling import with_target_uncertain
 
-__all__ = ["Member", "Prediction", "RejectedSetting", "ZoomLens"]
-
 
 @frozen_dataclass(eq=False)
 class Member:

@@ -9,10 +9,11 @@ import numpy as np
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState
+from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import Distortion
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.distortion.candidate_models import fit_candidates
 from neurocal_cli.points import Correspondences
 from support.campaign import Truth

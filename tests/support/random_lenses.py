@@ -9,8 +9,6 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["KINDS", "RandomLens", "random_lens"]
-
 _CENTRE = np.array([505.0, 392.0])
 _FARTHEST = 1.4  # rad
 _INDICES = 1.0, 1.5, 1.333  # of air, glass and water

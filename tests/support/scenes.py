@@ -11,9 +11,10 @@ from neurocal_cli import calibrate
 from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.problem import Problem, problem_for
-from neurocal_cli.bundle_adjustment.reprojection import ENTRIES, CameraState, normal_blocks
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.views import Views, arrange
 from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from support.plain_projection import project

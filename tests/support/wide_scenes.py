@@ -16,8 +16,6 @@ from neurocal_cli.camera.unprojection import largest_angle
 from neurocal_cli.geometry import Array, rotation_step
 from neurocal_cli.points import Correspondences
 
-__all__ = ["WideScene", "wide_set"]
-
 SIZE = (1000, 800)
 SQUARE = 30.0  # mm
 _SHARES, _POWERS = np.array([0.15, 0.1, 0.0015, 0.0015]), np.array([2, 4, 1, 1])  # as `xi_profile` has them

@@ -13,8 +13,6 @@ from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.medians import median
 from neurocal_cli.geometry import Array
 
-__all__ = ["edges_visible", "has_block", "is_smooth"]
-
 # Insensitive, apart from _EDGES, which is a share: doubled it rejects all boards.
 _ASIDE = 0.16  # squares; to either side of an edge, half-way between two vertices
 _LEAST_EDGE = 0.3  # of the contrast, across an edge

@@ -13,8 +13,6 @@ from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.medians import median, quantile
 from neurocal_cli.geometry import Array
 
-__all__ = ["largest_second_difference", "split_at_folds"]
-
 # Least second difference of a fold [squares], and its least ratio to those of distant rows; paper is not
 # flat either. Insensitive, as all constants here; FOLDED and
 # WHOLE in tests/test_finding.py repeat this.

@@ -20,8 +20,6 @@ from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
 
-__all__ = ["lattice_from_links", "linked_group"]
-
 # (c, r) from a vertex to its neighbour at the port along c, and at the next ones.
 _STEPS = ((1, 0), (0, 1), (-1, 0), (0, -1))
 # Insensitive: a lattice rejected here grows instead, which only costs time

@@ -33,8 +33,6 @@ from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
-__all__ = ["find_grids"]
-
 # Grids are searched on levels of up to this number of pixels. Larger levels only refine them, unless
 # nothing has been found yet. Chosen for time: tests/benchmarks/test_detection_speed.py.
 _SEARCHED = 1.4e6

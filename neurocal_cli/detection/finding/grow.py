@@ -18,8 +18,6 @@ from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.finding.vertex_check import check_vertices
 from neurocal_cli.geometry import Array
 
-__all__ = ["check_lattice", "frontier", "grow", "remove_outliers"]
-
 # Insensitive, with exceptions: half of _STEPS loses 3 of 1204 vertices, half of _MOST_SPREAD loses 47, and
 # twice _WEAKEST, more than the contrast of the neighbours, stops growth. tests/test_finding.py repeats this.
 _SEARCHED = 0.24  # squares; half width of the search around a prediction ...

@@ -14,14 +14,6 @@ from neurocal_cli.detection.medians import median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "LEAST_SIGMA",
-    "Index",
-    "Lattice",
-    "in_whole_square",
-    "signs",
-]
-
 Index = NDArray[np.intp]
 
 LEAST_SIGMA = 0.75  # px, of the smoothing of derivatives; for the narrowest squares

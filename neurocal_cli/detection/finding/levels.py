@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Level", "interpolate", "levels_of", "pyramid"]
-
 Image = NDArray[np.float32]
 
 # _SMOOTHING, _SMALLEST and _LEAST_NOISE are insensitive; the others bound memory.

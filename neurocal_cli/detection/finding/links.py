@@ -17,8 +17,6 @@ from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Links", "find_links"]
-
 Index = NDArray[np.intp]
 
 # Insensitive; tests/test_finding.py.

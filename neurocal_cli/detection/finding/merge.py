@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.geometry import Array
 
-__all__ = ["merge_lattices"]
-
 # tests/test_finding.py divides a board into two halves with these limits, and expects one grid.
 _NEAR = 4.0  # squares; of one lattice from the other, to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; farthest from whole numbers, median and worst

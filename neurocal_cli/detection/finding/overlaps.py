@@ -12,8 +12,6 @@ from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.finding.predict import predict_vertices
 from neurocal_cli.geometry import Array
 
-__all__ = ["any_overlap", "drop_duplicates", "trim_overlaps"]
-
 # Insensitive; FOLDED and "two boards" in tests/test_finding.py repeat this.
 _SAME = 0.25  # of a square's width; between vertices that are the same
 _MEETS = 0.13  # of a square's width; between a vertex and where another lattice goes on ...

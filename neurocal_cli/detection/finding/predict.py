@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["PredictedVertices", "predict_vertices"]
-
 # _REACH and _RIDGE are insensitive; tests/test_finding.py.
 _REACH = 3  # squares
 _WIDTH = 1.4  # squares; standard deviation of the Gaussian weights

@@ -17,8 +17,6 @@ from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Saddles", "find_saddles"]
-
 # Insensitive, apart from _RADII: doubled, the rings reach beyond squares of 6 px, whose board is not found.
 _THRESHOLD = 5.0  # standard deviations of the noise, of the steepness of a saddle
 _BORDER = 4  # px, not searched

@@ -12,8 +12,6 @@ from neurocal_cli.detection.finding.links import Index, Links
 from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.geometry import Array
 
-__all__ = ["find_seeds_2x3", "find_seeds_3x3", "whole_blocks"]
-
 # Insensitive; tests/test_finding.py.
 _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences ...
 _SECOND = 0.4  # ... and the weight of these differences themselves

@@ -29,8 +29,6 @@ from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["PlaneView", "any_left", "find_bent", "refined_locally"]
-
 _OWN, _BESIDE = 0.4, 2.0  # squares; nearer saddles are the lattice's own, farther ones not its next line
 _LIKE, _LINE = 0.5, 3  # least contrast relative to the lattice's, and least number of saddles of such a line
 _GROUPS = 3  # of linked saddles that are tried

@@ -12,8 +12,6 @@ from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Stretched", "stretch"]
-
 # For boards seen almost from the side, as in tests/test_finding.py. The limits have not been varied on
 # images that reach this step.
 _FACTOR = 2.0  # of the stretch

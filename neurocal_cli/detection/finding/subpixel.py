@@ -13,8 +13,6 @@ from numpy.typing import NDArray
 from neurocal_cli.detection.finding.levels import Image
 from neurocal_cli.geometry import Array
 
-__all__ = ["refine_saddles"]
-
 _LONGEST_STEP = 1.5  # px; insensitive, tests/test_finding.py
 
 

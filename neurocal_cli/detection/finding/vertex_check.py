@@ -14,8 +14,6 @@ from neurocal_cli.detection.finding.predict import PredictedVertices
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["VertexCheck", "check_vertices"]
-
 # Insensitive, apart from _INTO and _ALONG: doubled, samples reach the next squares, and 66 of 279 points of
 # three photographs are lost.
 _INTO = 0.3  # squares; from the vertex into the four squares around it

@@ -20,21 +20,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "BLUR",
-    "CONTRAST",
-    "LEAST_BLUR",
-    "MEAN",
-    "MORE_STEPS",
-    "BatchFit",
-    "LevelPrior",
-    "Linearised",
-    "Part",
-    "ProfileShape",
-    "fit_batch",
-    "rows_for",
-]
-
 Single = NDArray[np.float32]
 Part = NDArray[np.intp] | slice  # of the fits
 

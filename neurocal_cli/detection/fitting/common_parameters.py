@@ -35,8 +35,6 @@ from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["BoardBlur", "FieldBlur", "PixelNoise", "level_prior", "profile_shape"]
-
 Single = NDArray[np.float32]
 
 # Insensitive, apart from _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.

@@ -36,18 +36,6 @@ from neurocal_cli.detection.fitting.strips import Lines, Strips
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "OFFSET",
-    "TILT",
-    "EdgeData",
-    "edge_data",
-    "fit_edges",
-    "light_at",
-    "linearised",
-    "moments",
-    "with_weight",
-]
-
 Single = NDArray[np.float32]
 
 OFFSET, TILT = 0, 1  # the first two values of an edge's fit

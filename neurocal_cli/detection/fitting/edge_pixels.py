@@ -11,8 +11,6 @@ from neurocal_cli.detection.fitting.strips import Lines, strip_pixels
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
-__all__ = ["REACH", "SHARP", "edge_pixels", "usual_stride"]
-
 # Half of REACH raises errors by 16 %; doubled it lowers them by 2 %, with twice the pixels. Half of SHARP
 # raises the errors of edges sharper than a pixel up to 9 times. The others are insensitive.
 REACH = 4.0  # sigma on both sides of an edge; farther pixels hold no information on its place

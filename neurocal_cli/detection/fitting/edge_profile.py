@@ -20,18 +20,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "RESPONSE_TERMS",
-    "box_kurtosis",
-    "erf_and_density",
-    "profile",
-    "response",
-    "response_terms",
-    "tail_terms",
-    "tails_of",
-    "with_sign",
-]
-
 Real = NDArray[np.floating]
 
 RESPONSE_TERMS = 6

@@ -12,8 +12,6 @@ from neurocal_cli.detection.fitting.batched_newton import BLUR, CONTRAST, MEAN, 
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 from neurocal_cli.geometry import Array
 
-__all__ = ["is_reliable", "is_typical"]
-
 # Insensitive within what they must contain: a ratio of 1 to the prior, and fits of 8 pixels for the smallest
 # squares. tests/test_measuring.py counts the fits of hidden edges that are accepted.
 _LEAST_CONTRAST, _MOST_CONTRAST = 0.6, 1.6  # relative to the prior

@@ -43,8 +43,6 @@ from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["GridEdges", "GridFit", "GridImage", "fit_grid", "fit_grid_vertices", "fit_rim"]
-
 Image = NDArray[np.generic]
 
 # Insensitive: later stages correct the errors of earlier ones.

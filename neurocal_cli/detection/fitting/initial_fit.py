@@ -22,8 +22,6 @@ from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["InitialFit", "fit_initial"]
-
 # Insensitive, apart from edges sharper than a pixel ("straight, psf 0.15" in tests/rendered.py). There, half
 # of _FEW_STEPS raises errors by 50 %, and twice _CLEARLY, never taking the box, makes them 8 times larger.
 _SLACK = 0.5  # px, added to the strips because lines are not accurate yet

@@ -19,18 +19,6 @@ from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "STEPS",
-    "MapFit",
-    "MapSolution",
-    "Observations",
-    "fit_map",
-    "loss_of",
-    "robust_scale",
-    "solve_map",
-    "with_covariance",
-]
-
 # Insensitive.
 STEPS = 25  # at most
 _SHIFT_PRIOR = 1e-2  # 1/px^2, of the shifts: 10 px

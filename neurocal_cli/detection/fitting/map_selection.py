@@ -20,8 +20,6 @@ from neurocal_cli.detection.fitting.map_fit import (
 from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.geometry import Array
 
-__all__ = ["select_map"]
-
 # A richer model must lower chi2 by this much for each of its parameters; chance alone gives 1. Residuals far
 # above the noise come from an uneven board, which a polynomial must not follow: the price is higher then.
 # Insensitive, as all constants here; tests/test_fit_parts.py selects known models.

@@ -18,8 +18,6 @@ import numpy as np
 from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, profile, tails_of, with_sign
 from neurocal_cli.geometry import Array
 
-__all__ = ["PIXEL", "box_profile", "half_widths", "sharp_profile"]
-
 PIXEL = 1 / 12  # px^2, variance of the pixel's box along any direction
 # Against division by 0 in blurs and boxes that cannot be measured; insensitive.
 _LEAST_PSF = 0.02  # px

@@ -16,8 +16,6 @@ from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_medi
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Levels", "LocalShading", "Shading", "fit_shading", "square_levels"]
-
 _x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
 # Weights of a square's corners in places (64, 4) of its interior, away from the blurred edges.
 _INTERIOR = np.stack([(1 - _x) * (1 - _y), _x * (1 - _y), (1 - _x) * _y, _x * _y], axis=-1)

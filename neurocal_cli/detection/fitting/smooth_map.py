@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Frame", "Places", "SmoothMap", "homography_start", "polynomial_orders", "polynomials"]
-
 _HOMOGRAPHY, _LENS = 8, 6
 _REST = _HOMOGRAPHY + _LENS
 _FREE_LENS: tuple[tuple[int, ...], ...] = ((), (10,), (8, 9, 10, 11), (8, 9, 10, 11, 12, 13))

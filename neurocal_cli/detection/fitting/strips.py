@@ -12,8 +12,6 @@ from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Lines", "Strips", "grid_lines", "strip_pixels"]
-
 Single = NDArray[np.float32]
 
 _AROUND = np.array([[0, 0], [-0.5, 0], [0.5, 0], [-0.5, -0.2], [-0.5, 0.2], [0.5, -0.2], [0.5, 0.2]])

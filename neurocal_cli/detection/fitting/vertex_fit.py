@@ -35,8 +35,6 @@ from neurocal_cli.detection.fitting.strips import Lines, grid_lines, packed, str
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["FIRST", "SECOND", "VertexData", "fit_vertices", "linearised", "vertex_data", "vertex_lines"]
-
 Single = NDArray[np.float32]
 
 # Values of a vertex's fit: offset [px] and tilt [px over the half length] of the line along c and of that

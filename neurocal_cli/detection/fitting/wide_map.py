@@ -24,8 +24,6 @@ from neurocal_cli.detection.wide_lens import fit_wide_lens
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["WideMap", "wide_start"]
-
 _HOMOGRAPHY, _PROFILE = 8, 6
 _CENTRE, _FIRST = slice(8, 10), 10  # positions of c, and of a_0
 _SQUARE = slice(_FIRST + _PROFILE, _FIRST + _PROFILE + 2)  # of m and n

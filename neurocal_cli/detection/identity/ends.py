@@ -16,8 +16,6 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["DIRECTIONS", "End", "board_ends"]
-
 # Sides of a grid by the direction (c, r) that leads out of it.
 DIRECTIONS = ((-1, 0), (1, 0), (0, -1), (0, 1))
 

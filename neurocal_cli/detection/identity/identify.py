@@ -36,8 +36,6 @@ from neurocal_cli.detection.medians import median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Identified", "Located", "NoBoardError", "identify"]
-
 # tests/test_identity.py accepts and refuses rendered boards with these limits.
 _CLEARLY = 3.0  # ratio to the best rms error from which an arrangement is excluded
 _NOISE = 0.05  # px; rms errors below this exclude nothing

@@ -11,8 +11,6 @@ import numpy as np
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["CameraFit", "fit_camera", "is_flat", "rigid_motion"]
-
 _FLAT = 1e-6  # ratio of smallest and largest extent of points in one plane: rounding errors
 _WEAK = 3.0  # ratio by which an affine camera must fit worse for perspective to be certain
 

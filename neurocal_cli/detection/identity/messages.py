@@ -9,8 +9,6 @@ from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.errors import NeurocalError
 
-__all__ = ["SYMMETRIC_BOARD", "NoBoardError", "ambiguity_message", "wrong_size"]
-
 SYMMETRIC_BOARD = (
     "the board looks the same after a turn, so its first corner depends on its orientation in the image; to "
     "get the same point ids in all images, use a board with an even number of inner vertices on one side and "

@@ -14,8 +14,6 @@ from neurocal_cli.detection.identity.ends import End
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Placement", "placements"]
-
 Matrix = tuple[tuple[int, int], tuple[int, int]]
 
 _TURNS: tuple[Matrix, ...] = (((1, 0), (0, 1)), ((0, -1), (1, 0)), ((-1, 0), (0, -1)), ((0, 1), (-1, 0)))

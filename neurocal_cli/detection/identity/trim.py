@@ -14,8 +14,6 @@ from neurocal_cli.board import Plane
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.geometry import Array
 
-__all__ = ["trimmed"]
-
 # tests/test_identity.py removes such lines, and keeps them on larger boards.
 _FEW = 0.34  # greatest share of vertices of a line that may be removed
 _FEW_AT_FOLDS = 0.6  # the same for several planes, which one camera tests afterwards

@@ -12,8 +12,6 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["METRES", "CameraSet", "Format"]
-
 METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
 
 

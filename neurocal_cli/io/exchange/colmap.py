@@ -22,8 +22,6 @@ from neurocal_cli.io.exchange.rotations import after, from_quaternion, to_quater
 from neurocal_cli.io.files import read_text
 from neurocal_cli.io.yaml_text import number
 
-__all__ = ["FORMAT", "is_folder", "parse", "read_folder"]
-
 _HALF = 0.5  # of a pixel, from our origin to COLMAP's
 
 # Our model, how many focal lengths, and for each of our coefficients the place of COLMAP's or None for 0.

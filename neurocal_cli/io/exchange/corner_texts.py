@@ -16,8 +16,6 @@ from neurocal_cli.io.points_csv import format_points
 from neurocal_cli.io.yaml_text import number
 from neurocal_cli.points import Correspondences
 
-__all__ = ["corner_text", "points_lost"]
-
 
 def corner_text(points: Correspondences, target: str, ending: str) -> str | bytes:
     """Write points for a program.

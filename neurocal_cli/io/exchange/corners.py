@@ -33,8 +33,6 @@ from neurocal_cli.io.points_csv import read_points
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.points import Correspondences
 
-__all__ = ["read_corners"]
-
 _IMAGE = (
     "image_points",
     "imagePoints",

@@ -28,18 +28,6 @@ from neurocal_cli.io.file_storage_text import storage_text
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.stereo.rectification import rectify
 
-__all__ = [
-    "JSON",
-    "NPZ",
-    "OPENCV",
-    "arrays_of",
-    "from_tree",
-    "is_part",
-    "json_text",
-    "npz_bytes",
-    "read_npz",
-]
-
 _SIDES = (("1", "2"), ("_left", "_right"), ("L", "R"), ("_l", "_r"))
 _ROTATIONS, _TRANSLATIONS = ("R", "R_stereo", "rotation"), ("T", "t", "T_stereo", "translation")
 _MOST_BYTES = 500_000_000  # unpacked; a camera has a few hundred numbers

@@ -13,8 +13,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 
-__all__ = ["Fitted", "fitted_in"]
-
 _NO_SKEW = 1e-3  # a loss below this [px] is nobody's concern
 _NO_LOSS = 5e-3  # nor is this share of the image
 _AS_NEAR, _NEARER = 1.1, 0.01  # times the loss of the nearest model, and px

@@ -5,8 +5,6 @@ from __future__ import annotations
 from neurocal_cli.io.exchange import colmap, dictionary, kalibr, matlab, mrcal, neurocal, ros
 from neurocal_cli.io.exchange.camera_set import Format
 
-__all__ = ["FORMATS"]
-
 FORMATS: dict[str, Format] = {
     "neurocal": neurocal.FORMAT,
     "opencv": dictionary.OPENCV,

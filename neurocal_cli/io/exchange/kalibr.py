@@ -18,8 +18,6 @@ from neurocal_cli.io.exchange.rotations import after, inverse
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flow, text
 
-__all__ = ["FORMAT", "from_tree", "is_tree"]
-
 # By camera model and distortion model.
 _MODELS = {
     ("pinhole", "radtan"): "k1k2p1p2",

@@ -22,8 +22,6 @@ from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.rotations import from_vector
 from neurocal_cli.io.mat_file import read_variables
 
-__all__ = ["FIRST_PIXEL", "FORMAT", "read_mat", "saved", "unit_of"]
-
 FIRST_PIXEL = 1.0  # MATLAB's number of the first pixel
 _STRUCTS = ("cameraParams", "stereoParams", "params", "intrinsics")
 

@@ -22,8 +22,6 @@ from neurocal_cli.io.exchange.rotations import from_vector, to_vector
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import number
 
-__all__ = ["FORMAT", "REFERENCE", "is_text", "parse"]
-
 REFERENCE = "reference"  # the name of the world as a view
 _LENGTHS = {"PINHOLE": 0, "OPENCV4": 4, "OPENCV5": 5, "OPENCV8": 8, "OPENCV12": 12}
 _NAMES = {

@@ -22,8 +22,6 @@ from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.points import Correspondences
 from neurocal_cli.stereo.rig import Rig
 
-__all__ = ["FORMAT", "as_rig", "from_tree"]
-
 _UNKNOWN = "unknown"  # the unit of lengths that no file stated
 
 

@@ -16,8 +16,6 @@ from neurocal_cli.io.file_storage import parse_tree
 from neurocal_cli.io.files import decode, read_bytes
 from neurocal_cli.io.tree_fields import Field
 
-__all__ = ["read_cameras"]
-
 # By what a binary file begins with.
 _BINARY: tuple[tuple[bytes, Callable[[bytes, str], CameraSet]], ...] = (
     (b"PK\x03\x04", dictionary.read_npz),

@@ -21,8 +21,6 @@ from neurocal_cli.io.exchange.neurocal import as_rig
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.stereo.rectification import rectify
 
-__all__ = ["FORMAT", "from_tree", "is_tree", "joined"]
-
 _RECTIFIED = "rectified"  # the name under which a camera of a pair keeps its R and t / f in `poses`
 
 

@@ -10,15 +10,6 @@ import numpy as np
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.geometry import Array
 
-__all__ = [
-    "after",
-    "from_quaternion",
-    "from_vector",
-    "inverse",
-    "to_quaternion",
-    "to_vector",
-]
-
 
 def to_vector(R: Array) -> Array:
     """Axis times angle [rad] of a rotation (3, 3), also by nearly pi, as OpenCV's ``Rodrigues``."""

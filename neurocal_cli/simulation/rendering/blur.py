@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-__all__ = ["Blur"]
-
 _TAIL = 5.7  # standard deviations beyond which the Gaussian counts as nothing: 1e-8 of the light
 _STRIP = 16  # rows at a time
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(24)

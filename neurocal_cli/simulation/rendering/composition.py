@@ -16,8 +16,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.scene import Occluder, Scene
 
-__all__ = ["Composition"]
-
 _FINEST = 8  # parts of a cell's side where edges meet in it
 _PIXEL_SLACK = 0.1  # px by which an edge may bend between a pixel's centre and its corner
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 
-__all__ = ["Cover", "half_plane"]
-
 # Below this an edge counts as parallel to the cell's side; the area is then off by less than 1e-5.
 _LEAST_COMPONENT = 1e-5
 

@@ -14,8 +14,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.coverage import Cover, half_plane
 from neurocal_cli.simulation.rendering.scene import Scene, Target
 
-__all__ = ["BoardLayer"]
-
 # Cells further than this from the paper [squares] are not looked at; also keeps off the horizon.
 _NEARBY = 2.0
 

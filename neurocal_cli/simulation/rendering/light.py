@@ -10,8 +10,6 @@ from neurocal_cli.simulation.rendering.blur import Blur
 from neurocal_cli.simulation.rendering.composition import Composition
 from neurocal_cli.simulation.rendering.scene import Illumination, Scene
 
-__all__ = ["enough_parts", "image_light"]
-
 # Cells along a pixel's side, times the blur: what keeps the picture within 0.0005 of full scale.
 _PARTS_BY_BLUR = 8.0
 _FEWEST_PARTS, _MOST_PARTS = 4, 24

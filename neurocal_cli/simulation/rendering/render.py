@@ -10,8 +10,6 @@ from neurocal_cli.simulation.rendering.scene import Scene
 from neurocal_cli.simulation.rendering.sensor import Image, digitised
 from neurocal_cli.simulation.rendering.truth import Truth, ground_truth
 
-__all__ = ["Rendered", "render"]
-
 
 @frozen_dataclass(eq=False)
 class Rendered:

@@ -21,16 +21,6 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.coverage import Cover
 
-__all__ = [
-    "Background",
-    "Illumination",
-    "Occluder",
-    "Scene",
-    "Sensor",
-    "Sides",
-    "Target",
-]
-
 
 @frozen_dataclass
 class Sides:

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.scene import Sensor
 
-__all__ = ["digitised", "response", "signal"]
-
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 
 _SRGB_LINEAR = 0.0031308

@@ -11,8 +11,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.simulation.rendering.layers import BoardLayer
 from neurocal_cli.simulation.rendering.scene import Scene, Target
 
-__all__ = ["PlaneTruth", "Truth", "ground_truth"]
-
 Mask = NDArray[np.bool_]
 
 _TINY_CELL = 1e-6  # px; a point
