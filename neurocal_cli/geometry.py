@@ -181,16 +181,6 @@ def nearest_similarity(points: Array, to: Array) -> tuple[float, Array, Array]:
     return s, R, other - s * R @ centre
 
 
-def rq(M: Array) -> tuple[Array, Array]:
-    """Factor M = K Q, K upper triangular with positive diagonal, Q orthogonal; (..., 3, 3)."""
-    reverse = np.eye(3)[::-1]
-    q, r = np.linalg.qr(np.swapaxes(reverse @ M, -1, -2))
-    K = reverse @ np.swapaxes(r, -1, -2) @ reverse
-    Q = reverse @ np.swapaxes(q, -1, -2)
-    sign = np.where(np.diagonal(K, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
-    return K * sign[..., None, :], sign[..., :, None] * Q
-
-
 def distinct_rows(table: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Where each different row of a table (N, m) comes first, in the rows' order, and which one each row is.
 

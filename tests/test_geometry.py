@@ -19,7 +19,6 @@ from neurocal_cli.geometry import (
     orthonormalised,
     rotation_step,
     rotation_to_euler,
-    rq,
     similarity,
 )
 
@@ -152,23 +151,6 @@ def test_the_nearest_rotation_of_a_scaled_one_is_itself_and_of_a_mirrored_one_pr
     R = rotations(5)
     np.testing.assert_allclose(nearest_rotation(7.0 * R), R, atol=1e-14)
     assert_rotation(nearest_rotation(-R))
-
-
-@quick
-@given(matrix)
-def test_rq_factors(M: Array) -> None:
-    K, Q = rq(M)
-    np.testing.assert_allclose(K @ Q, M, atol=1e-14)
-    assert np.abs(np.tril(K, -1)).max() == 0
-    assert (np.diagonal(K) >= 0).all()
-    np.testing.assert_allclose(Q @ Q.T, np.eye(3), atol=1e-14)
-
-
-def test_rq_of_a_stack_is_the_rq_of_each() -> None:
-    M = np.random.default_rng(0).normal(size=(4, 3, 3))
-    for k, (K, Q) in enumerate(zip(*rq(M), strict=True)):
-        np.testing.assert_allclose(K, rq(M[k])[0], atol=1e-14)
-        np.testing.assert_allclose(Q, rq(M[k])[1], atol=1e-14)
 
 
 @quick
