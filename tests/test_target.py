@@ -242,3 +242,34 @@ def test_a_board_at_the_limit_of_stretch_is_kept_when_its_lens_is_chosen_anew(
     found = calibrate(read_points(tmp_path / "points.csv"))
     assert found.target is not None
     assert found.rmse_px < 0.09
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("images", "cols", "rows", "square", "stretched", "leaning"),
+    [
+        ("opencv_stereo/left*.jpg", 9, 6, 25, -0.0003, 0.0004),
+        ("sony_chess/frame*.jpg", 4, 6, 30, -0.0029, -0.0004),
+        ("fisheye_ocam/*.jpg", 6, 8, 32.5, 0.0, 0.0014),
+        ("fisheye_stereo/left*.jpg", 9, 6, 24.23, 0.0005, -0.0009),
+    ],
+)
+def test_boards_in_photographs_lean_as_much_as_they_are_stretched(
+    images: str,
+    cols: int,
+    rows: int,
+    square: float,
+    stretched: float,
+    leaning: float,
+    tmp_path: Path,
+    real_files: RealFiles,
+) -> None:
+    """With axes of the image that are known to be at right angles, which look like a board that leans."""
+    words = ["--cols", cols, "--rows", rows, "--square", square, "--points", "vertices"]
+    assert run("detect", *real_files(images), *words, "-o", tmp_path / "points.csv").exit_code == 0
+    target = calibrate(read_points(tmp_path / "points.csv"), skew=False).target
+    assert target is not None
+    places = np.column_stack([target.given, np.ones(len(target.given))])
+    linear = np.linalg.lstsq(places, target.offsets, rcond=None)[0]
+    assert 0.5 * (linear[0, 0] - linear[1, 1]) == pytest.approx(stretched, abs=2e-4)
+    assert 0.5 * (linear[0, 1] + linear[1, 0]) == pytest.approx(leaning, abs=2e-4)

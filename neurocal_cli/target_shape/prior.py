@@ -27,12 +27,12 @@ from neurocal_cli.target import Target, is_flat
 _LENGTH = 0.35  # of a plane's size, as printed boards bend; tests/test_target_shape.py tries others
 _LEAST = 1e-4  # of the largest eigenvalue: smaller ones are nothing
 _HELD = 1e-7  # of the target's size: a surveyed point that is exactly where it is stated
-# Std of a stretch, half of the relative difference of two sides: prints are off by a few thousandths. Of two
-# boards in photographs (tests/test_target.py), one is by 0.13 % and one by 1.5 to 2 %.
+# Std of a stretch, half of the relative difference of two sides. Four boards in photographs are stretched by
+# 0.03, 0.29, 0.00 and 0.05 %, and lean by 0.04, 0.04, 0.14 and 0.09 % (tests/test_target.py, slow).
 STRETCH = 1.5e-3
-# What a print leans by, over what it is stretched by: paper is fed along one side. With 1, errors from five
-# views of stretched and of twisted boards are 7 % and 2 % larger, from those of bent ones 1 % smaller
-# (tests/test_simulated_targets.py, slow).
+# What a print leans by, over what it is stretched by: between 1, as in these photographs, and 0, as in
+# simulated boards. With 1, errors from five views of stretched and of twisted boards are 7 % and 2 % larger,
+# from those of bent ones 1 % smaller (tests/test_simulated_targets.py, slow).
 _LEANING = 0.3
 _MOST = 150  # points that the eigenfunctions are found from
 
