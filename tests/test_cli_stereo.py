@@ -209,7 +209,7 @@ def test_the_corner_rig_from_its_photographs(
     )
     assert values["n_points"] > least
     assert values["baseline"] == pytest.approx(230.9, abs=3)
-    assert values["rmse"] == pytest.approx(1.1, abs=0.1)
+    assert values["rmse"] < 1.2
     assert values["rmse_x"] < 0.7 > values["rmse_y"]
     assert values["nsce"] == pytest.approx(3.95, abs=0.2)
 
