@@ -76,7 +76,7 @@ def _board(root: Field) -> Board:
     fields = list(root["planes"].items())
     if not fields:
         root["planes"].fail("a list of at least one plane")
-    unit = root["unit"].text() if "unit" in root else "mm"
+    unit = root.get("unit", "mm").text()
     planes = tuple(_plane(field, alone=len(fields) == 1) for field in fields)
     try:
         board = Board(planes, unit)
@@ -118,7 +118,7 @@ def _plane(field: Field, *, alone: bool) -> Plane:
 
 def _only(field: Field, known: tuple[str, ...]) -> None:
     """Refuse keys that would be passed over: a misspelt axis would silently be the default one."""
-    for key in field.keys():  # noqa: SIM118
+    for key in field.entries():
         if key not in known:
             where = f"{field.path}: " if field.path else ""
             raise FormatError(

@@ -116,9 +116,7 @@ def _coupling_lines(lens: ZoomLens) -> Iterator[str]:
         yield f"target_coupling: {flow(lens.target_coupling.reshape(len(lens.settings), -1))}"
 
 
-def _coupling(field: Field | None, S: int, size: int) -> Array | None:
-    if field is None:
-        return None
+def _coupling(field: Field, S: int, size: int) -> Array:
     flat = field.array(S, -1)
     if flat.shape[1] % size:
         field.fail(f"rows of a multiple of {size} numbers")
@@ -172,7 +170,7 @@ def _lens(block: Field) -> ZoomLens:
             f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again",
             block.source,
         )
-    controls = _names(block["controls"])
+    controls = tuple(block["controls"].texts())
     if not controls or any(name not in CONTROLS for name in controls) or len(set(controls)) < len(controls):
         block["controls"].fail("zoom, focus or both")
     camera = block["camera"].text()
@@ -209,14 +207,10 @@ def _lens(block: Field) -> ZoomLens:
         converged=block["converged"].boolean(),
         image_size=(width, height) if width and height else None,
         unit=block["unit"].text(),
-        warnings=tuple(field.text() for field in block["warnings"].items()),
-        target=read_target(block.get("target")),
-        target_coupling=_coupling(block.get("target_coupling"), S, L + Q),
+        warnings=tuple(block["warnings"].texts()),
+        target=block.read("target", read_target),
+        target_coupling=block.read("target_coupling", lambda field: _coupling(field, S, L + Q)),
     )
-
-
-def _names(field: Field) -> tuple[str, ...]:
-    return tuple(name.text() for name in field.items())
 
 
 def _positive(field: Field) -> float:
@@ -233,7 +227,7 @@ def _parameter_names(block: Field, camera: str) -> tuple[tuple[str, ...], str]:
         coefficients = coefficient_names(model)
     except InputError as error:
         raise FormatError(f"{block.path}.distortion: {error}", block.source) from error
-    names = _names(block["parameters"])
+    names = tuple(block["parameters"].texts())
     t_z = ("t_z",) if camera == "still" or (camera == "known" and "t_z" in names) else ()
     expected = (*_CAMERA, *t_z, *coefficients)
     if names != expected:

@@ -161,8 +161,8 @@ def rig_from_field(root: Field) -> Rig:
         converged=block["converged"].boolean(),
         stop_reason=block["stop_reason"].text(),
         iterations=block["iterations"].integer(),
-        warnings=tuple(entry.text() for entry in block["warnings"].items()),
-        judgement=read_verdict(block.get("verdict")),
+        warnings=tuple(block["warnings"].texts()),
+        judgement=block.read("verdict", read_verdict),
     )
     _check_consistent(rig, block)
     return rig
@@ -174,7 +174,7 @@ def _std(block: Field) -> dict[str, float]:
 
 
 def _names(entry: Field, count: int) -> tuple[str, ...]:
-    names = tuple(name.text() for name in entry.items())
+    names = tuple(entry.texts())
     if len(names) != count:
         entry.fail(f"a list of {count} texts")
     return names

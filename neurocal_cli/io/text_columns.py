@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.geometry import Array
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flows, quoted
 
@@ -74,14 +75,14 @@ def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
     if isinstance(field["columns"].value, dict):
         table = read_columns(field["columns"], labels)
     else:
-        names = [name.text() for name in field["columns"].items()]
+        names = field["columns"].texts()
         rows = [row.value for row in field["rows"].items()]
         if len(set(names)) < len(names) or any(
             type(row) is not list or len(row) != len(names) for row in rows
         ):
             field.fail(f"a table with {len(names)} columns")
         table = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)) if rows else {}
-    return {name: Field(values, field.source, f"{field.path}.{name}") for name, values in table.items()}
+    return as_fields(table, field)
 
 
 def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
@@ -92,17 +93,23 @@ def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
     FormatError
         What is no column, or columns of different lengths.
     """
-    columns: dict[str, list[Any]] = {}
-    for name in field.keys():  # noqa: SIM118 - a Field, not a dict
-        column = field[name]
-        columns[name] = (
-            [entry.text() for entry in column.items()]
-            if name in labels
-            else read_numbers(list(column.items()))
-        )
+    columns: dict[str, list[Any]] = {
+        name: column.texts() if name in labels else read_numbers(list(column.items()))
+        for name, column in field.entries().items()
+    }
     if len(set(map(len, columns.values()))) > 1:
         field.fail("columns of one length")
     return columns
+
+
+def as_fields(columns: Mapping[str, list[Any]], table: Field) -> dict[str, Field]:
+    """Columns of a table by their names."""
+    return {name: Field(values, table.source, f"{table.path}.{name}") for name, values in columns.items()}
+
+
+def numbers_of(columns: Mapping[str, Field], names: Sequence[str], unknown: bool = False) -> Array:
+    """(k, N) numbers of some columns; NaN for null, where that may be."""
+    return np.array([columns[name].array(-1, unknown=unknown) for name in names])
 
 
 def read_numbers(texts: Sequence[Field]) -> list[Any]:
