@@ -9,6 +9,7 @@ import click
 from neurocal_cli.commands.options import (
     Command,
     check_plot,
+    count_option,
     input_argument,
     json_option,
     plot_option,
@@ -19,14 +20,7 @@ from neurocal_cli.commands.summaries import print_summary
 
 @click.command(cls=Command)
 @input_argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")
-@click.option(
-    "--next",
-    "count",
-    metavar="N",
-    type=click.IntRange(1, 20),
-    default=3,
-    help="Number of views to advise.",
-)
+@count_option("--next", "N", "Number of views to advise.", default=3, most=20, to="count")
 @plot_option("the outlines of these views")
 @json_option
 def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.options import Command, FiniteNumber, json_option
+from neurocal_cli.commands.options import Command, json_option, number_option, output_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import say, warn
 from neurocal_cli.commands.summaries import print_summary
@@ -29,22 +29,13 @@ _ENDINGS = (".svg", ".pdf", ".png")
     default="A4",
     help="Paper: A0 to A5, letter, legal, tabloid, or its width and height in mm, such as 420x297.",
 )
-@click.option(
-    "--dpi",
-    metavar="N",
-    type=FiniteNumber(positive=True),
-    default=300,
-    show_default="300",
-    help="Resolution of a PNG in pixels per inch.",
+@number_option(
+    "--dpi", "N", "Resolution of a PNG in pixels per inch.", without="300", default=300, positive=True
 )
-@click.option(
-    "-o",
-    "--output",
-    metavar="BOARD.pdf",
+@output_option(
+    "BOARD.pdf",
+    "Write the target to this .pdf, .svg or .png file, and the board file beside it.",
     required=True,
-    type=click.Path(writable=False, readable=False),
-    show_default="required",
-    help="Write the target to this .pdf, .svg or .png file, and the board file beside it.",
 )
 @json_option
 def board(

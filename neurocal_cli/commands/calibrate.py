@@ -40,7 +40,7 @@ _NOT_CONVERGED = 3
 @html_option
 @lean_option
 @summary_option
-@output_option("CAMERA.yaml", "the calibration")
+@output_option("CAMERA.yaml", "Write the calibration to this file.")
 @click.pass_context
 def calibrate(
     ctx: click.Context,

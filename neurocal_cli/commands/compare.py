@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands.method_names import methods_option
-from neurocal_cli.commands.options import Command, input_argument, json_option
+from neurocal_cli.commands.options import (
+    Command,
+    choice_option,
+    count_option,
+    flag_option,
+    input_argument,
+    json_option,
+)
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
 from neurocal_cli.commands.summaries import print_summary
@@ -27,39 +34,32 @@ if TYPE_CHECKING:
     required=False,
 )
 @methods_option("neuro,nonlinear,linear,tsai,opencv")
-@click.option(
+@choice_option(
     "--distortion",
-    type=click.Choice(["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye"]),
-    default="auto",
-    help="Distortion model of all methods that can have it; auto is the one that neuro chooses. linear has "
+    "auto none k1 k1k2 k1k2p1p2 plumb_bob rational fisheye",
+    "Distortion model of all methods that can have it; auto is the one that neuro chooses. linear has "
     "none, tsai k1 alone.",
+    default="auto",
 )
-@click.option(
+@flag_option(
     "--no-skew",
-    is_flag=True,
-    show_default="estimate the angle",
-    help="Fix the angle between the image axes at 90 degrees, as tsai and opencv do anyway.",
+    "Fix the angle between the image axes at 90 degrees, as tsai and opencv do anyway.",
+    without="estimate the angle",
 )
-@click.option(
+@choice_option(
     "--outliers",
-    type=click.Choice(["reject", "keep"]),
+    "reject keep",
+    "Treatment of outliers: with reject, those that neuro finds are left out for all methods.",
     default="reject",
-    help="Treatment of outliers: with reject, those that neuro finds are left out for all methods.",
 )
-@click.option(
+@count_option(
     "--image-size",
-    type=click.IntRange(min=1),
-    nargs=2,
-    metavar="W H",
-    show_default="image_size in POINTS.csv",
-    help="Width and height of the images in pixels.",
+    "W H",
+    "Width and height of the images in pixels.",
+    without="image_size in POINTS.csv",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    metavar="S",
-    default=0,
-    help="Seed of the random weights, and of the choice of points to leave out.",
+@count_option(
+    "--seed", "S", "Seed of the random weights, and of the choice of points to leave out.", default=0, least=0
 )
 @json_option
 def compare(

@@ -13,9 +13,12 @@ from neurocal_cli.commands.frames import videos_as_frames
 from neurocal_cli.commands.one_size import of_one_size
 from neurocal_cli.commands.options import (
     Command,
-    FiniteNumber,
+    choice_option,
+    count_option,
     input_argument,
+    number_option,
     output_option,
+    path_option,
 )
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
@@ -44,59 +47,46 @@ _SECOND = 2  # images of another size, from which on it is no single one that st
     required=True,
 )
 @board_options("Unit of --square. A board file names its own unit.")
-@click.option(
+@choice_option(
     "--points",
-    type=click.Choice(["midpoints", "edges", "vertices"]),
-    default="midpoints",
-    help="Points to measure: midpoints of the edges between inner vertices; edges, which adds those of the "
+    "midpoints edges vertices",
+    "Points to measure: midpoints of the edges between inner vertices; edges, which adds those of the "
     "edges to the board's rim, for stiff boards with whole outer squares; or the inner vertices.",
+    default="midpoints",
 )
-@click.option(
+@number_option(
     "--gamma",
-    metavar="G",
-    type=FiniteNumber(positive=True),
-    show_default="unknown",
-    help="Gamma of the images, 2.2 for many cameras. The points are slightly more accurate if it is given.",
+    "G",
+    "Gamma of the images, 2.2 for many cameras. The points are slightly more accurate if it is given.",
+    without="unknown",
+    positive=True,
 )
-@click.option(
-    "--overlay",
-    metavar="DIR",
-    type=click.Path(readable=False),
-    show_default="none",
-    help="Draw the detected points over each image and write it to DIR/VIEW.png.",
+@path_option("--overlay", "DIR", "Draw the detected points over each image and write it to DIR/VIEW.png.")
+@count_option(
+    "--jobs", "N", "Number of processes that examine images at the same time.", without="the number of cores"
 )
-@click.option(
-    "--jobs",
-    metavar="N",
-    type=click.IntRange(min=1),
-    show_default="the number of cores",
-    help="Number of processes that examine images at the same time.",
-)
-@click.option(
+@count_option(
     "--frames",
-    metavar="N",
-    type=click.IntRange(min=1),
+    "N",
+    "Number of frames that are taken of a video at most: sharp ones that differ from each other.",
     default=50,
-    help="Number of frames that are taken of a video at most: sharp ones that differ from each other.",
 )
-@click.option(
+@path_option(
     "--cache",
-    metavar="DIR",
-    type=click.Path(readable=False),
-    show_default="none",
-    help="Keep what is found in each image in this folder, and look there first. The same image is found "
+    "DIR",
+    "Keep what is found in each image in this folder, and look there first. The same image is found "
     "again under any name; a run that was stopped goes on.",
 )
-@click.option(
+@number_option(
     "--watch",
-    metavar="SECONDS",
-    type=FiniteNumber(positive=True),
-    show_default="no",
-    help="Wait for more images, in folders and patterns, until none has come for so long or Ctrl-C is "
+    "SECONDS",
+    "Wait for more images, in folders and patterns, until none has come for so long or Ctrl-C is "
     "pressed. After each image, tell the verdict so far and the view that would help most.",
+    without="no",
+    positive=True,
 )
 @summary_option
-@output_option("POINTS.csv", "the points")
+@output_option("POINTS.csv", "Write the points to this file.")
 def detect(
     images: tuple[str, ...],
     board: str | None,

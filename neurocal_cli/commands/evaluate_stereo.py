@@ -7,7 +7,13 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.given_camera import calibration_or_camera
-from neurocal_cli.commands.options import INPUT, Command, input_argument, json_option
+from neurocal_cli.commands.options import (
+    Command,
+    choice_option,
+    input_argument,
+    json_option,
+    path_option,
+)
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, warn
@@ -32,20 +38,18 @@ if TYPE_CHECKING:
     nargs=-1,
     required=True,
 )
-@click.option(
+@path_option(
     "--points",
-    nargs=2,
-    metavar="LEFT.csv RIGHT.csv",
-    type=INPUT,
-    show_default="the points of the calibrations",
-    help="Points of both cameras to evaluate them on.",
+    "LEFT.csv RIGHT.csv",
+    "Points of both cameras to evaluate them on.",
+    without="the points of the calibrations",
 )
-@click.option(
+@choice_option(
     "--method",
-    type=click.Choice(["optimal", "linear", "midpoint"]),
-    default="optimal",
-    help="Triangulation: optimal is least squares on the pixels, linear solves linear equations, midpoint "
+    "optimal linear midpoint",
+    "Triangulation: optimal is least squares on the pixels, linear solves linear equations, midpoint "
     "takes the middle between the two rays.",
+    default="optimal",
 )
 @panels_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
 @json_option

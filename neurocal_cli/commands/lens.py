@@ -10,14 +10,19 @@ import click
 
 from neurocal_cli.commands.options import (
     Command,
-    FiniteNumber,
     camera_name_option,
     check_camera_name,
     check_plot,
+    choice_option,
+    count_option,
+    flag_option,
     input_argument,
     json_option,
+    no_skew_option,
+    number_option,
     output_option,
     plot_option,
+    seed_option,
 )
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
@@ -63,66 +68,55 @@ def lens() -> None:
     nargs=-1,
     required=True,
 )
-@click.option(
+@choice_option(
     "--distortion",
-    type=click.Choice(["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye"]),
-    default="auto",
-    help="Distortion model, with a network for each coefficient; none is a pinhole camera. auto chooses a "
+    "auto none k1 k1k2 k1k2p1p2 plumb_bob rational fisheye",
+    "Distortion model, with a network for each coefficient; none is a pinhole camera. auto chooses a "
     "richer model only if it lowers the cross-validation error over the settings.",
+    default="auto",
 )
-@click.option(
+@choice_option(
     "--training",
-    type=click.Choice(["joint", "alternating"]),
-    default="joint",
-    help="Last step of the training: joint changes all weights at once, alternating trains the networks of "
+    "joint alternating",
+    "Last step of the training: joint changes all weights at once, alternating trains the networks of "
     "the parameters and the calibrating network in turn, as in the paper.",
+    default="joint",
 )
-@click.option(
+@choice_option(
     "--camera",
-    type=click.Choice(["auto", "still", "moving"]),
-    default="auto",
-    help="Motion of the camera relative to the target: still is none, moving estimates a pose for each view, "
+    "auto still moving",
+    "Motion of the camera relative to the target: still is none, moving estimates a pose for each view, "
     "auto is still if each setting has one view.",
-)
-@click.option(
-    "--hidden",
-    type=click.IntRange(0, _MOST_UNITS),
-    nargs=2,
-    metavar="N1 N2",
-    show_default="chosen from the data",
-    help="Size of each network: number of tanh units in the first layer, for each of zoom and focus, and in "
-    "the second layer.",
-)
-@click.option(
-    "--outliers",
-    type=click.Choice(["reject", "keep"]),
-    default="reject",
-    help="Treatment of settings that contradict the others: reject leaves them out, keep uses them all.",
-)
-@click.option(
-    "--no-skew",
-    is_flag=True,
-    show_default="estimate the angle",
-    help="Fix the angle between the image axes at 90 degrees.",
-)
-@click.option(
-    "--target",
-    type=click.Choice(["auto", "given", "flat", "free"]),
     default="auto",
-    help="Where the points of a board in several views are, the same at all settings: given takes X, Y, Z as "
+)
+@count_option(
+    "--hidden",
+    "N1 N2",
+    "Size of each network: number of tanh units in the first layer, for each of zoom and focus, and in "
+    "the second layer.",
+    without="chosen from the data",
+    least=0,
+    most=_MOST_UNITS,
+)
+@choice_option(
+    "--outliers",
+    "reject keep",
+    "Treatment of settings that contradict the others: reject leaves them out, keep uses them all.",
+    default="reject",
+)
+@no_skew_option
+@choice_option(
+    "--target",
+    "auto given flat free",
+    "Where the points of a board in several views are, the same at all settings: given takes X, Y, Z as "
     "they are; free finds how the board is bent and printed; flat does so within its plane; auto finds it "
     "where the points ask for it.",
+    default="auto",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    metavar="S",
-    default=0,
-    help="Seed of the random weights. The same seed gives the same output.",
-)
+@seed_option
 @plot_option("each parameter over the settings, with its uncertainty, and the errors")
 @summary_option
-@output_option("LENS.yaml", "the lens")
+@output_option("LENS.yaml", "Write the lens to this file.")
 @click.pass_context
 def fit(
     ctx: click.Context,
@@ -232,21 +226,14 @@ def _write(learnt: ZoomLens, output: str, plot: str | None) -> None:
 
 @lens.command(cls=Command)
 @_LENS
-@click.option(
-    "--zoom", type=FiniteNumber(), metavar="Z", show_default="none", help="Zoom setting of the camera."
-)
-@click.option(
-    "--focus", type=FiniteNumber(), metavar="F", show_default="none", help="Focus setting of the camera."
-)
-@click.option(
-    "--extrapolate",
-    is_flag=True,
-    show_default="refuse such a setting",
-    help="Allow a setting outside the calibrated range.",
+@number_option("--zoom", "Z", "Zoom setting of the camera.", without="none")
+@number_option("--focus", "F", "Focus setting of the camera.", without="none")
+@flag_option(
+    "--extrapolate", "Allow a setting outside the calibrated range.", without="refuse such a setting"
 )
 @camera_name_option
 @summary_option
-@output_option("CAMERA.yaml", "the calibration")
+@output_option("CAMERA.yaml", "Write the calibration to this file.")
 def camera(
     lens_file: str,
     zoom: float | None,

@@ -12,9 +12,11 @@ from neurocal_cli.commands.options import (
     Command,
     alpha_option,
     check_alpha,
+    flag_option,
     input_argument,
     interpolation_option,
     json_option,
+    output_option,
 )
 from neurocal_cli.commands.progress import each_of
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
@@ -46,28 +48,10 @@ _SIDES = ("left", "right")
 )
 @alpha_option("not scaled")
 @interpolation_option
-@click.option(
-    "--side-by-side",
-    is_flag=True,
-    show_default="no",
-    help="Also write each pair as one picture with lines along the rows, to DIR/pairs.",
-)
-@click.option(
-    "--maps",
-    is_flag=True,
-    show_default="no",
-    help="Also write DIR/maps.npz: tables for cv2.remap, and R1, R2, P1, P2, Q.",
-)
+@flag_option("--side-by-side", "Also write each pair as one picture with lines along the rows, to DIR/pairs.")
+@flag_option("--maps", "Also write DIR/maps.npz: tables for cv2.remap, and R1, R2, P1, P2, Q.")
 @json_option
-@click.option(
-    "-o",
-    "--output",
-    metavar="DIR",
-    required=True,
-    type=click.Path(writable=False, readable=False),
-    show_default="required",
-    help="Write to the folders left and right in this folder.",
-)
+@output_option("DIR", "Write to the folders left and right in this folder.", required=True)
 def rectify(
     rig: str,
     files: tuple[str, ...],

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.options import Command, input_argument, output_option
+from neurocal_cli.commands.options import Command, input_argument, output_option, path_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
@@ -24,17 +24,15 @@ _MOST_BYTES = 1_400_000  # of all photographs; as text in the page they take a t
     "CAMERA.yaml|RIG.yaml|LENS.yaml",
     "What neurocal calibrate, stereo or lens fit wrote; - is standard input.",
 )
-@click.option(
+@path_option(
     "--images",
-    metavar="DIR",
-    multiple=True,
-    type=click.Path(readable=False),
-    show_default="none",
-    help="Show the photographs of the views, with the residuals over them: a folder or a pattern such as "
+    "DIR",
+    "Show the photographs of the views, with the residuals over them: a folder or a pattern such as "
     "'left*.png', whose files have the names of the views. For a rig give it twice, left and right, or once "
     "for both.",
+    multiple=True,
 )
-@output_option("REPORT.html", "the page")
+@output_option("REPORT.html", "Write the page to this file.")
 def report(result: str, images: tuple[str, ...], output: str) -> None:
     """Show a calibration, a rig or a zoom lens as one HTML page.
 

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands.method_names import methods_option
-from neurocal_cli.commands.options import INPUT, Command, FiniteNumber, check_plot, json_option, plot_option
+from neurocal_cli.commands.options import (
+    Command,
+    check_plot,
+    count_option,
+    flag_option,
+    json_option,
+    number_option,
+    path_option,
+    plot_option,
+)
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
@@ -49,86 +58,63 @@ def _is_number(word: str) -> bool:
 
 
 @click.command(cls=_Command)
-@click.option(
+@path_option(
     "--camera",
-    metavar="CAMERA.yaml",
-    type=INPUT,
-    show_default="the camera of the paper's Table 1",
-    help="The true camera: a neurocal, ROS or OpenCV file. A neurocal file also brings its points and poses.",
+    "CAMERA.yaml",
+    "The true camera: a neurocal, ROS or OpenCV file. A neurocal file also brings its points and poses.",
+    without="the camera of the paper's Table 1",
 )
-@click.option(
+@path_option(
     "--board",
-    metavar="BOARD.yaml",
-    type=INPUT,
-    show_default="two boards at a right angle, 440 points",
-    help="The target, as for detect; the points are its mid-points.",
+    "BOARD.yaml",
+    "The target, as for detect; the points are its mid-points.",
+    without="two boards at a right angle, 440 points",
 )
-@click.option(
+@count_option(
     "--views",
-    metavar="N",
-    type=click.IntRange(1, 1000),
-    show_default="1, and 10 of a flat board",
-    help="Number of random poses of the target. Without it, that of Table 1 or those of CAMERA.yaml.",
+    "N",
+    "Number of random poses of the target. Without it, that of Table 1 or those of CAMERA.yaml.",
+    without="1, and 10 of a flat board",
+    most=1000,
 )
-@click.option(
+@number_option(
     "--sigma",
-    metavar="PX...",
-    type=FiniteNumber(positive=True),
-    multiple=True,
+    "PX...",
+    "Standard deviations of the noise in u and in v.",
+    without="0.1 0.2 0.5 1 2",
     default=_SIGMA,
-    show_default="0.1 0.2 0.5 1 2",
-    help="Standard deviations of the noise in u and in v.",
+    positive=True,
+    multiple=True,
 )
-@click.option(
-    "--trials",
-    metavar="N",
-    type=click.IntRange(min=1),
-    default=50,
-    help="Number of trials at each sigma, as in the paper.",
-)
+@count_option("--trials", "N", "Number of trials at each sigma, as in the paper.", default=50)
 @methods_option(_DEFAULT_METHODS)
-@click.option(
+@count_option(
     "--random-starts",
-    metavar="N",
-    type=click.IntRange(min=0),
+    "N",
+    "Number of single random starts of the network and of plain Levenberg-Marquardt; 0 leaves them out.",
     default=50,
-    help="Number of single random starts of the network and of plain Levenberg-Marquardt; 0 leaves them out.",
+    least=0,
 )
-@click.option(
+@flag_option(
     "--rates",
-    is_flag=True,
-    show_default="noise and random starts",
-    help="Study the two learning rates of backprop instead, on many data sets.",
+    "Study the two learning rates of backprop instead, on many data sets.",
+    without="noise and random starts",
 )
-@click.option(
-    "--data-sets",
-    metavar="N",
-    type=click.IntRange(min=1),
-    default=70,
-    help="With --rates: number of data sets.",
-)
-@click.option(
-    "--seed", metavar="S", type=click.IntRange(min=0), default=0, help="Seed of everything that is random."
-)
-@click.option(
+@count_option("--data-sets", "N", "With --rates: number of data sets.", default=70)
+@count_option("--seed", "S", "Seed of everything that is random.", default=0, least=0)
+@count_option(
     "--jobs",
-    metavar="N",
-    type=click.IntRange(min=1),
-    show_default="the number of cores",
-    help="Number of processes; the results are the same for any number.",
+    "N",
+    "Number of processes; the results are the same for any number.",
+    without="the number of cores",
 )
-@click.option(
-    "--save",
-    metavar="DIR",
-    type=click.Path(readable=False),
-    show_default="none",
-    help="Write the true camera, its exact points and noisy points of each sigma to this folder.",
+@path_option(
+    "--save", "DIR", "Write the true camera, its exact points and noisy points of each sigma to this folder."
 )
-@click.option(
+@flag_option(
     "--images",
-    is_flag=True,
-    show_default="points only",
-    help="With --save: also write rendered images of the target, and the exact points that they show.",
+    "With --save: also write rendered images of the target, and the exact points that they show.",
+    without="points only",
 )
 @plot_option("the errors over the noise and the random starts, or with --rates the rates,")
 @json_option

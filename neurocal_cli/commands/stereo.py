@@ -10,11 +10,11 @@ import click
 
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
 from neurocal_cli.commands.options import (
-    INPUT,
     Command,
     input_argument,
     lean_option,
     output_option,
+    path_option,
 )
 from neurocal_cli.commands.pages import html_option, write_page
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
@@ -37,19 +37,13 @@ _NOT_CONVERGED = 3
 @input_argument("left", "LEFT.csv", "Points of the left camera; - is standard input.")
 @input_argument("right", "RIGHT.csv", "Points of the right camera.")
 @estimation_options_without_files
-@click.option(
+@path_option(
     "--left-intrinsics",
-    type=INPUT,
-    metavar="CAMERA.yaml",
-    show_default="none",
-    help="The left camera, if it is known: a neurocal, ROS or OpenCV file. Only its poses are estimated.",
+    "CAMERA.yaml",
+    "The left camera, if it is known: a neurocal, ROS or OpenCV file. Only its poses are estimated.",
 )
-@click.option(
-    "--right-intrinsics",
-    type=INPUT,
-    metavar="CAMERA.yaml",
-    show_default="none",
-    help="The right camera, if it is known. Only its poses are estimated.",
+@path_option(
+    "--right-intrinsics", "CAMERA.yaml", "The right camera, if it is known. Only its poses are estimated."
 )
 @click.option(
     "--alpha",
@@ -59,19 +53,16 @@ _NOT_CONVERGED = 3
     help="Zoom of the rectified images: 0 shows valid pixels only, 1 shows all pixels of the original "
     "images.",
 )
-@click.option(
+@path_option(
     "--ros",
-    nargs=2,
-    metavar="LEFT.yaml RIGHT.yaml",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Also write two camera_info files for the stereo nodes of ROS, in metres.",
+    "LEFT.yaml RIGHT.yaml",
+    "Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
 @panels_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
 @html_option
 @lean_option
 @summary_option
-@output_option("RIG.yaml", "the rig")
+@output_option("RIG.yaml", "Write the rig to this file.")
 @click.pass_context
 def stereo(
     ctx: click.Context,

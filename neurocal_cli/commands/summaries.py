@@ -7,14 +7,14 @@ from typing import Any
 
 import click
 
+from neurocal_cli.commands.options import flag_option
 from neurocal_cli.errors import UsageError
 
-summary_option = click.option(
+summary_option = flag_option(
     "--json",
-    "as_json",
-    is_flag=True,
-    show_default="print tables",
-    help="Print the summary as one JSON object on standard output, instead of tables; needs -o FILE.",
+    "Print the summary as one JSON object on standard output, instead of tables; needs -o FILE.",
+    without="print tables",
+    to="as_json",
 )
 
 

@@ -25,7 +25,7 @@ from neurocal_cli.errors import InputError
 )
 @plot_option("the heights of the board's points and their shifts")
 @summary_option
-@output_option("BOARD.yaml", "the board")
+@output_option("BOARD.yaml", "Write the board to this file.")
 def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
     """Write the board as it was found.
 

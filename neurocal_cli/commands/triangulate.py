@@ -8,12 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    FiniteNumber,
-    input_argument,
-    output_option,
-)
+from neurocal_cli.commands.options import Command, input_argument, number_option, output_option
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
@@ -38,22 +33,22 @@ _MANY_OFF = 0.5  # share of the points that no bad luck explains
     nargs=-1,
     required=True,
 )
-@click.option(
+@number_option(
     "--sigma",
-    type=FiniteNumber(positive=True),
-    metavar="PX",
-    show_default="the noise of the calibration's points",
-    help="Standard deviation of the pixels, in u and in v, for the covariances.",
+    "PX",
+    "Standard deviation of the pixels, in u and in v, for the covariances.",
+    without="the noise of the calibration's points",
+    positive=True,
 )
-@click.option(
+@number_option(
     "--epipolar-limit",
-    type=FiniteNumber(positive=True),
-    metavar="PX",
-    show_default="5 sigma",
-    help="Flag points whose pixels must be moved by more than this for their rays to meet.",
+    "PX",
+    "Flag points whose pixels must be moved by more than this for their rays to meet.",
+    without="5 sigma",
+    positive=True,
 )
 @summary_option
-@output_option("XYZ.csv", "the points")
+@output_option("XYZ.csv", "Write the points to this file.")
 def triangulate(
     inputs: tuple[str, ...], sigma: float | None, epipolar_limit: float | None, as_json: bool, output: str
 ) -> None:

@@ -8,11 +8,15 @@ import click
 
 from neurocal_cli.commands.options import (
     Command,
-    FiniteNumber,
     alpha_option,
     check_alpha,
+    choice_option,
+    count_option,
     input_argument,
     interpolation_option,
+    number_option,
+    output_option,
+    path_option,
 )
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import check_one_stdin, say
@@ -30,56 +34,41 @@ from neurocal_cli.errors import UsageError
     "images, file name patterns, or CSV files of points; - is points from standard input.",
     nargs=-1,
 )
-@click.option(
+@choice_option(
     "--to",
-    "shape",
-    type=click.Choice(["plane", "cylinder", "equirectangular"]),
-    default="plane",
-    help="What to project on. A plane keeps straight lines straight and shows less than 180 degrees; a "
+    "plane cylinder equirectangular",
+    "What to project on. A plane keeps straight lines straight and shows less than 180 degrees; a "
     "cylinder keeps vertical lines straight, and equirectangular shows all there is.",
+    default="plane",
+    to="shape",
 )
-@click.option(
+@number_option(
     "--fov",
-    metavar="DEG",
-    type=FiniteNumber(),
-    show_default="a plane keeps the scale of the middle, the others show the image from left to right",
-    help="Field of view of the result from left to right, in degrees.",
+    "DEG",
+    "Field of view of the result from left to right, in degrees.",
+    without="a plane keeps the scale of the middle, the others show the image from left to right",
 )
-@click.option(
+@count_option(
     "--size",
-    nargs=2,
-    type=click.IntRange(2, 32767),
-    metavar="W H",
-    show_default="that of the images",
-    help="Size of the result in pixels.",
+    "W H",
+    "Size of the result in pixels.",
+    without="that of the images",
+    least=2,
+    most=32767,
 )
 @alpha_option("keep the camera matrix")
 @interpolation_option
-@click.option(
+@path_option(
     "--camera",
-    "new_camera",
-    metavar="NEW.yaml",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Write the camera of the undistorted images to this file: a ROS camera_info without distortion, or "
+    "NEW.yaml",
+    "Write the camera of the undistorted images to this file: a ROS camera_info without distortion, or "
     "for --to cylinder and equirectangular the formula.",
+    to="new_camera",
 )
-@click.option(
-    "--maps",
-    metavar="FILE.npz",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Write the tables u and v for cv2.remap to this file.",
-)
+@path_option("--maps", "FILE.npz", "Write the tables u and v for cv2.remap to this file.")
 @summary_option
-@click.option(
-    "-o",
-    "--output",
-    metavar="DIR|FILE",
-    type=click.Path(writable=False, readable=False, allow_dash=True),
-    default="-",
-    show_default="standard output",
-    help="Write to this folder, under the names of the inputs. A single input may go to a file.",
+@output_option(
+    "DIR|FILE", "Write to this folder, under the names of the inputs. A single input may go to a file."
 )
 def undistort(
     camera: str,
