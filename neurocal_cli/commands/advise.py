@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from functools import partial
 
 import click
 
@@ -14,6 +14,7 @@ from neurocal_cli.commands.options import (
     json_option,
     plot_option,
 )
+from neurocal_cli.commands.pictures import write_plot
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.summaries import print_summary
 
@@ -50,10 +51,9 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     known = read_calibration(calibration)
     advice = weigh(known, count)
     if plot is not None:
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.planning.plots import draw_advice
 
-        write_whole(plot, draw_advice(advice, known, os.path.splitext(plot)[1][1:].lower()))
+        write_plot(plot, partial(draw_advice, advice, known))
     if as_json:
         print_summary(advice_json(advice))
     else:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
+from neurocal_cli.commands.given_camera import given_points
 from neurocal_cli.commands.options import (
     Command,
     camera_name_option,
@@ -19,7 +20,7 @@ from neurocal_cli.commands.pages import html_option, write_page
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
+from neurocal_cli.commands.streams import check_one_stdin, say, warn
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.plots import CAMERA_PANELS
@@ -97,34 +98,21 @@ def calibrate(
     estimation.check()
     check_summary(as_json, output)
     check_one_stdin(*points, *estimation.stdin_candidates)
-    _check_outputs(output, plots, camera_name)
+    check_camera_name(camera_name)
+    check_plots(plots, output)
     inputs = *points, estimation.intrinsics, estimation.extrinsics
     check_outputs((output, html, *(file for _, file in plots)), inputs)
-    calibration = _estimate(points, estimation, camera_name)
+    given, arguments = estimation.prepare(given_points(points))
+
+    from neurocal_cli.methods import calibrate as learn
+
+    with ProgressBar() as progress:
+        calibration = learn(given, **arguments, camera_name=camera_name, progress=progress)
     _write(calibration, output, plots, lean)
     write_page(html, calibration, *inputs)
     _report(calibration, as_json)
     if not calibration.converged:
         ctx.exit(_NOT_CONVERGED)
-
-
-def _check_outputs(output: str, plots: Plots, camera_name: str) -> None:
-    check_camera_name(camera_name)
-    check_plots(plots, output)
-
-
-def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) -> Calibration:
-    from neurocal_cli.io.points_csv import read_points
-
-    notes: list[str] = []
-    points = read_points(names, notes=notes)
-    note(notes)
-    points, arguments = estimation.prepare(points)
-
-    from neurocal_cli.methods import calibrate as learn
-
-    with ProgressBar() as progress:
-        return learn(points, **arguments, camera_name=camera_name, progress=progress)
 
 
 def _write(calibration: Calibration, output: str, plots: Plots, lean: bool) -> None:

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import click
 
+from neurocal_cli.commands.given_camera import given_points
 from neurocal_cli.commands.method_names import methods_option
 from neurocal_cli.commands.options import (
     Command,
@@ -20,9 +20,6 @@ from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
 from neurocal_cli.commands.summaries import print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
-
-if TYPE_CHECKING:
-    from neurocal_cli.points import Correspondences
 
 
 @click.command(cls=Command)
@@ -100,7 +97,9 @@ def compare(
     """  # noqa: D301 - as in the group
     check_one_stdin(points, right)
     compute_in_one_thread()
-    given = [_read(name, image_size) for name in (points, right) if name is not None]
+    given = [given_points([name]) for name in (points, right) if name is not None]
+    if image_size is not None:
+        given = [replace(one, image_size=image_size) for one in given]
 
     from neurocal_cli.comparison.compare import compare as compare_methods
     from neurocal_cli.comparison.report import comparison_json, comparison_report
@@ -109,16 +108,6 @@ def compare(
         found = compare_methods(given, methods, distortion, not no_skew, outliers, seed, progress)
     note(found.notes)
     if as_json:
-        values: dict[str, Any] = comparison_json(found)
-        print_summary(values)
+        print_summary(comparison_json(found))
     else:
         click.echo(comparison_report(found))
-
-
-def _read(name: str, image_size: tuple[int, int] | None) -> Correspondences:
-    from neurocal_cli.io.points_csv import read_points
-
-    notes: list[str] = []
-    points = read_points([name], notes=notes)
-    note(notes)
-    return points if image_size is None else replace(points, image_size=image_size)

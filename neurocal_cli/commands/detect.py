@@ -230,9 +230,9 @@ def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     """Tell of images of different sizes before any work: points of one camera are of one size."""
     from collections import Counter
 
-    from neurocal_cli.io.image_sizes import image_sizes
+    from neurocal_cli.io.image_headers import stated_sizes
 
-    sizes = Counter(size for size in image_sizes(paths) if size is not None)
+    sizes = Counter(size for size in stated_sizes(paths) if size is not None)
     if len(sizes) < 2 or sizes.most_common(2)[1][1] < _SECOND:
         return []
     counts = ", ".join(f"{count} of {w} x {h} px" for (w, h), count in sizes.most_common(4))

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.evaluate_stereo import stereo
-from neurocal_cli.commands.given_camera import calibration_or_camera
+from neurocal_cli.commands.given_camera import calibration_or_camera, given_points
 from neurocal_cli.commands.options import Command, input_argument, json_option
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_outputs
@@ -82,7 +82,7 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     check_one_stdin(calibration, points)
     check_plots(plots)
     check_outputs((file for _, file in plots), (calibration, points))
-    given = _read_points(points)
+    given = None if points is None else given_points([points])
     evaluation, verdict, judged = _evaluate(calibration, given)
     if plots:
         from neurocal_cli.plots.pages import draw_camera
@@ -92,17 +92,6 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
         write_plots(plots, lambda kind, panel: draw_camera(subject, kind, panel))
     _tell(evaluation)
     _show(evaluation, verdict, as_json)
-
-
-def _read_points(name: str | None) -> Correspondences | None:
-    if name is None:
-        return None
-    from neurocal_cli.io.points_csv import read_points
-
-    notes: list[str] = []
-    points = read_points([name], notes=notes)
-    note(notes)
-    return points
 
 
 def _evaluate(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import partial
 
 import click
 
@@ -24,16 +22,12 @@ from neurocal_cli.commands.options import (
     plot_option,
     seed_option,
 )
+from neurocal_cli.commands.pictures import write_plot
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
 from neurocal_cli.commands.threads import compute_in_one_thread
-
-if TYPE_CHECKING:
-    from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 _NOT_CONVERGED = 3
 _MOST_UNITS = 20
@@ -163,33 +157,11 @@ def fit(
     check_summary(as_json, output)
     check_plot(plot, output)
     check_outputs((output, plot), points)
-    learnt = _learn(points, distortion, training, camera, hidden, outliers, no_skew, target, seed)
-    _write(learnt, output, plot)
-    from neurocal_cli.zoom_lens.report import lens_json, lens_report
-
-    if as_json:
-        print_summary(lens_json(learnt))
-    else:
-        say(lens_report(learnt))
-    warn(learnt.warnings)
-    if not learnt.converged:
-        ctx.exit(_NOT_CONVERGED)
-
-
-def _learn(
-    points: tuple[str, ...],
-    distortion: str,
-    training: str,
-    camera: str,
-    hidden: tuple[int, int] | None,
-    outliers: str,
-    no_skew: bool,
-    target: str,
-    seed: int,
-) -> ZoomLens:
     from neurocal_cli.io.lens_points import read_lens_data
+    from neurocal_cli.io.lens_yaml import write_lens
     from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
     from neurocal_cli.zoom_lens.fit_points import fit_lens
+    from neurocal_cli.zoom_lens.report import lens_json, lens_report
 
     notes: list[str] = []
     data = read_lens_data(points, notes=notes)
@@ -197,31 +169,32 @@ def _learn(
     topologies = None if hidden is None else (hidden,)
     with ProgressBar() as progress:
         if isinstance(data, LensCameras):
-            return fit_lens_cameras(data, seed, topologies=topologies, progress=progress)
-        return fit_lens(
-            data,
-            distortion=distortion,
-            training=training,
-            outliers=outliers,
-            camera=camera,
-            skew=not no_skew,
-            seed=seed,
-            target=target,
-            topologies=topologies,
-            progress=progress,
-        )
-
-
-def _write(learnt: ZoomLens, output: str, plot: str | None) -> None:
-    """Write both files, the picture drawn before either is touched."""
-    from neurocal_cli.io.lens_yaml import write_lens
-
+            learnt = fit_lens_cameras(data, seed, topologies=topologies, progress=progress)
+        else:
+            learnt = fit_lens(
+                data,
+                distortion=distortion,
+                training=training,
+                outliers=outliers,
+                camera=camera,
+                skew=not no_skew,
+                seed=seed,
+                target=target,
+                topologies=topologies,
+                progress=progress,
+            )
     if plot is not None:
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.zoom_lens.plots import draw_lens
 
-        write_whole(plot, draw_lens(learnt, os.path.splitext(plot)[1][1:].lower()))
+        write_plot(plot, partial(draw_lens, learnt))
     write_lens(learnt, output)
+    if as_json:
+        print_summary(lens_json(learnt))
+    else:
+        say(lens_report(learnt))
+    warn(learnt.warnings)
+    if not learnt.converged:
+        ctx.exit(_NOT_CONVERGED)
 
 
 @lens.command(cls=Command)
@@ -324,10 +297,9 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
     if plot is not None:
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.zoom_lens.plots import draw_evaluation
 
-        write_whole(plot, draw_evaluation(evaluation, learnt.controls, os.path.splitext(plot)[1][1:].lower()))
+        write_plot(plot, partial(draw_evaluation, evaluation, learnt.controls))
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
     else:

@@ -51,7 +51,12 @@ def write_plots(plots: Plots, draw: Callable[[str, str | None], bytes]) -> None:
     draw : callable
         Gives a picture of a kind ("png") and of a panel.
     """
+    for panel, file in plots:
+        write_plot(file, lambda kind, panel=panel: draw(kind, panel))  # type: ignore[misc]
+
+
+def write_plot(file: str, draw: Callable[[str], bytes]) -> None:
+    """Draw and write a picture of the kind that its name ends in."""
     from neurocal_cli.io.writing import write_whole
 
-    for panel, file in plots:
-        write_whole(file, draw(os.path.splitext(file)[1][1:].lower(), panel))
+    write_whole(file, draw(os.path.splitext(file)[1][1:].lower()))

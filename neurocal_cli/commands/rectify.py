@@ -18,6 +18,7 @@ from neurocal_cli.commands.options import (
     json_option,
     output_option,
 )
+from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import each_of
 from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
 from neurocal_cli.commands.summaries import print_summary
@@ -99,7 +100,7 @@ def rectify(
     from neurocal_cli.io.image_paths import is_image
 
     sides = _sides(files)
-    _check_outputs(sides, output)
+    _check_folders(sides, output)
     found = _read_rig(rig)
     work = _Work(found, alpha, interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
@@ -132,13 +133,9 @@ def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return left, right
 
 
-def _check_outputs(sides: tuple[tuple[str, ...], tuple[str, ...]], output: str) -> None:
+def _check_folders(sides: tuple[tuple[str, ...], tuple[str, ...]], output: str) -> None:
     """Refuse to write over inputs."""
-    from neurocal_cli.io.outputs import held_back
-
-    held = held_back()
-    if held is not None:
-        held.protect(*sides[0], *sides[1])
+    check_outputs((), (*sides[0], *sides[1]))
     for side, paths in zip(_SIDES, sides, strict=True):
         folder = os.path.realpath(os.path.join(output, side))
         if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
@@ -186,8 +183,10 @@ class _Work:
 
         error = row_error_of_rig(self.rig, self.pair)
         if error is not None:
-            rows = "rows" if self.pair.axis == 0 else "columns"
-            self._tell(f"{rows} of the rig's own {error.n_points} points differ by {error.rms_px:.3g} px rms")
+            along = self.summary["along"]
+            self._tell(
+                f"{along} of the rig's own {error.n_points} points differ by {error.rms_px:.3g} px rms"
+            )
             self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
         verdict = self.rig.verdict
         if verdict is not None and verdict.word == "poor":
@@ -215,15 +214,14 @@ class _Work:
         for name, (path,), points in zip(_SIDES, sides, moved, strict=True):
             self._write(os.path.join(name, os.path.basename(path)), format_points(points))
         error = row_error(self.pair, moved[0], moved[1])
-        rows = "rows" if self.pair.axis == 0 else "columns"
         self.summary["points"] = {
             "n_points": error.n_points,
             "rms_px": number_or_none(error.rms_px),
             "max_px": number_or_none(error.max_px),
         }
         self._tell(
-            f"{rows} of the {error.n_points} points given differ by {error.rms_px:.3g} px rms, "
-            f"{error.max_px:.3g} px at most"
+            f"{self.summary['along']} of the {error.n_points} points given differ by {error.rms_px:.3g} px "
+            f"rms, {error.max_px:.3g} px at most"
         )
 
     def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
@@ -239,12 +237,12 @@ class _Work:
 
         pictures = []
         for remapping, path in zip(self._remappings(), pair, strict=True):
-            picture = read_picture(path)
-            note(f"{picture.source}: {text}" for text in picture.notes)
+            pixels, source, notes = read_picture(path)
+            note(f"{source}: {text}" for text in notes)
             try:
-                pictures.append(remapping(picture.pixels))
+                pictures.append(remapping(pixels))
             except InputError as error:
-                raise InputError(f"{picture.source}: {error}") from error
+                raise InputError(f"{source}: {error}") from error
         names = [os.path.splitext(os.path.basename(path))[0] for path in pair]
         for side, name, pixels in zip(_SIDES, names, pictures, strict=True):
             self._write(os.path.join(side, f"{name}.png"), encode_image(pixels, ".png"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -18,6 +19,7 @@ from neurocal_cli.commands.options import (
     path_option,
     plot_option,
 )
+from neurocal_cli.commands.pictures import write_plot
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import check_one_stdin, note
@@ -164,21 +166,44 @@ def simulate(
     """  # noqa: D301 - as in the group
     check_one_stdin(camera, board)
     _check(rates, save, images, (camera, board, views))
-    if plot is not None:
-        check_plot(plot, "-")
+    check_plot(plot, "-")
     check_outputs((plot,), (camera, board))
     compute_in_one_thread()
 
     from neurocal_cli.processes import usable_cores
 
-    processes = jobs or usable_cores()
+    jobs = jobs or usable_cores()
     if rates:
-        _rates(data_sets, seed, processes, plot, as_json)
+        _rates(data_sets, seed, jobs, plot, as_json)
         return
     scene, paper = _scene(camera, board, views, seed)
     if save is not None:
         _save(scene, save, sigma, seed, images)
-    _compare(scene, paper, sigma, trials, methods, random_starts, seed, processes, plot, as_json)
+    from neurocal_cli.simulation.noise import study_noise
+    from neurocal_cli.simulation.report import noise_json, simulation_tables, starts_json, text_of
+    from neurocal_cli.simulation.starts import study_starts
+
+    levels = tuple(sorted(set(sigma)))
+    with ProgressBar() as progress:
+        study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
+        starts = None
+        if random_starts:
+            try:
+                starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
+            except DegenerateGeometryError as error:
+                note([f"no random starts: {error}"])
+    if plot is not None:
+        from neurocal_cli.simulation.plots import draw_simulation
+
+        write_plot(plot, partial(draw_simulation, study, starts, scene.unit))
+    if as_json:
+        found: dict[str, Any] = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
+        found |= noise_json(study)
+        if starts is not None:
+            found["random_starts"] = starts_json(starts)
+        print_summary(found)
+    else:
+        click.echo(text_of(*simulation_tables(study, starts, paper)))
 
 
 def _check(rates: bool, save: str | None, images: bool, scene: tuple[object, ...]) -> None:
@@ -221,71 +246,20 @@ def _scene(
     return scenes.scene_of(camera, board, poses), False
 
 
-def _compare(
-    scene: SimulatedScene,
-    paper: bool,
-    sigma: tuple[float, ...],
-    trials: int,
-    methods: tuple[str, ...],
-    random_starts: int,
-    seed: int,
-    jobs: int,
-    plot: str | None,
-    as_json: bool,
-) -> None:
-    from neurocal_cli.simulation.noise import study_noise
-    from neurocal_cli.simulation.report import noise_json, simulation_tables, starts_json
-    from neurocal_cli.simulation.starts import study_starts
-
-    levels = tuple(sorted(set(sigma)))
-    with ProgressBar() as progress:
-        study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
-        starts = None
-        if random_starts:
-            try:
-                starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
-            except DegenerateGeometryError as error:
-                note([f"no random starts: {error}"])
-    if plot is not None:
-        from neurocal_cli.io.writing import write_whole
-        from neurocal_cli.simulation.plots import draw_simulation
-
-        write_whole(plot, draw_simulation(study, starts, scene.unit, _kind(plot)))
-    if as_json:
-        found: dict[str, Any] = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
-        found |= noise_json(study)
-        if starts is not None:
-            found["random_starts"] = starts_json(starts)
-        print_summary(found)
-    else:
-        _show(*simulation_tables(study, starts, paper))
-
-
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
     from neurocal_cli.simulation.rates import study_rates
-    from neurocal_cli.simulation.report import rates_json, rates_tables
+    from neurocal_cli.simulation.report import rates_json, rates_tables, text_of
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)
     if plot is not None:
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.simulation.plots import draw_rates
 
-        write_whole(plot, draw_rates(study, _kind(plot)))
+        write_plot(plot, partial(draw_rates, study))
     if as_json:
         print_summary(rates_json(study))
     else:
-        _show(*rates_tables(study))
-
-
-def _show(tables: list[tuple[str, list[list[str]]]], below: list[str]) -> None:
-    from neurocal_cli.simulation.report import text_of
-
-    click.echo(text_of(tables, below))
-
-
-def _kind(plot: str) -> str:
-    return os.path.splitext(plot)[1][1:].lower()
+        click.echo(text_of(*rates_tables(study)))
 
 
 def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: int, images: bool) -> None:

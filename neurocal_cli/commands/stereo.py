@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
+from neurocal_cli.commands.given_camera import given_points
 from neurocal_cli.commands.options import (
     Command,
     input_argument,
@@ -27,7 +28,6 @@ from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
 
 if TYPE_CHECKING:
-    from neurocal_cli.points import Correspondences
     from neurocal_cli.stereo.rig import Rig
 
 _NOT_CONVERGED = 3
@@ -127,7 +127,7 @@ def stereo(
     _check_outputs(output, ros)
     inputs = left, right, left_intrinsics, right_intrinsics
     check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
-    rig = _estimate((left, right), sides, estimation)
+    rig = _estimate((left, right), sides, estimation.outliers)
     _write(rig, output, alpha, ros, plots, lean)
     write_page(html, rig, *inputs)
     _report(rig, as_json)
@@ -165,29 +165,14 @@ def _check_outputs(output: str, ros: tuple[str, str] | None) -> None:
         raise UsageError("-o and --ros name the same file twice; give three different files")
 
 
-def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], estimation: Estimation) -> Rig:
-    from neurocal_cli.io.points_csv import read_points
-
-    points: list[Correspondences] = []
-    arguments = []
-    for name, side in zip(names, sides, strict=True):
-        notes: list[str] = []
-        one, given = side.prepare(read_points(name, notes=notes))
-        note(notes)
-        points.append(one)
-        arguments.append(given)
-
+def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], outliers: str) -> Rig:
+    (left, of_left), (right, of_right) = (
+        side.prepare(given_points(name)) for name, side in zip(names, sides, strict=True)
+    )
     from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
 
     with ProgressBar() as progress:
-        return calibrate_stereo(
-            points[0],
-            points[1],
-            arguments[0],
-            arguments[1],
-            outliers=estimation.outliers,
-            progress=progress,
-        )
+        return calibrate_stereo(left, right, of_left, of_right, outliers=outliers, progress=progress)
 
 
 def _write(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+from functools import partial
 
 import click
 
@@ -13,6 +13,7 @@ from neurocal_cli.commands.options import (
     output_option,
     plot_option,
 )
+from neurocal_cli.commands.pictures import write_plot
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import say
 from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
@@ -58,11 +59,9 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
             "--target free to find it"
         )
     if plot is not None:
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.target_plot import draw_target
 
-        kind = os.path.splitext(plot)[1][1:].lower()
-        write_whole(plot, draw_target(calibration.target, calibration.unit, kind))
+        write_plot(plot, partial(draw_target, calibration.target, calibration.unit))
     board = board_of(calibration.target, calibration.unit, calibration.points.distances)
     write_board(board, output)
     if as_json:

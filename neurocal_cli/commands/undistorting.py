@@ -92,15 +92,15 @@ class Undistorting:
     def _image(self, path: str, output: str) -> bytes:
         from neurocal_cli.io.images import encode_image, read_picture
 
-        picture = read_picture(path)
-        self.size = self.size or picture.size
+        pixels, source, notes = read_picture(path)
+        self.size = self.size or (pixels.shape[1], pixels.shape[0])
         remapping = self.remap()
         try:
-            corrected = remapping(picture.pixels)
+            corrected = remapping(pixels)
             content = encode_image(corrected, ".png" if output == "-" else os.path.splitext(output)[1])
         except InputError as error:
-            raise InputError(f"{picture.source}: {error}") from error
-        for text in picture.notes:
+            raise InputError(f"{source}: {error}") from error
+        for text in notes:
             self.notes.setdefault(text, []).append(path)
         return content
 

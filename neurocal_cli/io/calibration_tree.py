@@ -10,6 +10,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import FORMATS
 from neurocal_cli.io.distortion_names import own_length
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.named_entries import read_named
 from neurocal_cli.io.observations_yaml import read_observations
 from neurocal_cli.io.rejected_yaml import read_rejected
@@ -158,10 +159,8 @@ def distortion_from_field(root: Field) -> tuple[str, Array]:
     """Read the distortion model of a neurocal file, by our name, and its coefficients."""
     block = neurocal_block(root)
     model = block.get("distortion", "none").text()
-    try:
+    with value_failures(root.source, f"{block.path}.distortion: "):
         length = own_length(model)
-    except InputError as error:
-        raise FormatError(f"{block.path}.distortion: {error}", root.source) from error
     coefficients = root["distortion_coefficients"]["data"].array(-1)
     if len(coefficients) < length:
         root["distortion_coefficients"]["data"].fail(f"{length} numbers or more")

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING
 
-from neurocal_cli.errors import FormatError, NeurocalError
+from neurocal_cli.errors import FormatError, InputError, NeurocalError
 from neurocal_cli.io.outputs import held_back
 
 if TYPE_CHECKING:
@@ -102,6 +102,15 @@ def reading_failures(source: str) -> Iterator[None]:
         raise FormatError("may not be read; change its permissions", source) from error
     except (OSError, ValueError) as error:  # ValueError: a NUL in the path
         raise FormatError(f"cannot be read ({reason(error)}); check the path", source) from error
+
+
+@contextmanager
+def value_failures(source: str, where: str = "") -> Iterator[None]:
+    """Turn a value that cannot be used into a line about its file, and the place in it."""
+    try:
+        yield
+    except InputError as error:
+        raise FormatError(f"{where}{error}", source) from error
 
 
 def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli import __version__
 from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.target_yaml import read_target, target_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
@@ -67,10 +68,8 @@ def read_lens(path: str | Path) -> ZoomLens:
 
 def lens_from_field(root: Field) -> ZoomLens:
     """Read a lens from the tree of its file; see `read_lens`."""
-    try:
+    with value_failures(root.source):
         return _lens(root[_BLOCK])
-    except InputError as error:
-        raise FormatError(str(error), root.source) from error
 
 
 def _bool(value: bool) -> str:
@@ -223,10 +222,8 @@ def _positive(field: Field) -> float:
 def _parameter_names(block: Field, camera: str) -> tuple[tuple[str, ...], str]:
     """Names of the local parameters, which the kind of camera and the distortion model determine."""
     model = block["distortion"].text()
-    try:
+    with value_failures(block.source, f"{block.path}.distortion: "):
         coefficients = coefficient_names(model)
-    except InputError as error:
-        raise FormatError(f"{block.path}.distortion: {error}", block.source) from error
     names = tuple(block["parameters"].texts())
     t_z = ("t_z",) if camera == "still" or (camera == "known" and "t_z" in names) else ()
     expected = (*_CAMERA, *t_z, *coefficients)

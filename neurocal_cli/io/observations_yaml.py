@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.distances import Distance
-from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE, measured
 from neurocal_cli.io.text_columns import (
     LONGEST,
@@ -141,7 +141,7 @@ def read_observations(
     labels = {
         name: _labels(columns[name], observations, name) for name in ("view", "point") if name in columns
     }
-    try:
+    with value_failures(""):
         world, pixels = numbers(PLACE), numbers(PIXEL)
         known: dict[str, Any] = {
             attribute: numbers(names) for attribute, names in OPTIONAL.items() if set(names) <= set(columns)
@@ -158,8 +158,6 @@ def read_observations(
             unit=unit,
             source=observations.source,
         )
-    except InputError as error:
-        raise FormatError(str(error)) from error
 
 
 def _distances(field: Field) -> tuple[Distance, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Rejected
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.named_entries import named_lines, read_named
 from neurocal_cli.io.text_columns import numbers_of, read_table, table_lines
 from neurocal_cli.io.tree_fields import Field
@@ -60,7 +60,7 @@ def read_rejected(field: Field, unit: str) -> Rejected:
     if set(columns) - {"line", "point"} != {"view", *_NUMBERS}:
         field.fail(f"a table with view, {', '.join(_NUMBERS)}")
     numbers = numbers_of(columns, _NUMBERS, unknown=True)
-    try:
+    with value_failures(""):
         points = Correspondences(
             numbers[:3].T,
             numbers[3:5].T,
@@ -70,6 +70,4 @@ def read_rejected(field: Field, unit: str) -> Rejected:
             unit=unit,
             source=field.source,
         )
-    except InputError as error:
-        raise FormatError(str(error)) from error
     return Rejected(points, numbers[5], views)

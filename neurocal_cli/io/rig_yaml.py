@@ -16,6 +16,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.calibration_yaml import HEADER, calibration_lines
+from neurocal_cli.io.exchange.camera_set import METRES
 from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.verdict_yaml import read_verdict, verdict_lines
@@ -25,7 +26,6 @@ from neurocal_cli.stereo.rig import Rig
 
 FORMAT = 1  # of the stereo block; a change that older readers cannot follow makes it 2
 _GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
-_METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
 _SAME = 1e-6  # E, F and the baseline follow from R, t and the cameras; more means an edit of one
 
 
@@ -61,15 +61,15 @@ def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
     InputError
         A unit that is no length, or images without one known size.
     """
-    if rig.unit not in _METRES:
-        raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(_METRES)}")
+    if rig.unit not in METRES:
+        raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(METRES)}")
     rectified = rectify(rig, alpha)
     if rectified is None:
         raise InputError(
             "ROS's files need images of one known size; put image_size into both files of points"
         )
     metres = rectified.P2.copy()
-    metres[:, 3] *= _METRES[rig.unit]
+    metres[:, 3] *= METRES[rig.unit]
     sides = (rig.left, rectified.R1, rectified.P1), (rig.right, rectified.R2, metres)
     first, second = ("\n".join([*calibration_lines(camera, (R, P)), ""]) for camera, R, P in sides)
     return first, second

@@ -27,7 +27,7 @@ from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.exchange.dictionary import arrays_of
 from neurocal_cli.io.exchange.matlab import FIRST_PIXEL, unit_of
 from neurocal_cli.io.file_storage import parse_tree
-from neurocal_cli.io.files import decode, read_bytes
+from neurocal_cli.io.files import decode, read_bytes, value_failures
 from neurocal_cli.io.mat_file import read_variables
 from neurocal_cli.io.points_csv import read_points
 from neurocal_cli.io.tree_fields import Field
@@ -152,12 +152,12 @@ def _corners(
     views = len(pixels)
     names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
     if "view_names" in root:
-        names = [entry.text() for entry in root["view_names"].items()]
+        names = root["view_names"].texts()
         if len(names) != views or len(set(names)) < views:
             root["view_names"].fail(f"{views} different names")
     world = next((_stack(root[name], 3) for name in _WORLD if name in root), None)
     stated = root["unit"].text() if "unit" in root else unit
-    ids = [entry.text() for entry in root["points"].items()] if "points" in root else None
+    ids = root.read("points", Field.texts)
     if world is None:
         world, ids = _of_board(board, pixels.shape[1], field, down)
         stated = board.unit if board else stated
@@ -228,7 +228,7 @@ def _assembled(
     if not found.any():
         raise FormatError("holds no corner that was found; give another file", source)
     labels = ids if ids is not None else [str(k) for k in range(count)]
-    try:
+    with value_failures(""):
         return Correspondences(
             world[found],
             pixels[found],
@@ -237,8 +237,6 @@ def _assembled(
             unit=unit or "unknown",
             source=source,
         )
-    except InputError as error:
-        raise FormatError(str(error)) from error
 
 
 def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> Correspondences | None:
