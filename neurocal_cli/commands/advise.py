@@ -6,24 +6,17 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    check_plot,
-    count_option,
-    input_argument,
-    json_option,
-    plot_option,
-)
+from neurocal_cli.commands import options
 from neurocal_cli.commands.pictures import write_plot
 from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.streams import print_summary
 
 
-@click.command(cls=Command)
-@input_argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")
-@count_option("--next", "N", "Number of views to advise.", default=3, most=20, to="count")
-@plot_option("the outlines of these views")
-@json_option
+@click.command(cls=options.Command)
+@options.argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")
+@options.count("--next", "N", "Number of views to advise.", default=3, most=20, to="count")
+@options.plot("the outlines of these views")
+@options.json
 def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> None:
     """Advise which views of the target to photograph next.
 
@@ -42,7 +35,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal advise camera.yaml --next 2
       neurocal advise camera.yaml --plot next.png --json
     """  # noqa: D301 - as in the group
-    check_plot(plot, "-")
+    options.check_plot(plot, "-")
     check_outputs((plot,), (calibration,))
     from neurocal_cli.io.calibration_yaml import read_calibration
     from neurocal_cli.planning.advice import advise as weigh

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from neurocal_cli.commands.options import count_option, number_option, path_option
+from neurocal_cli.commands import options
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -30,8 +30,8 @@ def board_options(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
     def add(f: F) -> F:
         for option in reversed(
             (
-                path_option("--board", "BOARD.yaml", "Board file; a board may have several planes."),
-                count_option(
+                options.path("--board", "BOARD.yaml", "Board file; a board may have several planes."),
+                options.count(
                     "--cols",
                     "C",
                     "Number of inner vertices in a row of the board.",
@@ -39,10 +39,10 @@ def board_options(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
                     least=2,
                     most=1000,
                 ),
-                count_option(
+                options.count(
                     "--rows", "R", "Number of rows of inner vertices.", without="none", least=2, most=1000
                 ),
-                number_option("--square", "S", "Side length of a square.", without="none", positive=True),
+                options.number("--square", "S", "Side length of a square.", without="none", positive=True),
                 click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
             )
         ):

@@ -6,22 +6,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
 from neurocal_cli.commands.given_camera import given_points
-from neurocal_cli.commands.options import (
-    Command,
-    camera_name_option,
-    check_camera_name,
-    lean_option,
-    output_option,
-    points_argument,
-)
 from neurocal_cli.commands.pages import html_option, write_page
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.plots import CAMERA_PANELS
 
@@ -31,17 +23,17 @@ if TYPE_CHECKING:
 _NOT_CONVERGED = 3
 
 
-@click.command(cls=Command)
-@points_argument
+@click.command(cls=options.Command)
+@options.points
 @estimation_options
-@camera_name_option
+@options.camera_name
 @panels_option(
     "the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS
 )
 @html_option
-@lean_option
-@summary_option
-@output_option("CAMERA.yaml", "Write the calibration to this file.")
+@options.lean
+@options.summary
+@options.output("CAMERA.yaml", "Write the calibration to this file.")
 @click.pass_context
 def calibrate(
     ctx: click.Context,
@@ -98,7 +90,7 @@ def calibrate(
     estimation.check()
     check_summary(as_json, output)
     check_one_stdin(*points, *estimation.stdin_candidates)
-    check_camera_name(camera_name)
+    options.check_camera_name(camera_name)
     check_plots(plots, output)
     inputs = *points, estimation.intrinsics, estimation.extrinsics
     check_outputs((output, html, *(file for _, file in plots)), inputs)

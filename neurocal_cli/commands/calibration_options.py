@@ -7,15 +7,8 @@ from dataclasses import fields, replace
 from functools import wraps
 from typing import TYPE_CHECKING, Any
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.given_camera import given_camera
-from neurocal_cli.commands.options import (
-    choice_option,
-    count_option,
-    no_skew_option,
-    number_option,
-    path_option,
-    seed_option,
-)
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -158,15 +151,15 @@ class Estimation:
 
 def estimation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of `Estimation` to a command, which gets them as the keyword ``estimation``."""
-    return _collecting(command, [*_OPTIONS[:_BEFORE_GIVEN], *_GIVEN, *_OPTIONS[_BEFORE_GIVEN:]])
+    return _collecting(command, _OPTIONS)
 
 
 def estimation_options_without_files(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add all of them but the files of known cameras and poses."""
-    return _collecting(command, _OPTIONS)
+    return _collecting(command, [option for option in _OPTIONS if option not in _FILES])
 
 
-def _collecting(command: Callable[..., Any], options: list[Any]) -> Callable[..., Any]:
+def _collecting(command: Callable[..., Any], chosen: list[Any]) -> Callable[..., Any]:
     names = [field.name for field in fields(Estimation)]
 
     @wraps(command)
@@ -174,42 +167,41 @@ def _collecting(command: Callable[..., Any], options: list[Any]) -> Callable[...
         estimation = Estimation(**{name: kwargs.pop(name, None) for name in names})
         return command(*args, estimation=estimation, **kwargs)
 
-    for option in reversed(options):
+    for option in reversed(chosen):
         collected = option(collected)
     return collected
 
 
-_GIVEN = [
-    path_option(
+_FILES = [
+    options.path(
         "--intrinsics", "CAMERA.yaml", "With --type 3: the known camera, a neurocal, ROS or OpenCV file."
     ),
-    path_option(
+    options.path(
         "--extrinsics", "CAMERA.yaml", "With --type 4: a neurocal file with the known pose of each view."
     ),
 ]
 
-_BEFORE_GIVEN = 2  # options that come first in the help
 _OPTIONS = [
-    choice_option(
+    options.choice(
         "--type",
         "1 2 3 4",
         "What is known: 1 nothing, 2 the image centre, 3 the intrinsic parameters, 4 the poses.",
         default="1",
-        to="type",
     ),
-    number_option(
+    options.number(
         "--image-center",
         "U V",
         "With --type 2: the known image centre in pixels.",
         without="image_center in POINTS, else the middle of the image",
     ),
-    count_option(
+    *_FILES,
+    options.count(
         "--image-size",
         "W H",
         "Width and height of the images in pixels.",
         without="image_size in POINTS",
     ),
-    choice_option(
+    options.choice(
         "--method",
         "neuro linear nonlinear tsai",
         "Estimation method: neuro trains the network and refines its result by bundle adjustment. "
@@ -217,38 +209,38 @@ _OPTIONS = [
         "alignment; these three are for comparison, and use all points.",
         default="neuro",
     ),
-    choice_option(
+    options.choice(
         "--trainer",
         "lm backprop",
         "Training of the network: lm is Levenberg-Marquardt, backprop is the paper's back-propagation.",
         default="lm",
     ),
-    count_option(
+    options.count(
         "--starts",
         "N",
         "Maximum number of random starts. Training ends when two of them agree.",
         default=20,
         least=2,
     ),
-    seed_option,
-    count_option(
+    options.seed,
+    options.count(
         "--epochs", "N", "With --trainer backprop: maximum number of passes over the points.", without="50000"
     ),
-    number_option(
+    options.number(
         "--rate",
         "RATE",
         "With --trainer backprop: learning rate of the weights.",
         without="0.05",
         positive=True,
     ),
-    number_option(
+    options.number(
         "--rate-gamma",
         "RATE",
         "With --trainer backprop: learning rate of the scale factors gamma.",
         without="0.4",
         positive=True,
     ),
-    choice_option(
+    options.choice(
         "--distortion",
         "auto none k1 k1k2 k1k2p1p2 plumb_bob rational thin_prism tilted fisheye omnidir "
         "double_sphere eucm rich plumb-line",
@@ -261,15 +253,15 @@ _OPTIONS = [
         "plumb-line estimates k1, k2, p1 and p2 from the straight lines of the target alone.",
         default="auto",
     ),
-    no_skew_option,
-    choice_option(
+    options.no_skew,
+    options.choice(
         "--outliers",
         "reject keep",
         "Treatment of outliers, which are points or whole views that contradict the others: reject "
         "leaves them out and lists them, keep uses all points.",
         default="reject",
     ),
-    choice_option(
+    options.choice(
         "--target",
         "auto given flat free",
         "Where the points of the target are: given takes X, Y, Z as they are; free finds with the "

@@ -6,59 +6,52 @@ from dataclasses import replace
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.given_camera import given_points
 from neurocal_cli.commands.method_names import methods_option
-from neurocal_cli.commands.options import (
-    Command,
-    choice_option,
-    count_option,
-    flag_option,
-    input_argument,
-    json_option,
-)
+from neurocal_cli.commands.places import check_one_stdin
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.streams import note, print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
 
 
-@click.command(cls=Command)
-@input_argument("points", "POINTS.csv", "Points of a camera, as for calibrate; - is standard input.")
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument("points", "POINTS.csv", "Points of a camera, as for calibrate; - is standard input.")
+@options.argument(
     "right",
     "[RIGHT.csv]",
     "Points of a second camera, as for stereo: then points in space are compared too.",
     required=False,
 )
 @methods_option("neuro,nonlinear,linear,tsai,opencv")
-@choice_option(
+@options.choice(
     "--distortion",
     "auto none k1 k1k2 k1k2p1p2 plumb_bob rational fisheye",
     "Distortion model of all methods that can have it; auto is the one that neuro chooses. linear has "
     "none, tsai k1 alone.",
     default="auto",
 )
-@flag_option(
+@options.flag(
     "--no-skew",
     "Fix the angle between the image axes at 90 degrees, as tsai and opencv do anyway.",
     without="estimate the angle",
 )
-@choice_option(
+@options.choice(
     "--outliers",
     "reject keep",
     "Treatment of outliers: with reject, those that neuro finds are left out for all methods.",
     default="reject",
 )
-@count_option(
+@options.count(
     "--image-size",
     "W H",
     "Width and height of the images in pixels.",
     without="image_size in POINTS.csv",
 )
-@count_option(
+@options.count(
     "--seed", "S", "Seed of the random weights, and of the choice of points to leave out.", default=0, least=0
 )
-@json_option
+@options.json
 def compare(
     points: str,
     right: str | None,

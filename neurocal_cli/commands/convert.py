@@ -8,18 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.options import (
-    Command,
-    choice_option,
-    count_option,
-    flag_option,
-    input_argument,
-    output_option,
-)
-from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -30,8 +22,8 @@ if TYPE_CHECKING:
     from neurocal_cli.points import Correspondences
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "files",
     "FILE...",
     "A camera or a rig of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or a "
@@ -42,7 +34,7 @@ if TYPE_CHECKING:
     nargs=-1,
     required=True,
 )
-@choice_option(
+@options.choice(
     "--to",
     "neurocal opencv ros kalibr colmap mrcal matlab json npz",
     "Format to write.",
@@ -50,27 +42,27 @@ if TYPE_CHECKING:
     to="target",
     required=True,
 )
-@choice_option(
+@options.choice(
     "--model",
     "none k1 k1k2 k1k2p1p2 plumb_bob rational thin_prism tilted fisheye omnidir double_sphere eucm",
     "Write the nearest camera of this distortion model, and say how many pixels it is off.",
     without="the camera's own",
 )
-@flag_option(
+@options.flag(
     "--force",
     "If the format does not have the distortion model, write the nearest camera that it has.",
     without="refuse",
 )
 @board_options("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
-@count_option(
+@options.count(
     "--image-size",
     "W H",
     "Size of the images in pixels, if the file does not say.",
     without="as the file says",
     most=1_000_000,
 )
-@summary_option
-@output_option("FILE|DIR", "Write to this file; to this folder if the format needs several files.")
+@options.summary
+@options.output("FILE|DIR", "Write to this file; to this folder if the format needs several files.")
 def convert(
     files: tuple[str, ...],
     target: str,

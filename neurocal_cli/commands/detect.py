@@ -8,22 +8,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.frames import videos_as_frames
 from neurocal_cli.commands.one_size import of_one_size
-from neurocal_cli.commands.options import (
-    Command,
-    choice_option,
-    count_option,
-    input_argument,
-    number_option,
-    output_option,
-    path_option,
-)
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, complain, note, one_line, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.streams import complain, note, one_line, print_summary, say, some_of, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import NeurocalError, UsageError
 
@@ -37,8 +28,8 @@ if TYPE_CHECKING:
 _SECOND = 2  # images of another size, from which on it is no single one that strayed in
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "images",
     "IMAGE...",
     "Images of one camera (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits), folders of "
@@ -47,37 +38,37 @@ _SECOND = 2  # images of another size, from which on it is no single one that st
     required=True,
 )
 @board_options("Unit of --square. A board file names its own unit.")
-@choice_option(
+@options.choice(
     "--points",
     "midpoints edges vertices",
     "Points to measure: midpoints of the edges between inner vertices; edges, which adds those of the "
     "edges to the board's rim, for stiff boards with whole outer squares; or the inner vertices.",
     default="midpoints",
 )
-@number_option(
+@options.number(
     "--gamma",
     "G",
     "Gamma of the images, 2.2 for many cameras. The points are slightly more accurate if it is given.",
     without="unknown",
     positive=True,
 )
-@path_option("--overlay", "DIR", "Draw the detected points over each image and write it to DIR/VIEW.png.")
-@count_option(
+@options.path("--overlay", "DIR", "Draw the detected points over each image and write it to DIR/VIEW.png.")
+@options.count(
     "--jobs", "N", "Number of processes that examine images at the same time.", without="the number of cores"
 )
-@count_option(
+@options.count(
     "--frames",
     "N",
     "Number of frames that are taken of a video at most: sharp ones that differ from each other.",
     default=50,
 )
-@path_option(
+@options.path(
     "--cache",
     "DIR",
     "Keep what is found in each image in this folder, and look there first. The same image is found "
     "again under any name; a run that was stopped goes on.",
 )
-@number_option(
+@options.number(
     "--watch",
     "SECONDS",
     "Wait for more images, in folders and patterns, until none has come for so long or Ctrl-C is "
@@ -85,8 +76,8 @@ _SECOND = 2  # images of another size, from which on it is no single one that st
     without="no",
     positive=True,
 )
-@summary_option
-@output_option("POINTS.csv", "Write the points to this file.")
+@options.summary
+@options.output("POINTS.csv", "Write the points to this file.")
 def detect(
     images: tuple[str, ...],
     board: str | None,
@@ -264,7 +255,7 @@ def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool
     for name, outcome in outcomes:
         for text in outcome.notes:
             remarks.setdefault(text, []).append(name)
-    note(f"{_some(names)}: {text}" for text, names in remarks.items())
+    note(f"{some_of(names)}: {text}" for text, names in remarks.items())
     found = [outcome.detection for _, outcome in outcomes if outcome.detection is not None]
     warn(dict.fromkeys(text for detection in found for text in detection.warnings))
     warn(_another_board([outcome.shown for _, outcome in outcomes], board))
@@ -306,10 +297,6 @@ def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> lis
         f"most images show {size[0]} x {size[1]} inner vertices, and {plane.cols} x {plane.rows} were asked "
         "for; count inner vertices, not squares"
     ]
-
-
-def _some(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
 def _write(outcomes: Sequence[tuple[str, Outcome]], board: Board, overlay: str | None, output: str) -> None:

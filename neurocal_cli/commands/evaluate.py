@@ -6,13 +6,12 @@ from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.evaluate_stereo import stereo
 from neurocal_cli.commands.given_camera import calibration_or_camera, given_points
-from neurocal_cli.commands.options import Command, input_argument, json_option
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import check_one_stdin, note, warn
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.places import check_one_stdin, check_outputs
+from neurocal_cli.commands.streams import note, print_summary, warn
 from neurocal_cli.commands.tables import show
 from neurocal_cli.plots import CAMERA_PANELS
 
@@ -40,20 +39,20 @@ def evaluate() -> None:
 evaluate.add_command(stereo)
 
 
-@evaluate.command(cls=Command)
-@input_argument(
+@evaluate.command(cls=options.Command)
+@options.argument(
     "calibration",
     "CAMERA.yaml",
     "A calibration that neurocal wrote. With POINTS.csv also a ROS or OpenCV file; - is standard input.",
 )
-@input_argument(
+@options.argument(
     "points",
     "[POINTS.csv]",
     "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
 )
 @panels_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
-@json_option
+@options.json
 def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
 

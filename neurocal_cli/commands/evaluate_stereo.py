@@ -6,18 +6,11 @@ from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.given_camera import calibration_or_camera
-from neurocal_cli.commands.options import (
-    Command,
-    choice_option,
-    input_argument,
-    json_option,
-    path_option,
-)
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import check_one_stdin, note, warn
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.places import check_one_stdin, check_outputs
+from neurocal_cli.commands.streams import note, print_summary, warn
 from neurocal_cli.commands.tables import show
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import SPACE_PANELS
@@ -29,8 +22,8 @@ if TYPE_CHECKING:
     from neurocal_cli.stereo.rig import Rig
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "cameras",
     "LEFT.yaml RIGHT.yaml",
     "The calibrations of the left and the right camera, with --points also ROS or OpenCV files; "
@@ -38,13 +31,13 @@ if TYPE_CHECKING:
     nargs=-1,
     required=True,
 )
-@path_option(
+@options.path(
     "--points",
     "LEFT.csv RIGHT.csv",
     "Points of both cameras to evaluate them on.",
     without="the points of the calibrations",
 )
-@choice_option(
+@options.choice(
     "--method",
     "optimal linear midpoint",
     "Triangulation: optimal is least squares on the pixels, linear solves linear equations, midpoint "
@@ -52,7 +45,7 @@ if TYPE_CHECKING:
     default="optimal",
 )
 @panels_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
-@json_option
+@options.json
 def stereo(
     cameras: tuple[str, ...],
     points: tuple[str, str] | None,

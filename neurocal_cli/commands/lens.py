@@ -6,33 +6,17 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    camera_name_option,
-    check_camera_name,
-    check_plot,
-    choice_option,
-    count_option,
-    flag_option,
-    input_argument,
-    json_option,
-    no_skew_option,
-    number_option,
-    output_option,
-    plot_option,
-    seed_option,
-)
+from neurocal_cli.commands import options
 from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 
 _NOT_CONVERGED = 3
 _MOST_UNITS = 20
 
-_LENS = input_argument(
+_LENS = options.argument(
     "lens_file", "LENS.yaml", "A lens that `neurocal lens fit` wrote; - is standard input."
 )
 
@@ -52,8 +36,8 @@ def lens() -> None:
     """  # noqa: D301 - as in the group
 
 
-@lens.command(cls=Command)
-@input_argument(
+@lens.command(cls=options.Command)
+@options.argument(
     "points",
     "POINTS...",
     "CSV files of points with the columns zoom and/or focus, X,Y,Z,u,v and optionally view; or "
@@ -62,28 +46,28 @@ def lens() -> None:
     nargs=-1,
     required=True,
 )
-@choice_option(
+@options.choice(
     "--distortion",
     "auto none k1 k1k2 k1k2p1p2 plumb_bob rational fisheye",
     "Distortion model, with a network for each coefficient; none is a pinhole camera. auto chooses a "
     "richer model only if it lowers the cross-validation error over the settings.",
     default="auto",
 )
-@choice_option(
+@options.choice(
     "--training",
     "joint alternating",
     "Last step of the training: joint changes all weights at once, alternating trains the networks of "
     "the parameters and the calibrating network in turn, as in the paper.",
     default="joint",
 )
-@choice_option(
+@options.choice(
     "--camera",
     "auto still moving",
     "Motion of the camera relative to the target: still is none, moving estimates a pose for each view, "
     "auto is still if each setting has one view.",
     default="auto",
 )
-@count_option(
+@options.count(
     "--hidden",
     "N1 N2",
     "Size of each network: number of tanh units in the first layer, for each of zoom and focus, and in "
@@ -92,14 +76,14 @@ def lens() -> None:
     least=0,
     most=_MOST_UNITS,
 )
-@choice_option(
+@options.choice(
     "--outliers",
     "reject keep",
     "Treatment of settings that contradict the others: reject leaves them out, keep uses them all.",
     default="reject",
 )
-@no_skew_option
-@choice_option(
+@options.no_skew
+@options.choice(
     "--target",
     "auto given flat free",
     "Where the points of a board in several views are, the same at all settings: given takes X, Y, Z as "
@@ -107,10 +91,10 @@ def lens() -> None:
     "where the points ask for it.",
     default="auto",
 )
-@seed_option
-@plot_option("each parameter over the settings, with its uncertainty, and the errors")
-@summary_option
-@output_option("LENS.yaml", "Write the lens to this file.")
+@options.seed
+@options.plot("each parameter over the settings, with its uncertainty, and the errors")
+@options.summary
+@options.output("LENS.yaml", "Write the lens to this file.")
 @click.pass_context
 def fit(
     ctx: click.Context,
@@ -155,7 +139,7 @@ def fit(
     compute_in_one_thread()
     check_one_stdin(*points)
     check_summary(as_json, output)
-    check_plot(plot, output)
+    options.check_plot(plot, output)
     check_outputs((output, plot), points)
     from neurocal_cli.io.lens_points import read_lens_data
     from neurocal_cli.io.lens_yaml import write_lens
@@ -197,16 +181,16 @@ def fit(
         ctx.exit(_NOT_CONVERGED)
 
 
-@lens.command(cls=Command)
+@lens.command(cls=options.Command)
 @_LENS
-@number_option("--zoom", "Z", "Zoom setting of the camera.", without="none")
-@number_option("--focus", "F", "Focus setting of the camera.", without="none")
-@flag_option(
+@options.number("--zoom", "Z", "Zoom setting of the camera.", without="none")
+@options.number("--focus", "F", "Focus setting of the camera.", without="none")
+@options.flag(
     "--extrapolate", "Allow a setting outside the calibrated range.", without="refuse such a setting"
 )
-@camera_name_option
-@summary_option
-@output_option("CAMERA.yaml", "Write the calibration to this file.")
+@options.camera_name
+@options.summary
+@options.output("CAMERA.yaml", "Write the calibration to this file.")
 def camera(
     lens_file: str,
     zoom: float | None,
@@ -229,7 +213,7 @@ def camera(
           --camera-name tele --json -o tele.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
-    check_camera_name(camera_name)
+    options.check_camera_name(camera_name)
     check_summary(as_json, output)
     check_outputs((output,), (lens_file,))
     from neurocal_cli.io.calibration_yaml import write_calibration
@@ -252,15 +236,15 @@ def camera(
     warn(warnings)
 
 
-@lens.command(cls=Command)
+@lens.command(cls=options.Command)
 @_LENS
-@input_argument(
+@options.argument(
     "points",
     "POINTS.csv",
     "A CSV file of points at any settings, with the columns zoom and/or focus; - is standard input.",
 )
-@plot_option("the error over the settings, and the errors of the baseline models")
-@json_option
+@options.plot("the error over the settings, and the errors of the baseline models")
+@options.json
 def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> None:
     """Measure the reprojection error of a zoom lens.
 
@@ -282,7 +266,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     check_one_stdin(lens_file, points)
-    check_plot(plot, None)
+    options.check_plot(plot, None)
     check_outputs((plot,), (lens_file, points))
     from neurocal_cli.io.lens_points import read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens

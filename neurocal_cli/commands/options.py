@@ -1,4 +1,7 @@
-"""Arguments and options that several commands share, so that they cannot diverge."""
+"""Arguments and options of commands: the kinds that there are, and those that several commands share.
+
+Commands write them as ``@options.path(...)``, so that two with the same meaning cannot diverge.
+"""
 
 from __future__ import annotations
 
@@ -73,7 +76,7 @@ class FiniteNumber(FloatParamType):
         return number
 
 
-def path_option(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
+def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
     """An option that names a file or a folder, or as many as its metavar has words.
 
     In this and the following, `without` is what ``--help`` says of the option's absence.
@@ -81,14 +84,14 @@ def path_option(name: str, metavar: str, help: str, without: str = "none", **mor
     return _option(name, help, without, metavar=metavar, type=PATH, **more)
 
 
-def number_option(
+def number(
     name: str, metavar: str, help: str, without: str | None = None, *, positive: bool = False, **more: Any
 ) -> Callable[[F], F]:
     """An option that is a finite number, or as many as its metavar has words."""
     return _option(name, help, without, metavar=metavar, type=FiniteNumber(positive), **more)
 
 
-def count_option(
+def count(
     name: str,
     metavar: str,
     help: str,
@@ -102,14 +105,12 @@ def count_option(
     return _option(name, help, without, metavar=metavar, type=click.IntRange(least, most), **more)
 
 
-def choice_option(
-    name: str, words: str, help: str, without: str | None = None, **more: Any
-) -> Callable[[F], F]:
+def choice(name: str, words: str, help: str, without: str | None = None, **more: Any) -> Callable[[F], F]:
     """An option that is one of some words."""
     return _option(name, help, without, type=click.Choice(words.split()), **more)
 
 
-def flag_option(name: str, help: str, without: str = "no", **more: Any) -> Callable[[F], F]:
+def flag(name: str, help: str, without: str = "no", **more: Any) -> Callable[[F], F]:
     """An option without a value."""
     return _option(name, help, without, is_flag=True, **more)
 
@@ -131,12 +132,12 @@ def _option(
     return click.option(*names, *([] if to is None else [to]), help=help, **attributes)
 
 
-def input_argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
+def argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
     """Add an argument that names what is read."""
     return click.argument(name, metavar=metavar, type=PATH, cls=Argument, description=description, **more)
 
 
-points_argument = input_argument(
+points = argument(
     "points",
     "POINTS...",
     "CSV files with the columns X,Y,Z,u,v and optionally view. Several files are read as "
@@ -146,14 +147,14 @@ points_argument = input_argument(
 )
 
 
-def output_option(metavar: str, help: str, *, required: bool = False) -> Callable[[F], F]:
+def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], F]:
     """Add ``-o``, where the result goes; stdout unless it is given or has to be."""
     usual = {"required": True} if required else {"default": "-"}
     without = "required" if required else "standard output"
     return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
 
 
-camera_name_option = click.option(
+camera_name = click.option(
     "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
 )
 
@@ -169,9 +170,9 @@ def check_camera_name(name: str) -> None:
         raise UsageError("--camera-name must hold printable characters only; give another name")
 
 
-def alpha_option(default: str) -> Callable[[F], F]:
+def alpha(default: str) -> Callable[[F], F]:
     """Add ``--alpha``, how much of the original images is shown; see `check_alpha`."""
-    return number_option(
+    return number(
         "--alpha",
         "ALPHA",
         "Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
@@ -190,15 +191,15 @@ def check_alpha(alpha: float | None) -> None:
         raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
 
 
-seed_option = count_option(
+seed = count(
     "--seed", "S", "Seed of the random weights. The same seed gives the same output.", default=0, least=0
 )
 
-no_skew_option = flag_option(
+no_skew = flag(
     "--no-skew", "Fix the angle between the image axes at 90 degrees.", without="estimate the angle"
 )
 
-interpolation_option = choice_option(
+interpolation = choice(
     "--interpolation",
     "nearest linear cubic lanczos",
     "Interpolation between the pixels of an image.",
@@ -206,18 +207,21 @@ interpolation_option = choice_option(
 )
 
 
-json_option = flag_option(
-    "--json", "Print one JSON object instead of tables.", without="print tables", to="as_json"
+json = flag("--json", "Print one JSON object instead of tables.", without="print tables", to="as_json")
+
+summary = flag(
+    "--json",
+    "Print the summary as one JSON object on standard output, instead of tables; needs -o FILE.",
+    without="print tables",
+    to="as_json",
 )
 
-lean_option = flag_option(
-    "--lean", "Leave the points, the poses and the network out of the file, so that it is short."
-)
+lean = flag("--lean", "Leave the points, the poses and the network out of the file, so that it is short.")
 
 
-def plot_option(what: str) -> Callable[[F], F]:
+def plot(what: str) -> Callable[[F], F]:
     """Add ``--plot``, a picture of something; see `check_plot`."""
-    return path_option("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
+    return path("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
 
 
 def check_plot(plot: str | None, output: str | None = None) -> None:

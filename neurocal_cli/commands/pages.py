@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.options import path_option
+from neurocal_cli.commands import options
 from neurocal_cli.commands.streams import TYPED
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.stereo.rig import Rig
 
-html_option = path_option(
+html_option = options.path(
     "--html",
     "REPORT.html",
     "Also write the page that `neurocal report` makes, with this command and the SHA-256 of its inputs.",

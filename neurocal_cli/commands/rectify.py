@@ -8,20 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    alpha_option,
-    check_alpha,
-    flag_option,
-    input_argument,
-    interpolation_option,
-    json_option,
-    output_option,
-)
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands import options
+from neurocal_cli.commands.places import check_one_stdin, check_outputs
 from neurocal_cli.commands.progress import each_of
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -34,25 +24,27 @@ if TYPE_CHECKING:
 _SIDES = ("left", "right")
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "rig",
     "RIG.yaml",
     "A rig of neurocal, or of another program that neurocal convert reads; - is standard input.",
 )
-@input_argument(
+@options.argument(
     "files",
     "LEFT... RIGHT...",
     "Images of the left camera and as many of the right one, in the same order: files, file name "
     "patterns or one folder each. Or CSV files of points.",
     nargs=-1,
 )
-@alpha_option("not scaled")
-@interpolation_option
-@flag_option("--side-by-side", "Also write each pair as one picture with lines along the rows, to DIR/pairs.")
-@flag_option("--maps", "Also write DIR/maps.npz: tables for cv2.remap, and R1, R2, P1, P2, Q.")
-@json_option
-@output_option("DIR", "Write to the folders left and right in this folder.", required=True)
+@options.alpha("not scaled")
+@options.interpolation
+@options.flag(
+    "--side-by-side", "Also write each pair as one picture with lines along the rows, to DIR/pairs."
+)
+@options.flag("--maps", "Also write DIR/maps.npz: tables for cv2.remap, and R1, R2, P1, P2, Q.")
+@options.json
+@options.output("DIR", "Write to the folders left and right in this folder.", required=True)
 def rectify(
     rig: str,
     files: tuple[str, ...],
@@ -92,7 +84,7 @@ def rectify(
           --side-by-side --json -o pairs
     """  # noqa: D301 - as in the group
     check_one_stdin(rig, *files)
-    check_alpha(alpha)
+    options.check_alpha(alpha)
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
     if os.path.exists(output) and not os.path.isdir(output):

@@ -8,22 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.method_names import methods_option
-from neurocal_cli.commands.options import (
-    Command,
-    check_plot,
-    count_option,
-    flag_option,
-    json_option,
-    number_option,
-    path_option,
-    plot_option,
-)
 from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.places import check_one_stdin, check_outputs
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.streams import note, print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
@@ -36,7 +26,7 @@ _FLAT_VIEWS = 10
 _STARTS_SIGMA = 0.5  # px
 
 
-class _Command(Command):
+class _Command(options.Command):
     """A command that takes several values after --sigma, as in ``--sigma 0.5 1 2``."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -60,26 +50,26 @@ def _is_number(word: str) -> bool:
 
 
 @click.command(cls=_Command)
-@path_option(
+@options.path(
     "--camera",
     "CAMERA.yaml",
     "The true camera: a neurocal, ROS or OpenCV file. A neurocal file also brings its points and poses.",
     without="the camera of the paper's Table 1",
 )
-@path_option(
+@options.path(
     "--board",
     "BOARD.yaml",
     "The target, as for detect; the points are its mid-points.",
     without="two boards at a right angle, 440 points",
 )
-@count_option(
+@options.count(
     "--views",
     "N",
     "Number of random poses of the target. Without it, that of Table 1 or those of CAMERA.yaml.",
     without="1, and 10 of a flat board",
     most=1000,
 )
-@number_option(
+@options.number(
     "--sigma",
     "PX...",
     "Standard deviations of the noise in u and in v.",
@@ -88,38 +78,38 @@ def _is_number(word: str) -> bool:
     positive=True,
     multiple=True,
 )
-@count_option("--trials", "N", "Number of trials at each sigma, as in the paper.", default=50)
+@options.count("--trials", "N", "Number of trials at each sigma, as in the paper.", default=50)
 @methods_option(_DEFAULT_METHODS)
-@count_option(
+@options.count(
     "--random-starts",
     "N",
     "Number of single random starts of the network and of plain Levenberg-Marquardt; 0 leaves them out.",
     default=50,
     least=0,
 )
-@flag_option(
+@options.flag(
     "--rates",
     "Study the two learning rates of backprop instead, on many data sets.",
     without="noise and random starts",
 )
-@count_option("--data-sets", "N", "With --rates: number of data sets.", default=70)
-@count_option("--seed", "S", "Seed of everything that is random.", default=0, least=0)
-@count_option(
+@options.count("--data-sets", "N", "With --rates: number of data sets.", default=70)
+@options.count("--seed", "S", "Seed of everything that is random.", default=0, least=0)
+@options.count(
     "--jobs",
     "N",
     "Number of processes; the results are the same for any number.",
     without="the number of cores",
 )
-@path_option(
+@options.path(
     "--save", "DIR", "Write the true camera, its exact points and noisy points of each sigma to this folder."
 )
-@flag_option(
+@options.flag(
     "--images",
     "With --save: also write rendered images of the target, and the exact points that they show.",
     without="points only",
 )
-@plot_option("the errors over the noise and the random starts, or with --rates the rates,")
-@json_option
+@options.plot("the errors over the noise and the random starts, or with --rates the rates,")
+@options.json
 def simulate(
     camera: str | None,
     board: str | None,
@@ -166,7 +156,7 @@ def simulate(
     """  # noqa: D301 - as in the group
     check_one_stdin(camera, board)
     _check(rates, save, images, (camera, board, views))
-    check_plot(plot, "-")
+    options.check_plot(plot, "-")
     check_outputs((plot,), (camera, board))
     compute_in_one_thread()
 

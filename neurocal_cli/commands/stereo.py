@@ -8,21 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
 from neurocal_cli.commands.given_camera import given_points
-from neurocal_cli.commands.options import (
-    Command,
-    input_argument,
-    lean_option,
-    output_option,
-    path_option,
-)
 from neurocal_cli.commands.pages import html_option, write_page
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
@@ -33,16 +26,16 @@ if TYPE_CHECKING:
 _NOT_CONVERGED = 3
 
 
-@click.command(cls=Command)
-@input_argument("left", "LEFT.csv", "Points of the left camera; - is standard input.")
-@input_argument("right", "RIGHT.csv", "Points of the right camera.")
+@click.command(cls=options.Command)
+@options.argument("left", "LEFT.csv", "Points of the left camera; - is standard input.")
+@options.argument("right", "RIGHT.csv", "Points of the right camera.")
 @estimation_options_without_files
-@path_option(
+@options.path(
     "--left-intrinsics",
     "CAMERA.yaml",
     "The left camera, if it is known: a neurocal, ROS or OpenCV file. Only its poses are estimated.",
 )
-@path_option(
+@options.path(
     "--right-intrinsics", "CAMERA.yaml", "The right camera, if it is known. Only its poses are estimated."
 )
 @click.option(
@@ -53,16 +46,16 @@ _NOT_CONVERGED = 3
     help="Zoom of the rectified images: 0 shows valid pixels only, 1 shows all pixels of the original "
     "images.",
 )
-@path_option(
+@options.path(
     "--ros",
     "LEFT.yaml RIGHT.yaml",
     "Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
 @panels_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
 @html_option
-@lean_option
-@summary_option
-@output_option("RIG.yaml", "Write the rig to this file.")
+@options.lean
+@options.summary
+@options.output("RIG.yaml", "Write the rig to this file.")
 @click.pass_context
 def stereo(
     ctx: click.Context,

@@ -6,27 +6,20 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    check_plot,
-    input_argument,
-    output_option,
-    plot_option,
-)
+from neurocal_cli.commands import options
 from neurocal_cli.commands.pictures import write_plot
-from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import say
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.places import check_outputs, check_summary
+from neurocal_cli.commands.streams import print_summary, say
 from neurocal_cli.errors import InputError
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "camera", "CAMERA.yaml", "A calibration that `neurocal calibrate` wrote; - is standard input."
 )
-@plot_option("the heights of the board's points and their shifts")
-@summary_option
-@output_option("BOARD.yaml", "Write the board to this file.")
+@options.plot("the heights of the board's points and their shifts")
+@options.summary
+@options.output("BOARD.yaml", "Write the board to this file.")
 def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
     """Write the board as it was found.
 
@@ -43,7 +36,7 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
       neurocal target camera.yaml -o board.yaml --plot board.png --json
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
     """  # noqa: D301 - as in the group
-    check_plot(plot, output)
+    options.check_plot(plot, output)
     check_summary(as_json, output)
     check_outputs((output, plot), (camera,))
 

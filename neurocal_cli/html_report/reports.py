@@ -45,7 +45,7 @@ def calibration_page(
         f'<p class="soft">{escape(head + calibration.distortion_model)}</p>',
         verdict_block(calibration.verdict, _facts(calibration.verdict)),
         *_camera_parts(calibration, photographs or {}),
-        _repeat(_command(calibration), calibration, origin),
+        _repeat(f"neurocal calibrate POINTS.csv{_options(calibration)}", calibration, origin),
     ]
     return page(f"Calibration of {printable(calibration.camera_name)}", parts)
 
@@ -282,10 +282,6 @@ def _options(calibration: Calibration) -> str:
     if not calibration.intrinsics.skewed:
         options += " --no-skew"
     return f"{options} --seed {calibration.seed}"
-
-
-def _command(calibration: Calibration) -> str:
-    return f"neurocal calibrate POINTS.csv{_options(calibration)}"
 
 
 def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:

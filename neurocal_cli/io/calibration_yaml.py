@@ -99,7 +99,8 @@ def calibration_lines(
     by_rows : bool
         See `format_calibration`.
     """
-    long = not by_rows and _is_long(cal)
+    large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
+    long = large and not by_rows and alike(cal.views)
     yield from camera_info_lines(
         cal.camera_name, cal.image_size, cal.K, cal.distortion_model, cal.distortion, rectified
     )
@@ -117,10 +118,6 @@ def calibration_lines(
     if cal.straight_lines is not None:
         yield f"  straight_lines: {_straight_lines(cal.straight_lines)}"
     yield from (f"  {line}" for line in observation_lines(cal.points, long))
-
-
-def _is_long(cal: Calibration) -> bool:
-    return (len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS) and alike(cal.views)
 
 
 def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:

@@ -41,7 +41,8 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
         The file cannot be read: missing, a folder, not permitted.
     """
     if str(path) == "-":
-        return _read_stdin(), "<stdin>"
+        with _stdin_failures():
+            return sys.stdin.buffer.read(), "<stdin>"
     source = one_line(path)
     with reading_failures(source), open(path, "rb") as file:
         _protect(file)
@@ -153,11 +154,6 @@ def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "
         raise FormatError(
             f"byte 0x{data[error.start]:02x} is not UTF-8 text; save the file as UTF-8", source, line
         ) from error
-
-
-def _read_stdin() -> bytes:
-    with _stdin_failures():
-        return sys.stdin.buffer.read()
 
 
 @contextmanager

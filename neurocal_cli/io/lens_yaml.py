@@ -199,7 +199,10 @@ def _lens(block: Field) -> ZoomLens:
         free_theta=block["skew"].boolean(),
         counts=counts,
         rmse=rmse,
-        rejected=tuple(_rejected(field, len(controls)) for field in block["rejected"].items()),
+        rejected=tuple(
+            RejectedSetting(tuple(bad["setting"].array(len(controls)).tolist()), bad["reason"].text())
+            for bad in block["rejected"].items()
+        ),
         left_out_px=fit["left_out_px"].number_or_nan(),
         training=block["training"].text(),
         seed=block["seed"].integer(),
@@ -265,10 +268,6 @@ def _net(field: Field, D: int) -> ParameterNet:
 
 def _read_constants(field: Field) -> Constants:
     return Constants(field["theta"].number(), field["R"].array(3, 3), field["t"].array(2))
-
-
-def _rejected(field: Field, D: int) -> RejectedSetting:
-    return RejectedSetting(tuple(field["setting"].array(D).tolist()), field["reason"].text())
 
 
 def _table(field: Field, S: int, L: int, Q: int) -> Tables:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -110,13 +110,10 @@ def read_corners(
         return _separate(names, board, unit)
     if _TABLE.match(text):
         return read_points(names, notes=notes)
-    if text.lstrip()[:1] in ("{", "<", "%") or _names_points(text):
+    named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
+    if named or text.lstrip()[:1] in ("{", "<", "%"):
         return _dictionary(parse_tree(text, source), board, unit)
     return None
-
-
-def _names_points(text: str) -> bool:
-    return any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
 
 
 def _npy(data: bytes, source: str) -> Any:
@@ -163,7 +160,6 @@ def _corners(
         stated = board.unit if board else stated
     if world.shape[1] != pixels.shape[1] or len(world) not in (1, views):
         field.fail(f"{world.shape[1]} points in each view, as there are places on the board")
-    world = np.broadcast_to(world, (views, *world.shape[1:]))
     points = _assembled(world, pixels, names, ids, stated, root.source)
     return replace(points, image_size=image_size(root))
 
@@ -222,7 +218,7 @@ def _stack(field: Field, width: int) -> Array:
 def _assembled(
     world: Array, pixels: Array, names: list[str], ids: list[str] | None, unit: str | None, source: str
 ) -> Correspondences:
-    """Rows of all views; corners that are NaN were not found."""
+    """Rows of all views; corners that are NaN were not found. Places of one view are those of all."""
     views, count = pixels.shape[:2]
     found = np.isfinite(pixels).all(axis=2)
     if not found.any():
@@ -230,7 +226,7 @@ def _assembled(
     labels = ids if ids is not None else [str(k) for k in range(count)]
     with value_failures(""):
         return Correspondences(
-            world[found],
+            np.broadcast_to(world, (views, count, 3))[found],
             pixels[found],
             np.repeat(names, count).reshape(views, count)[found],
             point=np.tile(labels, views).reshape(views, count)[found],
@@ -243,7 +239,8 @@ def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> 
     tree = read_variables(data, source)
     if not any(name in tree for name in _IMAGE):
         return None
-    root = Field({name: _plain(value) for name, value in tree.items()}, source)
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in tree.items()}
+    root = Field(plain, source)
     field = next(name for name in _IMAGE if name in tree)
     if np.size(tree.get("ImageSize", ())) == 2:  # MATLAB's is height and width
         root.value["image_size"] = [int(side) for side in np.ravel(tree["ImageSize"])[::-1]]
@@ -275,10 +272,6 @@ def _matlab_board(tree: dict[str, Any], unit: str | None, source: str) -> Board 
     return Board((plane,), "mm" if "squareSizeInMM" in tree else unit or "unknown")
 
 
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
 def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
     """Read mrcal's table; a corner that was not found is ``-``, and each level doubles the sigma."""
     rows: dict[str, list[tuple[float, float, float]]] = {}
@@ -304,19 +297,10 @@ def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
         )
     stack = np.array(list(seen.values()))
     world, ids = _of_board(board, counts.pop(), Field(None, source, "the table"))
-    names = [Path(name).stem for name in seen]
-    names = names if len(set(names)) == len(names) else list(seen)
     # A negative level marks a corner that mrcal itself takes for an outlier.
     pixels = np.where(stack[:, :, 2:] < 0, np.nan, stack[:, :, :2])
     found = np.isfinite(pixels).all(axis=2)
-    points = _assembled(
-        np.broadcast_to(world, (len(stack), *world.shape[1:])),
-        pixels,
-        names,
-        ids,
-        board.unit if board else None,
-        source,
-    )
+    points = _assembled(world, pixels, _stems(seen), ids, board.unit if board else None, source)
     sigma = 2.0 ** stack[:, :, 2][found]
     if not (sigma > 1).any():
         return points
@@ -341,11 +325,13 @@ def _separate(names: list[str], board: Board | None, unit: str | None) -> Corres
             raise FormatError(
                 f"has {len(table)} rows of {table.shape[1]}; give {world.shape[1]} rows of u and v", name
             )
+    return _assembled(world, np.stack(tables), _stems(names), ids, stated, names[0])
+
+
+def _stems(names: Iterable[str]) -> list[str]:
+    """Names of files without folder and ending, where they still differ."""
     stems = [Path(name).stem for name in names]
-    labels = stems if len(set(stems)) == len(stems) else names
-    pixels = np.stack(tables)
-    world = np.broadcast_to(world, (len(tables), *world.shape[1:]))
-    return _assembled(world, pixels, labels, ids, stated, names[0])
+    return stems if len(set(stems)) == len(stems) else list(names)
 
 
 def _table(name: str) -> Array:
