@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import partial
 
 import click
 
@@ -16,9 +16,6 @@ from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.plots import CAMERA_PANELS
-
-if TYPE_CHECKING:
-    from neurocal_cli.calibration import Calibration
 
 _NOT_CONVERGED = 3
 
@@ -96,35 +93,23 @@ def calibrate(
     check_outputs((output, html, *(file for _, file in plots)), inputs)
     given, arguments = estimation.prepare(given_points(points))
 
+    from neurocal_cli.io.result_files import write_result
     from neurocal_cli.methods import calibrate as learn
+    from neurocal_cli.report import calibration_json, calibration_report
 
     with ProgressBar() as progress:
         calibration = learn(given, **arguments, camera_name=camera_name, progress=progress)
-    _write(calibration, output, plots, lean)
-    write_page(html, calibration, *inputs)
-    _report(calibration, as_json)
-    if not calibration.converged:
-        ctx.exit(_NOT_CONVERGED)
-
-
-def _write(calibration: Calibration, output: str, plots: Plots, lean: bool) -> None:
-    """Write all files."""
-    from neurocal_cli.io.result_files import write_result
-
     if plots:
         from neurocal_cli.plots.pages import draw_camera
         from neurocal_cli.plots.subject import Subject
 
-        subject = Subject.of(calibration)
-        write_plots(plots, lambda kind, panel: draw_camera(subject, kind, panel))
+        write_plots(plots, partial(draw_camera, Subject.of(calibration)))
     warn(write_result(calibration, output, lean=lean))
-
-
-def _report(calibration: Calibration, as_json: bool) -> None:
-    from neurocal_cli.report import calibration_json, calibration_report
-
+    write_page(html, calibration, *inputs)
     if as_json:
         print_summary(calibration_json(calibration))
     else:
         say(calibration_report(calibration))
     warn(calibration.warnings)
+    if not calibration.converged:
+        ctx.exit(_NOT_CONVERGED)

@@ -8,7 +8,6 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.given_camera import given_points
-from neurocal_cli.commands.method_names import methods_option
 from neurocal_cli.commands.places import check_one_stdin
 from neurocal_cli.commands.progress import ProgressBar
 from neurocal_cli.commands.streams import note, print_summary
@@ -23,7 +22,7 @@ from neurocal_cli.commands.threads import compute_in_one_thread
     "Points of a second camera, as for stereo: then points in space are compared too.",
     required=False,
 )
-@methods_option("neuro,nonlinear,linear,tsai,opencv")
+@options.methods("neuro,nonlinear,linear,tsai,opencv")
 @options.choice(
     "--distortion",
     "auto none k1 k1k2 k1k2p1p2 plumb_bob rational fisheye",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -87,10 +88,16 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
         from neurocal_cli.plots.pages import draw_camera
         from neurocal_cli.plots.subject import Subject
 
-        subject = Subject.of(judged, given, evaluation)
-        write_plots(plots, lambda kind, panel: draw_camera(subject, kind, panel))
+        write_plots(plots, partial(draw_camera, Subject.of(judged, given, evaluation)))
     _tell(evaluation)
-    _show(evaluation, verdict, as_json)
+    from neurocal_cli.report import evaluation_json, evaluation_report, evaluation_tables
+    from neurocal_cli.verdict.report import verdict_lines
+
+    if as_json:
+        print_summary(evaluation_json(evaluation, verdict))
+    else:
+        below = [] if verdict is None else verdict_lines(verdict)
+        show(evaluation_report(evaluation, verdict), evaluation_tables(evaluation), below)
 
 
 def _evaluate(
@@ -125,14 +132,3 @@ def _tell(evaluation: CameraEvaluation) -> None:
     if evaluation.on_target:
         note(["the points are taken where the calibration found them, not where their file has them"])
     warn(evaluation.warnings)
-
-
-def _show(evaluation: CameraEvaluation, verdict: Verdict | None, as_json: bool) -> None:
-    from neurocal_cli.report import evaluation_json, evaluation_report, evaluation_tables
-    from neurocal_cli.verdict.report import verdict_lines
-
-    if as_json:
-        print_summary(evaluation_json(evaluation, verdict))
-    else:
-        below = [] if verdict is None else verdict_lines(verdict)
-        show(evaluation_report(evaluation, verdict), evaluation_tables(evaluation), below)

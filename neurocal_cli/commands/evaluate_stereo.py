@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
@@ -92,15 +93,25 @@ def stereo(
     if plots:
         from neurocal_cli.plots.pages import draw_points_in_space
 
-        write_plots(plots, lambda kind, panel: draw_points_in_space(evaluation, rig, kind, panel))
-    from neurocal_cli.stereo.report import views_alone
+        write_plots(plots, partial(draw_points_in_space, evaluation, rig))
+    from neurocal_cli.stereo.report import (
+        stereo_evaluation_json,
+        stereo_evaluation_report,
+        stereo_evaluation_tables,
+        views_alone,
+    )
+    from neurocal_cli.verdict.report import verdict_lines
 
     note(views_alone(evaluation.alone))
     if evaluation.fitted:
         names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
         note([f"{names}: not in the calibrations; the poses are fitted with the cameras fixed"])
     warn(evaluation.warnings)
-    _show(evaluation, as_json)
+    if as_json:
+        print_summary(stereo_evaluation_json(evaluation))
+    else:
+        below = [] if evaluation.verdict is None else verdict_lines(evaluation.verdict)
+        show(stereo_evaluation_report(evaluation), stereo_evaluation_tables(evaluation), below)
 
 
 def _read_points(names: tuple[str, str] | None) -> tuple[Correspondences, Correspondences] | None:
@@ -143,18 +154,3 @@ def _camera(name: str, points: Correspondences) -> Calibration:
         return camera
     assert seen is not None
     return calibrate(seen, type=3, intrinsics=camera, outliers="keep")
-
-
-def _show(evaluation: StereoEvaluation, as_json: bool) -> None:
-    from neurocal_cli.stereo.report import (
-        stereo_evaluation_json,
-        stereo_evaluation_report,
-        stereo_evaluation_tables,
-    )
-    from neurocal_cli.verdict.report import verdict_lines
-
-    if as_json:
-        print_summary(stereo_evaluation_json(evaluation))
-    else:
-        below = [] if evaluation.verdict is None else verdict_lines(evaluation.verdict)
-        show(stereo_evaluation_report(evaluation), stereo_evaluation_tables(evaluation), below)

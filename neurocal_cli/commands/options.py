@@ -23,6 +23,10 @@ F = TypeVar("F", bound=Callable[..., Any])
 PATH = click.Path(readable=False, allow_dash=True)
 
 
+METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
+"""Those of `comparison.by_method`, which a test compares."""
+
+
 class Argument(click.Argument):
     """An argument that says what it is, in ``--help`` and in the man page."""
 
@@ -74,6 +78,21 @@ class FiniteNumber(FloatParamType):
         if self._positive and number <= 0:
             self.fail(f"{value!r} is not greater than 0.", param, ctx)
         return number
+
+
+class _MethodNames(click.ParamType):  # type: ignore[type-arg]
+    """Names of methods, separated by commas; a tuple without repetitions."""
+
+    name = "methods"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Split, or fail as click does."""
+        if isinstance(value, tuple):
+            return value
+        names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
+        if not names or any(name not in METHODS for name in names):
+            self.fail(f"{value!r} is not a list of {', '.join(METHODS)}.", param, ctx)
+        return names
 
 
 def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
@@ -189,6 +208,18 @@ def check_alpha(alpha: float | None) -> None:
     """
     if alpha is not None and not 0 <= alpha <= 1:
         raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
+
+
+def methods(default: str) -> Callable[[F], F]:
+    """Add ``--methods``, the methods to compare."""
+    return click.option(
+        "--methods",
+        metavar="M,...",
+        type=_MethodNames(),
+        default=default,
+        help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro "
+        "with the paper's trainer.",
+    )
 
 
 seed = count(

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from neurocal_cli.commands import options
-from neurocal_cli.commands.method_names import methods_option
 from neurocal_cli.commands.pictures import write_plot
 from neurocal_cli.commands.places import check_one_stdin, check_outputs
 from neurocal_cli.commands.progress import ProgressBar
@@ -79,7 +78,7 @@ def _is_number(word: str) -> bool:
     multiple=True,
 )
 @options.count("--trials", "N", "Number of trials at each sigma, as in the paper.", default=50)
-@methods_option(_DEFAULT_METHODS)
+@options.methods(_DEFAULT_METHODS)
 @options.count(
     "--random-starts",
     "N",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
 
 import click
 
@@ -19,9 +19,6 @@ from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
-
-if TYPE_CHECKING:
-    from neurocal_cli.stereo.rig import Rig
 
 _NOT_CONVERGED = 3
 
@@ -120,10 +117,35 @@ def stereo(
     _check_outputs(output, ros)
     inputs = left, right, left_intrinsics, right_intrinsics
     check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
-    rig = _estimate((left, right), sides, estimation.outliers)
-    _write(rig, output, alpha, ros, plots, lean)
+    (left_points, of_left), (right_points, of_right) = (
+        side.prepare(given_points(name)) for name, side in zip((left, right), sides, strict=True)
+    )
+    from neurocal_cli.io.result_files import write_result
+    from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
+    from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
+
+    with ProgressBar() as progress:
+        rig = calibrate_stereo(
+            left_points, right_points, of_left, of_right, outliers=estimation.outliers, progress=progress
+        )
+    if plots:
+        from neurocal_cli.plots.pages import draw_rig
+
+        write_plots(plots, partial(draw_rig, rig))
+    if ros is not None:
+        from neurocal_cli.io.rig_yaml import format_ros_pair
+        from neurocal_cli.io.writing import write_whole
+
+        for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
+            write_whole(name, text)
+    warn(write_result(rig, output, lean=lean, alpha=alpha))
     write_page(html, rig, *inputs)
-    _report(rig, as_json)
+    note(views_alone(rig.alone))
+    if as_json:
+        print_summary(rig_json(rig))
+    else:
+        say(rig_report(rig))
+    warn(rig.warnings)
     if not rig.converged:
         ctx.exit(_NOT_CONVERGED)
 
@@ -156,42 +178,3 @@ def _check_outputs(output: str, ros: tuple[str, str] | None) -> None:
     names = [os.path.realpath(name) for name in (output, *(ros or ())) if name != "-"]
     if len(set(names)) < len(names):
         raise UsageError("-o and --ros name the same file twice; give three different files")
-
-
-def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], outliers: str) -> Rig:
-    (left, of_left), (right, of_right) = (
-        side.prepare(given_points(name)) for name, side in zip(names, sides, strict=True)
-    )
-    from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-
-    with ProgressBar() as progress:
-        return calibrate_stereo(left, right, of_left, of_right, outliers=outliers, progress=progress)
-
-
-def _write(
-    rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plots: Plots, lean: bool
-) -> None:
-    """Write all files."""
-    from neurocal_cli.io.result_files import write_result
-    from neurocal_cli.io.rig_yaml import format_ros_pair
-    from neurocal_cli.io.writing import write_whole
-
-    if plots:
-        from neurocal_cli.plots.pages import draw_rig
-
-        write_plots(plots, lambda kind, panel: draw_rig(rig, kind, panel))
-    if ros is not None:
-        for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
-            write_whole(name, text)
-    warn(write_result(rig, output, lean=lean, alpha=alpha))
-
-
-def _report(rig: Rig, as_json: bool) -> None:
-    from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
-
-    note(views_alone(rig.alone))
-    if as_json:
-        print_summary(rig_json(rig))
-    else:
-        say(rig_report(rig))
-    warn(rig.warnings)

@@ -117,7 +117,7 @@ class Undistorting:
         if isinstance(new, Panorama):
             write_whole(path, format_panorama(new))
         else:
-            write_whole(path, format_camera_info(new.name, new.image_size or self.size, new.A))
+            write_whole(path, format_camera_info(replace(new, image_size=new.image_size or self.size)))
 
     def write_maps(self, path: str) -> None:
         """Write the tables, and the camera of the pictures that they make."""

@@ -28,7 +28,7 @@ from neurocal_cli.io.target_yaml import target_lines
 from neurocal_cli.io.text_columns import column_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
 from neurocal_cli.io.views_yaml import alike, view_lines
-from neurocal_cli.io.yaml_text import flow, flows, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import flow, flows, list_lines, mapping, number, quoted, text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -101,9 +101,7 @@ def calibration_lines(
     """
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
     long = large and not by_rows and alike(cal.views)
-    yield from camera_info_lines(
-        cal.camera_name, cal.image_size, cal.K, cal.distortion_model, cal.distortion, rectified
-    )
+    yield from camera_info_lines(cal.camera, rectified)
     yield "neurocal:"
     for lines in (
         _record_lines(cal, long),
@@ -160,9 +158,7 @@ def _parameter_lines(cal: Calibration) -> Iterator[str]:
         rmse_px=number(cal.rmse_px),
         max_px=number(cal.max_px),
     )
-    yield "warnings:" if cal.warnings else "warnings: []"
-    for warning in cal.warnings:
-        yield f"  - {quoted(warning)}"
+    yield from list_lines("warnings", map(quoted, cal.warnings))
 
 
 def _network_lines(network: NetworkRecord | None, long: bool) -> Iterator[str]:

@@ -19,32 +19,13 @@ from neurocal_cli.io.tree_fields import Field
 
 # Ours and ROS's first; a stereo file of OpenCV's sample has M1, D1 for the left camera.
 _MATRIX_KEYS = (
-    "camera_matrix",
-    "cameraMatrix",
-    "camera_Matrix",
-    "CameraMatrix",
-    "K",
-    "k",
-    "mtx",
-    "M",
-    "M1",
-    "intrinsic_matrix",
-    "intrinsics_matrix",
-)
+    "camera_matrix", "cameraMatrix", "camera_Matrix", "CameraMatrix", "K", "k", "mtx", "M", "M1",
+    "intrinsic_matrix", "intrinsics_matrix",
+)  # fmt: skip
 _DISTORTION_KEYS = (
-    "distortion_coefficients",
-    "distCoeffs",
-    "dist_coeffs",
-    "dist_coeff",
-    "dist_coefs",
-    "distortion_coeffs",
-    "DistCoeffs",
-    "distortion",
-    "dist",
-    "D",
-    "d",
-    "D1",
-)
+    "distortion_coefficients", "distCoeffs", "dist_coeffs", "dist_coeff", "dist_coefs", "distortion_coeffs",
+    "DistCoeffs", "distortion", "dist", "D", "d", "D1",
+)  # fmt: skip
 _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
 _SIZE_KEYS = ("imageSize", "image_size", "img_size", "resolution")

@@ -16,7 +16,7 @@ from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.target_yaml import read_target, target_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
-from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import read_yaml
 from neurocal_cli.zoom_lens.mlfn import Topology
 from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, ParameterNet
@@ -102,12 +102,11 @@ def _record_lines(lens: ZoomLens) -> Iterator[str]:
         variance=number(lens.variance),
     )
     yield f"scatter: {flow(lens.scatter)}"
-    yield "rejected:" if lens.rejected else "rejected: []"
-    for bad in lens.rejected:
-        yield f"  - {mapping(setting=flow(np.array(bad.setting)), reason=quoted(bad.reason))}"
-    yield "warnings:" if lens.warnings else "warnings: []"
-    for warning in lens.warnings:
-        yield f"  - {quoted(warning)}"
+    rejected = [
+        mapping(setting=flow(np.array(bad.setting)), reason=quoted(bad.reason)) for bad in lens.rejected
+    ]
+    yield from list_lines("rejected", rejected)
+    yield from list_lines("warnings", map(quoted, lens.warnings))
 
 
 def _coupling_lines(lens: ZoomLens) -> Iterator[str]:

@@ -34,26 +34,13 @@ from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.points import Correspondences
 
 _IMAGE = (
-    "image_points",
-    "imagePoints",
-    "imgpoints",
-    "img_points",
-    "imgPoints",
-    "ImagePoints",
-    "corners",
+    "image_points", "imagePoints", "imgpoints", "img_points", "imgPoints", "ImagePoints", "corners",
     "all_corners",
-)
+)  # fmt: skip
 _WORLD = (
-    "object_points",
-    "objectPoints",
-    "objpoints",
-    "obj_points",
-    "objPoints",
-    "grid_points",
-    "worldPoints",
-    "WorldPoints",
-    "world_points",
-)
+    "object_points", "objectPoints", "objpoints", "obj_points", "objPoints", "grid_points", "worldPoints",
+    "WorldPoints", "world_points",
+)  # fmt: skip
 _VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
 _TABLE = re.compile(r"\A(?:#[^\n]*\n|\s*\n)*[^\n#]*\bX\b[^\n]*\bv\b", re.IGNORECASE)
 _KALIBR = re.compile(r"\ACalibration results\s*\n=+\s*\n")
