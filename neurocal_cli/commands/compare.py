@@ -42,10 +42,7 @@ from neurocal_cli.commands.threads import compute_in_one_thread
     default="reject",
 )
 @options.count(
-    "--image-size",
-    "W H",
-    "Width and height of the images in pixels.",
-    without="image_size in POINTS.csv",
+    "--image-size", "W H", "Width and height of the images in pixels.", without="image_size in POINTS.csv"
 )
 @options.count(
     "--seed", "S", "Seed of the random weights, and of the choice of points to leave out.", default=0, least=0

@@ -28,12 +28,6 @@ _NUMBERS = re.compile(r"(?:[-+0-9.eE, ]|null)+").fullmatch
 _RANGES = re.compile(r"[0-9]{1,12}(?:-[0-9]{1,12})?(?:,[0-9]{1,12}(?:-[0-9]{1,12})?)*").fullmatch
 
 
-def number_texts(values: NDArray[Any]) -> list[str]:
-    """Write numbers as texts in quotes; ``null`` for what is not finite."""
-    words = number_words(values)
-    return [f"'{','.join(words[k : k + LONGEST])}'" for k in range(0, len(words), LONGEST)]
-
-
 def number_words(values: NDArray[Any]) -> list[str]:
     """Write each number as text; ``null`` for what is not finite."""
     flat = np.ravel(values)
@@ -43,7 +37,11 @@ def number_words(values: NDArray[Any]) -> list[str]:
 def column_lines(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Iterator[str]:
     """Lines of a table, one for each column: arrays as texts of numbers, labels one by one."""
     for name, values in columns.items():
-        parts = number_texts(values) if isinstance(values, np.ndarray) else map(quoted, values)
+        if isinstance(values, np.ndarray):
+            words = number_words(values)
+            parts = [f"'{','.join(words[k : k + LONGEST])}'" for k in range(0, len(words), LONGEST)]
+        else:
+            parts = list(map(quoted, values))
         yield f"{name}: [{', '.join(parts)}]"
 
 

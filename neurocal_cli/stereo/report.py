@@ -214,10 +214,10 @@ def _view_lines(rig: Rig) -> list[str]:
     rows = []
     for a, b in rig.pairs:
         left, right = rig.left.views[a], rig.right.views[b]
-        errors = left.rmse_px, right.rmse_px
-        label = printable(a if a == b else f"{a} / {b}")
-        rows.append((max(errors), [label, str(left.n_points), *map(_figure, errors[:1]),
-                                   str(right.n_points), _figure(errors[1])]))  # fmt: skip
+        cells = [printable(a if a == b else f"{a} / {b}")]
+        for view in (left, right):
+            cells += [str(view.n_points), _figure(view.rmse_px)]
+        rows.append((max(left.rmse_px, right.rmse_px), cells))
     hidden = len(rows) - _MOST_VIEWS
     if hidden > 0:
         rows = sorted(rows, key=lambda row: -row[0])[:_MOST_VIEWS]

@@ -17,16 +17,7 @@ _HALVINGS = 10
 
 
 class WidePointBatch:
-    """Some thousand points.
-
-    Parameters
-    ----------
-    cameras : two of Camera
-    rig : (3, 4, n) or (3, 4, 1) array
-        [R | t] of each point, or of all.
-    left, right : (2, n) arrays [px]
-    whitening : two of (3, n) array or None
-    """
+    """Some thousand points, from the same as a `PointBatch`."""
 
     def __init__(
         self,
