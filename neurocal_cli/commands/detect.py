@@ -135,8 +135,7 @@ def detect(
         )
     note([_rescaled(target)] if target.distances else [])
     target = target.as_measured()
-    strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
-    wanted = _wanted(target, points, gamma, overlay, cache, strict)
+    wanted = _wanted(target, points, gamma, overlay, cache)
     if watch is None:
         outcomes = _examined(images, wanted, board, output, overlay, jobs, frames)
     else:
@@ -156,7 +155,7 @@ def _rescaled(board: Board) -> str:
 
 
 def _wanted(
-    board: Board, points: str, gamma: float | None, overlay: str | None, cache: str | None, strict: bool
+    board: Board, points: str, gamma: float | None, overlay: str | None, cache: str | None
 ) -> DetectionOptions:
     from neurocal_cli.detection.batch import DetectionOptions
     from neurocal_cli.detection.memory import Memory
@@ -167,6 +166,7 @@ def _wanted(
     if cache is not None:
         _check_folder("--cache", cache)
         memory = Memory(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
+    strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
     return DetectionOptions(board, kind, gamma, overlay is not None, strict, memory)
 
 

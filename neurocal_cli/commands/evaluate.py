@@ -90,14 +90,13 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
 
         write_plots(plots, partial(draw_camera, Subject.of(judged, given, evaluation)))
     _tell(evaluation)
-    from neurocal_cli.report import evaluation_json, evaluation_report, evaluation_tables
+    from neurocal_cli.report import evaluation_json, evaluation_tables
     from neurocal_cli.verdict.report import verdict_lines
 
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
     else:
-        below = [] if verdict is None else verdict_lines(verdict)
-        show(evaluation_report(evaluation, verdict), evaluation_tables(evaluation), below)
+        show(evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
 
 
 def _evaluate(

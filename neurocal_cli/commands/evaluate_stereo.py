@@ -94,12 +94,7 @@ def stereo(
         from neurocal_cli.plots.pages import draw_points_in_space
 
         write_plots(plots, partial(draw_points_in_space, evaluation, rig))
-    from neurocal_cli.stereo.report import (
-        stereo_evaluation_json,
-        stereo_evaluation_report,
-        stereo_evaluation_tables,
-        views_alone,
-    )
+    from neurocal_cli.stereo.report import stereo_evaluation_json, stereo_evaluation_tables, views_alone
     from neurocal_cli.verdict.report import verdict_lines
 
     note(views_alone(evaluation.alone))
@@ -110,8 +105,8 @@ def stereo(
     if as_json:
         print_summary(stereo_evaluation_json(evaluation))
     else:
-        below = [] if evaluation.verdict is None else verdict_lines(evaluation.verdict)
-        show(stereo_evaluation_report(evaluation), stereo_evaluation_tables(evaluation), below)
+        verdict = evaluation.verdict
+        show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
 
 
 def _read_points(names: tuple[str, str] | None) -> tuple[Correspondences, Correspondences] | None:

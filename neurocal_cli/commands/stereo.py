@@ -10,7 +10,6 @@ import click
 
 from neurocal_cli.commands import options
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
-from neurocal_cli.commands.given_camera import given_points
 from neurocal_cli.commands.pages import html_option, write_page
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
 from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
@@ -117,17 +116,19 @@ def stereo(
     _check_outputs(output, ros)
     inputs = left, right, left_intrinsics, right_intrinsics
     check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
-    (left_points, of_left), (right_points, of_right) = (
-        side.prepare(given_points(name)) for name, side in zip((left, right), sides, strict=True)
-    )
+    from neurocal_cli.io.points_csv import read_points
     from neurocal_cli.io.result_files import write_result
     from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
     from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
 
+    prepared = []
+    for name, side in zip((left, right), sides, strict=True):
+        notes: list[str] = []
+        prepared.append(side.prepare(read_points(name, notes=notes)))
+        note(notes)
+    points, arguments = zip(*prepared, strict=True)
     with ProgressBar() as progress:
-        rig = calibrate_stereo(
-            left_points, right_points, of_left, of_right, outliers=estimation.outliers, progress=progress
-        )
+        rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
     if plots:
         from neurocal_cli.plots.pages import draw_rig
 

@@ -9,6 +9,7 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import FORMATS
+from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.distortion_names import own_length
 from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.named_entries import read_named
@@ -209,7 +210,7 @@ def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspon
     observations = block["observations"]
     unit = block.get("unit", "mm").text()
     center = block.read("image_center", lambda field: tuple(field.array(2).tolist()))
-    points = read_observations(observations, unit, _image_size(root), center, none)
+    points = read_observations(observations, unit, image_size(root), center, none)
     strange = set() if points.view is None else set(points.view_names) - views
     if strange:
         raise FormatError(
@@ -218,8 +219,3 @@ def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspon
             root.source,
         )
     return points
-
-
-def _image_size(root: Field) -> tuple[int, int] | None:
-    width, height = (root.get(key, 0).integer() for key in ("image_width", "image_height"))
-    return (width, height) if width and height else None

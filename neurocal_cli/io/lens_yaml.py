@@ -14,6 +14,7 @@ from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.target_yaml import read_target, target_lines
+from neurocal_cli.io.text_columns import table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
@@ -122,11 +123,10 @@ def _coupling(field: Field, S: int, size: int) -> Array:
 
 
 def _setting_lines(lens: ZoomLens) -> Iterator[str]:
+    columns = dict(zip(lens.controls, lens.settings.T, strict=True))
+    columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
     yield "settings:"
-    yield f"  columns: [{', '.join([*lens.controls, 'n_points', 'rmse_px'])}]"
-    yield "  rows:"
-    for setting, count, rmse in zip(lens.settings, lens.counts.tolist(), lens.rmse.tolist(), strict=True):
-        yield f"    - [{', '.join(map(number, setting.tolist()))}, {count}, {number(rmse)}]"
+    yield from (f"  {line}" for line in table_lines(columns, long=False, indent=2))
 
 
 def _member_lines(lens: ZoomLens) -> Iterator[str]:

@@ -86,6 +86,13 @@ class Field:
         """Take a list of texts."""
         return [entry.text() for entry in self.items()]
 
+    def names(self, count: int) -> list[str]:
+        """Take a list of so many different texts."""
+        texts = self.texts()
+        if len(texts) != count or len(set(texts)) < count:
+            self.fail(f"{count} different names")
+        return texts
+
     def number(self) -> float:
         """Take a finite number."""
         number = _as_float(self.value)

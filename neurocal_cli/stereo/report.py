@@ -20,14 +20,6 @@ _MOST_VIEWS = 20  # rows of a table that still fit on a screen
 _ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
 
 
-def stereo_evaluation_report(evaluation: StereoEvaluation) -> str:
-    """Summary of an evaluation as aligned text."""
-    blocks = [align(table) for table in stereo_evaluation_tables(evaluation)]
-    if evaluation.verdict is not None:
-        blocks.append(verdict_lines(evaluation.verdict))
-    return "\n\n".join("\n".join(block) for block in blocks)
-
-
 def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[str]], ...]:
     """Rows of the tables of all points, of the depths and of the views, each with its heading."""
     unit = evaluation.unit

@@ -136,9 +136,7 @@ def _corners(
     views = len(pixels)
     names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
     if "view_names" in root:
-        names = root["view_names"].texts()
-        if len(names) != views or len(set(names)) < views:
-            root["view_names"].fail(f"{views} different names")
+        names = root["view_names"].names(views)
     world = next((_stack(root[name], 3) for name in _WORLD if name in root), None)
     stated = root["unit"].text() if "unit" in root else unit
     ids = root.read("points", Field.texts)

@@ -112,9 +112,7 @@ def _poses(root: Field) -> dict[str, Pose]:
         return {}
     names = [f"{number}" for number in range(1, len(rows) + 1)]
     if "view_names" in root:
-        names = root["view_names"].texts()
-    if len(names) != len(rows) or len(set(names)) < len(names):
-        root["view_names"].fail(f"{len(rows)} different names")
+        names = root["view_names"].names(len(rows))
     return {name: Pose(from_vector(row[:3]), row[3:]) for name, row in zip(names, rows, strict=True)}
 
 
