@@ -125,14 +125,6 @@ def _surveyed_line(target: Target, unit: str) -> str:
     )
 
 
-def evaluation_report(evaluation: CameraEvaluation, verdict: Verdict | None = None) -> str:
-    """Summary of an evaluation as aligned text."""
-    blocks = [align(table) for table in evaluation_tables(evaluation)]
-    if verdict is not None:
-        blocks.append(verdict_lines(verdict))
-    return "\n\n".join("\n".join(block) for block in blocks)
-
-
 def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], list[list[str]]]:
     """Rows, the heading first, of the table of all points and of the table of views."""
     e = evaluation

@@ -17,8 +17,8 @@ from rich.console import Console
 from support.command_line import run
 
 from neurocal_cli.commands import tables
+from neurocal_cli.io.image_headers import stated_sizes
 from neurocal_cli.io.image_paths import find_images, natural_order
-from neurocal_cli.io.image_sizes import image_sizes
 
 SAMPLES = Path(__file__).parents[1] / "sample_data"
 
@@ -54,7 +54,7 @@ def test_images_of_different_sizes_are_named_before_the_work(tmp_path: Path) -> 
     for name, size in (("a.png", (30, 40)), ("b.jpg", (40, 30)), ("c.jpg", (60, 80)), ("d.png", (60, 80))):
         cv2.imwrite(str(tmp_path / name), np.zeros(size, np.uint8))
     (tmp_path / "e.png").write_bytes(b"\x89PNG")
-    found = list(image_sizes([*map(str, sorted(tmp_path.iterdir())), "-", "none.png"]))
+    found = list(stated_sizes([*map(str, sorted(tmp_path.iterdir())), "-", "none.png"]))
     assert found == [(40, 30), (40, 30), (80, 60), (80, 60), None, None, None]
     result = run("detect", tmp_path, "--cols", 9, "--rows", 6, "--square", 25, "--jobs", 1)
     assert result.stderr.startswith("note: the images have 2 sizes (2 of 40 x 30 px, 2 of 80 x 60 px)")

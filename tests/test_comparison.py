@@ -12,7 +12,7 @@ from support.real_data import RealFiles
 from support.scenes import random_flat_set, table_1
 
 from neurocal_cli import Correspondences, calibrate, read_points, write_points
-from neurocal_cli.commands import method_names
+from neurocal_cli.commands import options
 from neurocal_cli.comparison.by_method import METHODS, calibrate_with
 from neurocal_cli.comparison.compare import compare
 
@@ -32,7 +32,7 @@ def noisy() -> Correspondences:
 
 
 def test_the_names_of_the_option_are_those_of_the_methods() -> None:
-    assert method_names.NAMES == METHODS
+    assert options.METHODS == METHODS
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -20,7 +20,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.pipeline.fit import fit
 from neurocal_cli.stereo import stretch_covariance
-from neurocal_cli.stereo.adjust import adjust_rig
+from neurocal_cli.stereo.adjust import RigFit, adjust_rig
 from neurocal_cli.stereo.pairing import pair_views
 from neurocal_cli.stereo.problem import rig_problem
 from neurocal_cli.stereo.stretch_covariance import stretched_rig
@@ -86,7 +86,7 @@ def test_a_rig_follows_a_stretch_as_a_fit_anew_does(monkeypatch: pytest.MonkeyPa
     free = np.concatenate([stretch_covariance.estimated_parameters(c) for c in (left, right)] + [[True] * 6])
     adjusted = adjust_rig(problem.frames, problem.observations, problem.start(scene.rig), free)
     only(0, monkeypatch, stretch_covariance)
-    found = stretched_rig(problem, (left, right), adjusted, free)
+    found = stretched_rig(RigFit(problem, (left, right), adjusted, free))
     assert found is not None
     stretch = np.eye(3) + EPS * stretches(left.points.world)[0]
     observations = [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -176,7 +177,7 @@ def test_an_image_and_its_points_agree(shape: str) -> None:
 @pytest.fixture
 def camera(tmp_path: Path) -> Path:
     cam = wide_camera("double_sphere")
-    lines = camera_info_lines("wide", SIZE, cam.A, cam.distortion.model, cam.distortion.coefficients)
+    lines = camera_info_lines(replace(cam, image_size=SIZE, name="wide"))
     (tmp_path / "wide.yaml").write_text("\n".join([*lines, ""]))
     return tmp_path / "wide.yaml"
 

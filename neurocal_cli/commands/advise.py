@@ -2,33 +2,21 @@
 
 from __future__ import annotations
 
-import os
+from functools import partial
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    check_plot,
-    input_argument,
-    json_option,
-    plot_option,
-)
+from neurocal_cli.commands import options
+from neurocal_cli.commands.pictures import write_plot
 from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.streams import print_summary
 
 
-@click.command(cls=Command)
-@input_argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")
-@click.option(
-    "--next",
-    "count",
-    metavar="N",
-    type=click.IntRange(1, 20),
-    default=3,
-    help="Number of views to advise.",
-)
-@plot_option("the outlines of these views")
-@json_option
+@click.command(cls=options.Command)
+@options.argument("calibration", "CAMERA.yaml", "A calibration that neurocal wrote; - is standard input.")
+@options.count("--next", "N", "Number of views to advise.", default=3, most=20, to="count")
+@options.plot("the outlines of these views")
+@options.json
 def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> None:
     """Advise which views of the target to photograph next.
 
@@ -47,7 +35,7 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
       neurocal advise camera.yaml --next 2
       neurocal advise camera.yaml --plot next.png --json
     """  # noqa: D301 - as in the group
-    check_plot(plot, "-")
+    options.check_plot(plot, "-")
     check_outputs((plot,), (calibration,))
     from neurocal_cli.io.calibration_yaml import read_calibration
     from neurocal_cli.planning.advice import advise as weigh
@@ -56,10 +44,9 @@ def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> Non
     known = read_calibration(calibration)
     advice = weigh(known, count)
     if plot is not None:
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.planning.plots import draw_advice
 
-        write_whole(plot, draw_advice(advice, known, os.path.splitext(plot)[1][1:].lower()))
+        write_plot(plot, partial(draw_advice, advice, known))
     if as_json:
         print_summary(advice_json(advice))
     else:

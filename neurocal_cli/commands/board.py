@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.options import Command, FiniteNumber, json_option
 from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import say, warn
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 _ENDINGS = (".svg", ".pdf", ".png")
 
 
-@click.command(cls=Command)
+@click.command(cls=options.Command)
 @board_options("Unit of --square. A board file names its own unit.")
 @click.option(
     "--paper",
@@ -29,24 +28,15 @@ _ENDINGS = (".svg", ".pdf", ".png")
     default="A4",
     help="Paper: A0 to A5, letter, legal, tabloid, or its width and height in mm, such as 420x297.",
 )
-@click.option(
-    "--dpi",
-    metavar="N",
-    type=FiniteNumber(positive=True),
-    default=300,
-    show_default="300",
-    help="Resolution of a PNG in pixels per inch.",
+@options.number(
+    "--dpi", "N", "Resolution of a PNG in pixels per inch.", without="300", default=300, positive=True
 )
-@click.option(
-    "-o",
-    "--output",
-    metavar="BOARD.pdf",
+@options.output(
+    "BOARD.pdf",
+    "Write the target to this .pdf, .svg or .png file, and the board file beside it.",
     required=True,
-    type=click.Path(writable=False, readable=False),
-    show_default="required",
-    help="Write the target to this .pdf, .svg or .png file, and the board file beside it.",
 )
-@json_option
+@options.json
 def board(
     board: str | None,
     cols: int | None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from neurocal_cli.commands.options import INPUT, FiniteNumber
+from neurocal_cli.commands import options
 from neurocal_cli.errors import UsageError
 
 if TYPE_CHECKING:
@@ -30,34 +30,19 @@ def board_options(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
     def add(f: F) -> F:
         for option in reversed(
             (
-                click.option(
-                    "--board",
-                    metavar="BOARD.yaml",
-                    type=INPUT,
-                    show_default="none",
-                    help="Board file; a board may have several planes.",
-                ),
-                click.option(
+                options.path("--board", "BOARD.yaml", "Board file; a board may have several planes."),
+                options.count(
                     "--cols",
-                    metavar="C",
-                    type=_VERTICES,
-                    show_default="none",
-                    help="Number of inner vertices in a row of the board.",
+                    "C",
+                    "Number of inner vertices in a row of the board.",
+                    without="none",
+                    least=2,
+                    most=1000,
                 ),
-                click.option(
-                    "--rows",
-                    metavar="R",
-                    type=_VERTICES,
-                    show_default="none",
-                    help="Number of rows of inner vertices.",
+                options.count(
+                    "--rows", "R", "Number of rows of inner vertices.", without="none", least=2, most=1000
                 ),
-                click.option(
-                    "--square",
-                    metavar="S",
-                    type=FiniteNumber(positive=True),
-                    show_default="none",
-                    help="Side length of a square.",
-                ),
+                options.number("--square", "S", "Side length of a square.", without="none", positive=True),
                 click.option("--unit", metavar="UNIT", show_default=unit_default, help=unit_help),
             )
         ):

@@ -2,45 +2,35 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import partial
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options
-from neurocal_cli.commands.options import (
-    Command,
-    camera_name_option,
-    check_camera_name,
-    lean_option,
-    output_option,
-    points_argument,
-)
+from neurocal_cli.commands.given_camera import given_points
 from neurocal_cli.commands.pages import html_option, write_page
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.streams import print_summary, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.plots import CAMERA_PANELS
-
-if TYPE_CHECKING:
-    from neurocal_cli.calibration import Calibration
 
 _NOT_CONVERGED = 3
 
 
-@click.command(cls=Command)
-@points_argument
+@click.command(cls=options.Command)
+@options.points
 @estimation_options
-@camera_name_option
+@options.camera_name
 @panels_option(
     "the residuals, the coverage, the uncertainty, the poses and the learning curve", CAMERA_PANELS
 )
 @html_option
-@lean_option
-@summary_option
-@output_option("CAMERA.yaml", "the calibration")
+@options.lean
+@options.summary
+@options.output("CAMERA.yaml", "Write the calibration to this file.")
 @click.pass_context
 def calibrate(
     ctx: click.Context,
@@ -97,54 +87,29 @@ def calibrate(
     estimation.check()
     check_summary(as_json, output)
     check_one_stdin(*points, *estimation.stdin_candidates)
-    _check_outputs(output, plots, camera_name)
+    options.check_camera_name(camera_name)
+    check_plots(plots, output)
     inputs = *points, estimation.intrinsics, estimation.extrinsics
     check_outputs((output, html, *(file for _, file in plots)), inputs)
-    calibration = _estimate(points, estimation, camera_name)
-    _write(calibration, output, plots, lean)
-    write_page(html, calibration, *inputs)
-    _report(calibration, as_json)
-    if not calibration.converged:
-        ctx.exit(_NOT_CONVERGED)
+    given, arguments = estimation.prepare(given_points(points))
 
-
-def _check_outputs(output: str, plots: Plots, camera_name: str) -> None:
-    check_camera_name(camera_name)
-    check_plots(plots, output)
-
-
-def _estimate(names: tuple[str, ...], estimation: Estimation, camera_name: str) -> Calibration:
-    from neurocal_cli.io.points_csv import read_points
-
-    notes: list[str] = []
-    points = read_points(names, notes=notes)
-    note(notes)
-    points, arguments = estimation.prepare(points)
-
+    from neurocal_cli.io.result_files import write_result
     from neurocal_cli.methods import calibrate as learn
+    from neurocal_cli.report import calibration_json, calibration_report
 
     with ProgressBar() as progress:
-        return learn(points, **arguments, camera_name=camera_name, progress=progress)
-
-
-def _write(calibration: Calibration, output: str, plots: Plots, lean: bool) -> None:
-    """Write all files."""
-    from neurocal_cli.io.result_files import write_result
-
+        calibration = learn(given, **arguments, camera_name=camera_name, progress=progress)
     if plots:
         from neurocal_cli.plots.pages import draw_camera
         from neurocal_cli.plots.subject import Subject
 
-        subject = Subject.of(calibration)
-        write_plots(plots, lambda kind, panel: draw_camera(subject, kind, panel))
+        write_plots(plots, partial(draw_camera, Subject.of(calibration)))
     warn(write_result(calibration, output, lean=lean))
-
-
-def _report(calibration: Calibration, as_json: bool) -> None:
-    from neurocal_cli.report import calibration_json, calibration_report
-
+    write_page(html, calibration, *inputs)
     if as_json:
         print_summary(calibration_json(calibration))
     else:
         say(calibration_report(calibration))
     warn(calibration.warnings)
+    if not calibration.converged:
+        ctx.exit(_NOT_CONVERGED)

@@ -7,10 +7,8 @@ from dataclasses import fields, replace
 from functools import wraps
 from typing import TYPE_CHECKING, Any
 
-import click
-
+from neurocal_cli.commands import options
 from neurocal_cli.commands.given_camera import given_camera
-from neurocal_cli.commands.options import INPUT, FiniteNumber
 from neurocal_cli.commands.streams import note, warn
 from neurocal_cli.errors import UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -153,15 +151,15 @@ class Estimation:
 
 def estimation_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options of `Estimation` to a command, which gets them as the keyword ``estimation``."""
-    return _collecting(command, [*_OPTIONS[:_BEFORE_GIVEN], *_GIVEN, *_OPTIONS[_BEFORE_GIVEN:]])
+    return _collecting(command, _OPTIONS)
 
 
 def estimation_options_without_files(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add all of them but the files of known cameras and poses."""
-    return _collecting(command, _OPTIONS)
+    return _collecting(command, [option for option in _OPTIONS if option not in _FILES])
 
 
-def _collecting(command: Callable[..., Any], options: list[Any]) -> Callable[..., Any]:
+def _collecting(command: Callable[..., Any], chosen: list[Any]) -> Callable[..., Any]:
     names = [field.name for field in fields(Estimation)]
 
     @wraps(command)
@@ -169,153 +167,107 @@ def _collecting(command: Callable[..., Any], options: list[Any]) -> Callable[...
         estimation = Estimation(**{name: kwargs.pop(name, None) for name in names})
         return command(*args, estimation=estimation, **kwargs)
 
-    for option in reversed(options):
+    for option in reversed(chosen):
         collected = option(collected)
     return collected
 
 
-_GIVEN = [
-    click.option(
-        "--intrinsics",
-        type=INPUT,
-        metavar="CAMERA.yaml",
-        show_default="none",
-        help="With --type 3: the known camera, a neurocal, ROS or OpenCV file.",
+_FILES = [
+    options.path(
+        "--intrinsics", "CAMERA.yaml", "With --type 3: the known camera, a neurocal, ROS or OpenCV file."
     ),
-    click.option(
-        "--extrinsics",
-        type=INPUT,
-        metavar="CAMERA.yaml",
-        show_default="none",
-        help="With --type 4: a neurocal file with the known pose of each view.",
+    options.path(
+        "--extrinsics", "CAMERA.yaml", "With --type 4: a neurocal file with the known pose of each view."
     ),
 ]
 
-_BEFORE_GIVEN = 2  # options that come first in the help
 _OPTIONS = [
-    click.option(
+    options.choice(
         "--type",
-        "type",
-        type=click.Choice(["1", "2", "3", "4"]),
+        "1 2 3 4",
+        "What is known: 1 nothing, 2 the image centre, 3 the intrinsic parameters, 4 the poses.",
         default="1",
-        help="What is known: 1 nothing, 2 the image centre, 3 the intrinsic parameters, 4 the poses.",
     ),
-    click.option(
+    options.number(
         "--image-center",
-        type=FiniteNumber(),
-        nargs=2,
-        metavar="U V",
-        show_default="image_center in POINTS, else the middle of the image",
-        help="With --type 2: the known image centre in pixels.",
+        "U V",
+        "With --type 2: the known image centre in pixels.",
+        without="image_center in POINTS, else the middle of the image",
     ),
-    click.option(
+    *_FILES,
+    options.count(
         "--image-size",
-        type=click.IntRange(min=1),
-        nargs=2,
-        metavar="W H",
-        show_default="image_size in POINTS",
-        help="Width and height of the images in pixels.",
+        "W H",
+        "Width and height of the images in pixels.",
+        without="image_size in POINTS",
     ),
-    click.option(
+    options.choice(
         "--method",
-        type=click.Choice(["neuro", "linear", "nonlinear", "tsai"]),
-        default="neuro",
-        help="Estimation method: neuro trains the network and refines its result by bundle adjustment. "
+        "neuro linear nonlinear tsai",
+        "Estimation method: neuro trains the network and refines its result by bundle adjustment. "
         "linear is a closed form, nonlinear is Levenberg-Marquardt from it, tsai is two-stage radial "
         "alignment; these three are for comparison, and use all points.",
+        default="neuro",
     ),
-    click.option(
+    options.choice(
         "--trainer",
-        type=click.Choice(["lm", "backprop"]),
+        "lm backprop",
+        "Training of the network: lm is Levenberg-Marquardt, backprop is the paper's back-propagation.",
         default="lm",
-        help="Training of the network: lm is Levenberg-Marquardt, backprop is the paper's back-propagation.",
     ),
-    click.option(
+    options.count(
         "--starts",
-        type=click.IntRange(min=2),
-        metavar="N",
+        "N",
+        "Maximum number of random starts. Training ends when two of them agree.",
         default=20,
-        help="Maximum number of random starts. Training ends when two of them agree.",
+        least=2,
     ),
-    click.option(
-        "--seed",
-        type=click.IntRange(min=0),
-        metavar="S",
-        default=0,
-        help="Seed of the random weights. The same seed gives the same output.",
+    options.seed,
+    options.count(
+        "--epochs", "N", "With --trainer backprop: maximum number of passes over the points.", without="50000"
     ),
-    click.option(
-        "--epochs",
-        type=click.IntRange(min=1),
-        metavar="N",
-        show_default="50000",
-        help="With --trainer backprop: maximum number of passes over the points.",
-    ),
-    click.option(
+    options.number(
         "--rate",
-        type=FiniteNumber(positive=True),
-        metavar="RATE",
-        show_default="0.05",
-        help="With --trainer backprop: learning rate of the weights.",
+        "RATE",
+        "With --trainer backprop: learning rate of the weights.",
+        without="0.05",
+        positive=True,
     ),
-    click.option(
+    options.number(
         "--rate-gamma",
-        type=FiniteNumber(positive=True),
-        metavar="RATE",
-        show_default="0.4",
-        help="With --trainer backprop: learning rate of the scale factors gamma.",
+        "RATE",
+        "With --trainer backprop: learning rate of the scale factors gamma.",
+        without="0.4",
+        positive=True,
     ),
-    click.option(
+    options.choice(
         "--distortion",
-        type=click.Choice(
-            # As `MODELS`, which --help does not wait for.
-            [
-                "auto",
-                "none",
-                "k1",
-                "k1k2",
-                "k1k2p1p2",
-                "plumb_bob",
-                "rational",
-                "thin_prism",
-                "tilted",
-                "fisheye",
-                "omnidir",
-                "double_sphere",
-                "eucm",
-                "rich",
-                "plumb-line",
-            ]
-        ),
-        default="auto",
-        help="Distortion model, with coefficients as in OpenCV; none is a pinhole camera. thin_prism and "
+        "auto none k1 k1k2 k1k2p1p2 plumb_bob rational thin_prism tilted fisheye omnidir "
+        "double_sphere eucm rich plumb-line",
+        "Distortion model, with coefficients as in OpenCV; none is a pinhole camera. thin_prism and "
         "tilted are OpenCV's models of 12 and 14 coefficients. fisheye, omnidir, double_sphere and eucm are "
         "for wide lenses, also beyond 180 degrees. rich is a fisheye with a smooth displacement of the "
         "image, for lenses that no other model describes. auto chooses from none to rational and fisheye, "
         "by cross-validation error and number of coefficients, and takes rich only where it predicts views "
         "left out decidedly better. "
         "plumb-line estimates k1, k2, p1 and p2 from the straight lines of the target alone.",
-    ),
-    click.option(
-        "--no-skew",
-        is_flag=True,
-        show_default="estimate the angle",
-        help="Fix the angle between the image axes at 90 degrees.",
-    ),
-    click.option(
-        "--outliers",
-        type=click.Choice(["reject", "keep"]),
-        default="reject",
-        help="Treatment of outliers, which are points or whole views that contradict the others: reject "
-        "leaves them out and lists them, keep uses all points.",
-    ),
-    click.option(
-        "--target",
-        type=click.Choice(["auto", "given", "flat", "free"]),
         default="auto",
-        help="Where the points of the target are: given takes X, Y, Z as they are; free finds with the "
+    ),
+    options.no_skew,
+    options.choice(
+        "--outliers",
+        "reject keep",
+        "Treatment of outliers, which are points or whole views that contradict the others: reject "
+        "leaves them out and lists them, keep uses all points.",
+        default="reject",
+    ),
+    options.choice(
+        "--target",
+        "auto given flat free",
+        "Where the points of the target are: given takes X, Y, Z as they are; free finds with the "
         "camera how the target is bent and printed, which takes 3 views or more; flat does so within its "
         "plane; auto finds it where the points ask for it. Points with columns sX, sY, sZ are found by these "
         "standard deviations, unless given.",
+        default="auto",
     ),
 ]

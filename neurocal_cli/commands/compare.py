@@ -3,65 +3,51 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.method_names import methods_option
-from neurocal_cli.commands.options import Command, input_argument, json_option
+from neurocal_cli.commands import options
+from neurocal_cli.commands.given_camera import given_points
+from neurocal_cli.commands.places import check_one_stdin
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.streams import note, print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
 
-if TYPE_CHECKING:
-    from neurocal_cli.points import Correspondences
 
-
-@click.command(cls=Command)
-@input_argument("points", "POINTS.csv", "Points of a camera, as for calibrate; - is standard input.")
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument("points", "POINTS.csv", "Points of a camera, as for calibrate; - is standard input.")
+@options.argument(
     "right",
     "[RIGHT.csv]",
     "Points of a second camera, as for stereo: then points in space are compared too.",
     required=False,
 )
-@methods_option("neuro,nonlinear,linear,tsai,opencv")
-@click.option(
+@options.methods("neuro,nonlinear,linear,tsai,opencv")
+@options.choice(
     "--distortion",
-    type=click.Choice(["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye"]),
-    default="auto",
-    help="Distortion model of all methods that can have it; auto is the one that neuro chooses. linear has "
+    "auto none k1 k1k2 k1k2p1p2 plumb_bob rational fisheye",
+    "Distortion model of all methods that can have it; auto is the one that neuro chooses. linear has "
     "none, tsai k1 alone.",
+    default="auto",
 )
-@click.option(
+@options.flag(
     "--no-skew",
-    is_flag=True,
-    show_default="estimate the angle",
-    help="Fix the angle between the image axes at 90 degrees, as tsai and opencv do anyway.",
+    "Fix the angle between the image axes at 90 degrees, as tsai and opencv do anyway.",
+    without="estimate the angle",
 )
-@click.option(
+@options.choice(
     "--outliers",
-    type=click.Choice(["reject", "keep"]),
+    "reject keep",
+    "Treatment of outliers: with reject, those that neuro finds are left out for all methods.",
     default="reject",
-    help="Treatment of outliers: with reject, those that neuro finds are left out for all methods.",
 )
-@click.option(
-    "--image-size",
-    type=click.IntRange(min=1),
-    nargs=2,
-    metavar="W H",
-    show_default="image_size in POINTS.csv",
-    help="Width and height of the images in pixels.",
+@options.count(
+    "--image-size", "W H", "Width and height of the images in pixels.", without="image_size in POINTS.csv"
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    metavar="S",
-    default=0,
-    help="Seed of the random weights, and of the choice of points to leave out.",
+@options.count(
+    "--seed", "S", "Seed of the random weights, and of the choice of points to leave out.", default=0, least=0
 )
-@json_option
+@options.json
 def compare(
     points: str,
     right: str | None,
@@ -100,7 +86,9 @@ def compare(
     """  # noqa: D301 - as in the group
     check_one_stdin(points, right)
     compute_in_one_thread()
-    given = [_read(name, image_size) for name in (points, right) if name is not None]
+    given = [given_points([name]) for name in (points, right) if name is not None]
+    if image_size is not None:
+        given = [replace(one, image_size=image_size) for one in given]
 
     from neurocal_cli.comparison.compare import compare as compare_methods
     from neurocal_cli.comparison.report import comparison_json, comparison_report
@@ -109,16 +97,6 @@ def compare(
         found = compare_methods(given, methods, distortion, not no_skew, outliers, seed, progress)
     note(found.notes)
     if as_json:
-        values: dict[str, Any] = comparison_json(found)
-        print_summary(values)
+        print_summary(comparison_json(found))
     else:
         click.echo(comparison_report(found))
-
-
-def _read(name: str, image_size: tuple[int, int] | None) -> Correspondences:
-    from neurocal_cli.io.points_csv import read_points
-
-    notes: list[str] = []
-    points = read_points([name], notes=notes)
-    note(notes)
-    return points if image_size is None else replace(points, image_size=image_size)

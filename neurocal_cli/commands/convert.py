@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.board_options import board_options, given_board
-from neurocal_cli.commands.options import Command, input_argument
-from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import InputError, UsageError
 
 if TYPE_CHECKING:
@@ -22,16 +21,9 @@ if TYPE_CHECKING:
     from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.points import Correspondences
 
-_FORMATS = ("neurocal", "opencv", "ros", "kalibr", "colmap", "mrcal", "matlab", "json", "npz")
-_MODELS = (
-    "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir",
-    "double_sphere", "eucm",
-)  # fmt: skip
-_SIZE = click.IntRange(1, 1_000_000)
 
-
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "files",
     "FILE...",
     "A camera or a rig of neurocal, ROS, OpenCV, Kalibr, COLMAP, mrcal, MATLAB or BoofCV, or a "
@@ -42,45 +34,35 @@ _SIZE = click.IntRange(1, 1_000_000)
     nargs=-1,
     required=True,
 )
-@click.option(
+@options.choice(
     "--to",
-    "target",
+    "neurocal opencv ros kalibr colmap mrcal matlab json npz",
+    "Format to write.",
+    without="required",
+    to="target",
     required=True,
-    type=click.Choice(_FORMATS),
-    show_default="required",
-    help="Format to write.",
 )
-@click.option(
+@options.choice(
     "--model",
-    type=click.Choice(_MODELS),
-    show_default="the camera's own",
-    help="Write the nearest camera of this distortion model, and say how many pixels it is off.",
+    "none k1 k1k2 k1k2p1p2 plumb_bob rational thin_prism tilted fisheye omnidir double_sphere eucm",
+    "Write the nearest camera of this distortion model, and say how many pixels it is off.",
+    without="the camera's own",
 )
-@click.option(
+@options.flag(
     "--force",
-    is_flag=True,
-    show_default="refuse",
-    help="If the format does not have the distortion model, write the nearest camera that it has.",
+    "If the format does not have the distortion model, write the nearest camera that it has.",
+    without="refuse",
 )
 @board_options("Unit of --square, and of the lengths in FILE if the file does not say.", "as the file says")
-@click.option(
+@options.count(
     "--image-size",
-    nargs=2,
-    type=_SIZE,
-    metavar="W H",
-    show_default="as the file says",
-    help="Size of the images in pixels, if the file does not say.",
+    "W H",
+    "Size of the images in pixels, if the file does not say.",
+    without="as the file says",
+    most=1_000_000,
 )
-@summary_option
-@click.option(
-    "-o",
-    "--output",
-    metavar="FILE|DIR",
-    type=click.Path(writable=False, readable=False, allow_dash=True),
-    default="-",
-    show_default="standard output",
-    help="Write to this file; to this folder if the format needs several files.",
-)
+@options.summary
+@options.output("FILE|DIR", "Write to this file; to this folder if the format needs several files.")
 def convert(
     files: tuple[str, ...],
     target: str,

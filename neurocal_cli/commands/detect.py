@@ -8,19 +8,13 @@ from typing import TYPE_CHECKING, Any, cast
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.board_options import board_options, given_board
 from neurocal_cli.commands.frames import videos_as_frames
 from neurocal_cli.commands.one_size import of_one_size
-from neurocal_cli.commands.options import (
-    Command,
-    FiniteNumber,
-    input_argument,
-    output_option,
-)
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, complain, note, one_line, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.streams import complain, note, one_line, print_summary, say, some_of, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import NeurocalError, UsageError
 
@@ -34,8 +28,8 @@ if TYPE_CHECKING:
 _SECOND = 2  # images of another size, from which on it is no single one that strayed in
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "images",
     "IMAGE...",
     "Images of one camera (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits), folders of "
@@ -44,59 +38,46 @@ _SECOND = 2  # images of another size, from which on it is no single one that st
     required=True,
 )
 @board_options("Unit of --square. A board file names its own unit.")
-@click.option(
+@options.choice(
     "--points",
-    type=click.Choice(["midpoints", "edges", "vertices"]),
-    default="midpoints",
-    help="Points to measure: midpoints of the edges between inner vertices; edges, which adds those of the "
+    "midpoints edges vertices",
+    "Points to measure: midpoints of the edges between inner vertices; edges, which adds those of the "
     "edges to the board's rim, for stiff boards with whole outer squares; or the inner vertices.",
+    default="midpoints",
 )
-@click.option(
+@options.number(
     "--gamma",
-    metavar="G",
-    type=FiniteNumber(positive=True),
-    show_default="unknown",
-    help="Gamma of the images, 2.2 for many cameras. The points are slightly more accurate if it is given.",
+    "G",
+    "Gamma of the images, 2.2 for many cameras. The points are slightly more accurate if it is given.",
+    without="unknown",
+    positive=True,
 )
-@click.option(
-    "--overlay",
-    metavar="DIR",
-    type=click.Path(readable=False),
-    show_default="none",
-    help="Draw the detected points over each image and write it to DIR/VIEW.png.",
+@options.path("--overlay", "DIR", "Draw the detected points over each image and write it to DIR/VIEW.png.")
+@options.count(
+    "--jobs", "N", "Number of processes that examine images at the same time.", without="the number of cores"
 )
-@click.option(
-    "--jobs",
-    metavar="N",
-    type=click.IntRange(min=1),
-    show_default="the number of cores",
-    help="Number of processes that examine images at the same time.",
-)
-@click.option(
+@options.count(
     "--frames",
-    metavar="N",
-    type=click.IntRange(min=1),
+    "N",
+    "Number of frames that are taken of a video at most: sharp ones that differ from each other.",
     default=50,
-    help="Number of frames that are taken of a video at most: sharp ones that differ from each other.",
 )
-@click.option(
+@options.path(
     "--cache",
-    metavar="DIR",
-    type=click.Path(readable=False),
-    show_default="none",
-    help="Keep what is found in each image in this folder, and look there first. The same image is found "
+    "DIR",
+    "Keep what is found in each image in this folder, and look there first. The same image is found "
     "again under any name; a run that was stopped goes on.",
 )
-@click.option(
+@options.number(
     "--watch",
-    metavar="SECONDS",
-    type=FiniteNumber(positive=True),
-    show_default="no",
-    help="Wait for more images, in folders and patterns, until none has come for so long or Ctrl-C is "
+    "SECONDS",
+    "Wait for more images, in folders and patterns, until none has come for so long or Ctrl-C is "
     "pressed. After each image, tell the verdict so far and the view that would help most.",
+    without="no",
+    positive=True,
 )
-@summary_option
-@output_option("POINTS.csv", "the points")
+@options.summary
+@options.output("POINTS.csv", "Write the points to this file.")
 def detect(
     images: tuple[str, ...],
     board: str | None,
@@ -154,8 +135,7 @@ def detect(
         )
     note([_rescaled(target)] if target.distances else [])
     target = target.as_measured()
-    strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
-    wanted = _wanted(target, points, gamma, overlay, cache, strict)
+    wanted = _wanted(target, points, gamma, overlay, cache)
     if watch is None:
         outcomes = _examined(images, wanted, board, output, overlay, jobs, frames)
     else:
@@ -175,7 +155,7 @@ def _rescaled(board: Board) -> str:
 
 
 def _wanted(
-    board: Board, points: str, gamma: float | None, overlay: str | None, cache: str | None, strict: bool
+    board: Board, points: str, gamma: float | None, overlay: str | None, cache: str | None
 ) -> DetectionOptions:
     from neurocal_cli.detection.batch import DetectionOptions
     from neurocal_cli.detection.memory import Memory
@@ -186,6 +166,7 @@ def _wanted(
     if cache is not None:
         _check_folder("--cache", cache)
         memory = Memory(cache, f"{kind} {gamma!r} {overlay is not None} {format_board(board)}")
+    strict = os.environ.get("NEUROCAL_DEBUG", "0") not in ("", "0")
     return DetectionOptions(board, kind, gamma, overlay is not None, strict, memory)
 
 
@@ -240,9 +221,9 @@ def _mixed_sizes(paths: Sequence[str]) -> list[str]:
     """Tell of images of different sizes before any work: points of one camera are of one size."""
     from collections import Counter
 
-    from neurocal_cli.io.image_sizes import image_sizes
+    from neurocal_cli.io.image_headers import stated_sizes
 
-    sizes = Counter(size for size in image_sizes(paths) if size is not None)
+    sizes = Counter(size for size in stated_sizes(paths) if size is not None)
     if len(sizes) < 2 or sizes.most_common(2)[1][1] < _SECOND:
         return []
     counts = ", ".join(f"{count} of {w} x {h} px" for (w, h), count in sizes.most_common(4))
@@ -274,7 +255,7 @@ def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool
     for name, outcome in outcomes:
         for text in outcome.notes:
             remarks.setdefault(text, []).append(name)
-    note(f"{_some(names)}: {text}" for text, names in remarks.items())
+    note(f"{some_of(names)}: {text}" for text, names in remarks.items())
     found = [outcome.detection for _, outcome in outcomes if outcome.detection is not None]
     warn(dict.fromkeys(text for detection in found for text in detection.warnings))
     warn(_another_board([outcome.shown for _, outcome in outcomes], board))
@@ -316,10 +297,6 @@ def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> lis
         f"most images show {size[0]} x {size[1]} inner vertices, and {plane.cols} x {plane.rows} were asked "
         "for; count inner vertices, not squares"
     ]
-
-
-def _some(names: Sequence[str]) -> str:
-    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
 
 
 def _write(outcomes: Sequence[tuple[str, Outcome]], board: Board, overlay: str | None, output: str) -> None:

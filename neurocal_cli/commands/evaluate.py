@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.evaluate_stereo import stereo
-from neurocal_cli.commands.given_camera import calibration_or_camera
-from neurocal_cli.commands.options import Command, input_argument, json_option
+from neurocal_cli.commands.given_camera import calibration_or_camera, given_points
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import check_one_stdin, note, warn
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.places import check_one_stdin, check_outputs
+from neurocal_cli.commands.streams import note, print_summary, warn
 from neurocal_cli.commands.tables import show
 from neurocal_cli.plots import CAMERA_PANELS
 
@@ -40,20 +40,20 @@ def evaluate() -> None:
 evaluate.add_command(stereo)
 
 
-@evaluate.command(cls=Command)
-@input_argument(
+@evaluate.command(cls=options.Command)
+@options.argument(
     "calibration",
     "CAMERA.yaml",
     "A calibration that neurocal wrote. With POINTS.csv also a ROS or OpenCV file; - is standard input.",
 )
-@input_argument(
+@options.argument(
     "points",
     "[POINTS.csv]",
     "Points to evaluate the camera on; without them, those it was calibrated from.",
     required=False,
 )
 @panels_option("the errors, and of a calibration the coverage, uncertainty and poses", CAMERA_PANELS)
-@json_option
+@options.json
 def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) -> None:
     """Measure the reprojection error of a calibrated camera, in pixels.
 
@@ -82,27 +82,21 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     check_one_stdin(calibration, points)
     check_plots(plots)
     check_outputs((file for _, file in plots), (calibration, points))
-    given = _read_points(points)
+    given = None if points is None else given_points([points])
     evaluation, verdict, judged = _evaluate(calibration, given)
     if plots:
         from neurocal_cli.plots.pages import draw_camera
         from neurocal_cli.plots.subject import Subject
 
-        subject = Subject.of(judged, given, evaluation)
-        write_plots(plots, lambda kind, panel: draw_camera(subject, kind, panel))
+        write_plots(plots, partial(draw_camera, Subject.of(judged, given, evaluation)))
     _tell(evaluation)
-    _show(evaluation, verdict, as_json)
+    from neurocal_cli.report import evaluation_json, evaluation_tables
+    from neurocal_cli.verdict.report import verdict_lines
 
-
-def _read_points(name: str | None) -> Correspondences | None:
-    if name is None:
-        return None
-    from neurocal_cli.io.points_csv import read_points
-
-    notes: list[str] = []
-    points = read_points([name], notes=notes)
-    note(notes)
-    return points
+    if as_json:
+        print_summary(evaluation_json(evaluation, verdict))
+    else:
+        show(evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
 
 
 def _evaluate(
@@ -137,14 +131,3 @@ def _tell(evaluation: CameraEvaluation) -> None:
     if evaluation.on_target:
         note(["the points are taken where the calibration found them, not where their file has them"])
     warn(evaluation.warnings)
-
-
-def _show(evaluation: CameraEvaluation, verdict: Verdict | None, as_json: bool) -> None:
-    from neurocal_cli.report import evaluation_json, evaluation_report, evaluation_tables
-    from neurocal_cli.verdict.report import verdict_lines
-
-    if as_json:
-        print_summary(evaluation_json(evaluation, verdict))
-    else:
-        below = [] if verdict is None else verdict_lines(verdict)
-        show(evaluation_report(evaluation, verdict), evaluation_tables(evaluation), below)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.given_camera import calibration_or_camera
-from neurocal_cli.commands.options import INPUT, Command, input_argument, json_option
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import check_one_stdin, note, warn
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.places import check_one_stdin, check_outputs
+from neurocal_cli.commands.streams import note, print_summary, warn
 from neurocal_cli.commands.tables import show
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import SPACE_PANELS
@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from neurocal_cli.stereo.rig import Rig
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "cameras",
     "LEFT.yaml RIGHT.yaml",
     "The calibrations of the left and the right camera, with --points also ROS or OpenCV files; "
@@ -32,23 +32,21 @@ if TYPE_CHECKING:
     nargs=-1,
     required=True,
 )
-@click.option(
+@options.path(
     "--points",
-    nargs=2,
-    metavar="LEFT.csv RIGHT.csv",
-    type=INPUT,
-    show_default="the points of the calibrations",
-    help="Points of both cameras to evaluate them on.",
+    "LEFT.csv RIGHT.csv",
+    "Points of both cameras to evaluate them on.",
+    without="the points of the calibrations",
 )
-@click.option(
+@options.choice(
     "--method",
-    type=click.Choice(["optimal", "linear", "midpoint"]),
-    default="optimal",
-    help="Triangulation: optimal is least squares on the pixels, linear solves linear equations, midpoint "
+    "optimal linear midpoint",
+    "Triangulation: optimal is least squares on the pixels, linear solves linear equations, midpoint "
     "takes the middle between the two rays.",
+    default="optimal",
 )
 @panels_option("the errors in space, by depth and by view, and of a rig the poses", SPACE_PANELS)
-@json_option
+@options.json
 def stereo(
     cameras: tuple[str, ...],
     points: tuple[str, str] | None,
@@ -95,15 +93,20 @@ def stereo(
     if plots:
         from neurocal_cli.plots.pages import draw_points_in_space
 
-        write_plots(plots, lambda kind, panel: draw_points_in_space(evaluation, rig, kind, panel))
-    from neurocal_cli.stereo.report import views_alone
+        write_plots(plots, partial(draw_points_in_space, evaluation, rig))
+    from neurocal_cli.stereo.report import stereo_evaluation_json, stereo_evaluation_tables, views_alone
+    from neurocal_cli.verdict.report import verdict_lines
 
     note(views_alone(evaluation.alone))
     if evaluation.fitted:
         names = ", ".join(evaluation.fitted[:5]) + (", ..." if len(evaluation.fitted) > 5 else "")
         note([f"{names}: not in the calibrations; the poses are fitted with the cameras fixed"])
     warn(evaluation.warnings)
-    _show(evaluation, as_json)
+    if as_json:
+        print_summary(stereo_evaluation_json(evaluation))
+    else:
+        verdict = evaluation.verdict
+        show(stereo_evaluation_tables(evaluation), [] if verdict is None else verdict_lines(verdict))
 
 
 def _read_points(names: tuple[str, str] | None) -> tuple[Correspondences, Correspondences] | None:
@@ -146,18 +149,3 @@ def _camera(name: str, points: Correspondences) -> Calibration:
         return camera
     assert seen is not None
     return calibrate(seen, type=3, intrinsics=camera, outliers="keep")
-
-
-def _show(evaluation: StereoEvaluation, as_json: bool) -> None:
-    from neurocal_cli.stereo.report import (
-        stereo_evaluation_json,
-        stereo_evaluation_report,
-        stereo_evaluation_tables,
-    )
-    from neurocal_cli.verdict.report import verdict_lines
-
-    if as_json:
-        print_summary(stereo_evaluation_json(evaluation))
-    else:
-        below = [] if evaluation.verdict is None else verdict_lines(evaluation.verdict)
-        show(stereo_evaluation_report(evaluation), stereo_evaluation_tables(evaluation), below)

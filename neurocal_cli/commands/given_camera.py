@@ -1,4 +1,4 @@
-"""A camera that the user has a file of, with the points that it is used on."""
+"""Points, and a camera that the user has a file of, with the points that it is used on."""
 
 from __future__ import annotations
 
@@ -9,9 +9,21 @@ from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import FormatError, InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.camera.camera import Camera
     from neurocal_cli.points import Correspondences
+
+
+def given_points(names: str | Sequence[str]) -> Correspondences:
+    """Read points, and tell what of their files was left out."""
+    from neurocal_cli.io.points_csv import read_points
+
+    notes: list[str] = []
+    points = read_points(names, notes=notes)
+    note(notes)
+    return points
 
 
 def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, Camera]:

@@ -2,38 +2,21 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import partial
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    FiniteNumber,
-    camera_name_option,
-    check_camera_name,
-    check_plot,
-    input_argument,
-    json_option,
-    output_option,
-    plot_option,
-)
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands import options
+from neurocal_cli.commands.pictures import write_plot
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
-
-if TYPE_CHECKING:
-    from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
-
-F = TypeVar("F", bound=Callable[..., Any])
 
 _NOT_CONVERGED = 3
 _MOST_UNITS = 20
 
-_LENS = input_argument(
+_LENS = options.argument(
     "lens_file", "LENS.yaml", "A lens that `neurocal lens fit` wrote; - is standard input."
 )
 
@@ -53,8 +36,8 @@ def lens() -> None:
     """  # noqa: D301 - as in the group
 
 
-@lens.command(cls=Command)
-@input_argument(
+@lens.command(cls=options.Command)
+@options.argument(
     "points",
     "POINTS...",
     "CSV files of points with the columns zoom and/or focus, X,Y,Z,u,v and optionally view; or "
@@ -63,66 +46,55 @@ def lens() -> None:
     nargs=-1,
     required=True,
 )
-@click.option(
+@options.choice(
     "--distortion",
-    type=click.Choice(["auto", "none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational", "fisheye"]),
-    default="auto",
-    help="Distortion model, with a network for each coefficient; none is a pinhole camera. auto chooses a "
+    "auto none k1 k1k2 k1k2p1p2 plumb_bob rational fisheye",
+    "Distortion model, with a network for each coefficient; none is a pinhole camera. auto chooses a "
     "richer model only if it lowers the cross-validation error over the settings.",
+    default="auto",
 )
-@click.option(
+@options.choice(
     "--training",
-    type=click.Choice(["joint", "alternating"]),
-    default="joint",
-    help="Last step of the training: joint changes all weights at once, alternating trains the networks of "
+    "joint alternating",
+    "Last step of the training: joint changes all weights at once, alternating trains the networks of "
     "the parameters and the calibrating network in turn, as in the paper.",
+    default="joint",
 )
-@click.option(
+@options.choice(
     "--camera",
-    type=click.Choice(["auto", "still", "moving"]),
-    default="auto",
-    help="Motion of the camera relative to the target: still is none, moving estimates a pose for each view, "
+    "auto still moving",
+    "Motion of the camera relative to the target: still is none, moving estimates a pose for each view, "
     "auto is still if each setting has one view.",
-)
-@click.option(
-    "--hidden",
-    type=click.IntRange(0, _MOST_UNITS),
-    nargs=2,
-    metavar="N1 N2",
-    show_default="chosen from the data",
-    help="Size of each network: number of tanh units in the first layer, for each of zoom and focus, and in "
-    "the second layer.",
-)
-@click.option(
-    "--outliers",
-    type=click.Choice(["reject", "keep"]),
-    default="reject",
-    help="Treatment of settings that contradict the others: reject leaves them out, keep uses them all.",
-)
-@click.option(
-    "--no-skew",
-    is_flag=True,
-    show_default="estimate the angle",
-    help="Fix the angle between the image axes at 90 degrees.",
-)
-@click.option(
-    "--target",
-    type=click.Choice(["auto", "given", "flat", "free"]),
     default="auto",
-    help="Where the points of a board in several views are, the same at all settings: given takes X, Y, Z as "
+)
+@options.count(
+    "--hidden",
+    "N1 N2",
+    "Size of each network: number of tanh units in the first layer, for each of zoom and focus, and in "
+    "the second layer.",
+    without="chosen from the data",
+    least=0,
+    most=_MOST_UNITS,
+)
+@options.choice(
+    "--outliers",
+    "reject keep",
+    "Treatment of settings that contradict the others: reject leaves them out, keep uses them all.",
+    default="reject",
+)
+@options.no_skew
+@options.choice(
+    "--target",
+    "auto given flat free",
+    "Where the points of a board in several views are, the same at all settings: given takes X, Y, Z as "
     "they are; free finds how the board is bent and printed; flat does so within its plane; auto finds it "
     "where the points ask for it.",
+    default="auto",
 )
-@click.option(
-    "--seed",
-    type=click.IntRange(min=0),
-    metavar="S",
-    default=0,
-    help="Seed of the random weights. The same seed gives the same output.",
-)
-@plot_option("each parameter over the settings, with its uncertainty, and the errors")
-@summary_option
-@output_option("LENS.yaml", "the lens")
+@options.seed
+@options.plot("each parameter over the settings, with its uncertainty, and the errors")
+@options.summary
+@options.output("LENS.yaml", "Write the lens to this file.")
 @click.pass_context
 def fit(
     ctx: click.Context,
@@ -167,12 +139,39 @@ def fit(
     compute_in_one_thread()
     check_one_stdin(*points)
     check_summary(as_json, output)
-    check_plot(plot, output)
+    options.check_plot(plot, output)
     check_outputs((output, plot), points)
-    learnt = _learn(points, distortion, training, camera, hidden, outliers, no_skew, target, seed)
-    _write(learnt, output, plot)
+    from neurocal_cli.io.lens_points import read_lens_data
+    from neurocal_cli.io.lens_yaml import write_lens
+    from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
+    from neurocal_cli.zoom_lens.fit_points import fit_lens
     from neurocal_cli.zoom_lens.report import lens_json, lens_report
 
+    notes: list[str] = []
+    data = read_lens_data(points, notes=notes)
+    note(notes)
+    topologies = None if hidden is None else (hidden,)
+    with ProgressBar() as progress:
+        if isinstance(data, LensCameras):
+            learnt = fit_lens_cameras(data, seed, topologies=topologies, progress=progress)
+        else:
+            learnt = fit_lens(
+                data,
+                distortion=distortion,
+                training=training,
+                outliers=outliers,
+                camera=camera,
+                skew=not no_skew,
+                seed=seed,
+                target=target,
+                topologies=topologies,
+                progress=progress,
+            )
+    if plot is not None:
+        from neurocal_cli.zoom_lens.plots import draw_lens
+
+        write_plot(plot, partial(draw_lens, learnt))
+    write_lens(learnt, output)
     if as_json:
         print_summary(lens_json(learnt))
     else:
@@ -182,71 +181,16 @@ def fit(
         ctx.exit(_NOT_CONVERGED)
 
 
-def _learn(
-    points: tuple[str, ...],
-    distortion: str,
-    training: str,
-    camera: str,
-    hidden: tuple[int, int] | None,
-    outliers: str,
-    no_skew: bool,
-    target: str,
-    seed: int,
-) -> ZoomLens:
-    from neurocal_cli.io.lens_points import read_lens_data
-    from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
-    from neurocal_cli.zoom_lens.fit_points import fit_lens
-
-    notes: list[str] = []
-    data = read_lens_data(points, notes=notes)
-    note(notes)
-    topologies = None if hidden is None else (hidden,)
-    with ProgressBar() as progress:
-        if isinstance(data, LensCameras):
-            return fit_lens_cameras(data, seed, topologies=topologies, progress=progress)
-        return fit_lens(
-            data,
-            distortion=distortion,
-            training=training,
-            outliers=outliers,
-            camera=camera,
-            skew=not no_skew,
-            seed=seed,
-            target=target,
-            topologies=topologies,
-            progress=progress,
-        )
-
-
-def _write(learnt: ZoomLens, output: str, plot: str | None) -> None:
-    """Write both files, the picture drawn before either is touched."""
-    from neurocal_cli.io.lens_yaml import write_lens
-
-    if plot is not None:
-        from neurocal_cli.io.writing import write_whole
-        from neurocal_cli.zoom_lens.plots import draw_lens
-
-        write_whole(plot, draw_lens(learnt, os.path.splitext(plot)[1][1:].lower()))
-    write_lens(learnt, output)
-
-
-@lens.command(cls=Command)
+@lens.command(cls=options.Command)
 @_LENS
-@click.option(
-    "--zoom", type=FiniteNumber(), metavar="Z", show_default="none", help="Zoom setting of the camera."
+@options.number("--zoom", "Z", "Zoom setting of the camera.", without="none")
+@options.number("--focus", "F", "Focus setting of the camera.", without="none")
+@options.flag(
+    "--extrapolate", "Allow a setting outside the calibrated range.", without="refuse such a setting"
 )
-@click.option(
-    "--focus", type=FiniteNumber(), metavar="F", show_default="none", help="Focus setting of the camera."
-)
-@click.option(
-    "--extrapolate",
-    is_flag=True,
-    show_default="refuse such a setting",
-    help="Allow a setting outside the calibrated range.",
-)
-@camera_name_option
-@summary_option
-@output_option("CAMERA.yaml", "the calibration")
+@options.camera_name
+@options.summary
+@options.output("CAMERA.yaml", "Write the calibration to this file.")
 def camera(
     lens_file: str,
     zoom: float | None,
@@ -269,7 +213,7 @@ def camera(
           --camera-name tele --json -o tele.yaml
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
-    check_camera_name(camera_name)
+    options.check_camera_name(camera_name)
     check_summary(as_json, output)
     check_outputs((output,), (lens_file,))
     from neurocal_cli.io.calibration_yaml import write_calibration
@@ -292,15 +236,15 @@ def camera(
     warn(warnings)
 
 
-@lens.command(cls=Command)
+@lens.command(cls=options.Command)
 @_LENS
-@input_argument(
+@options.argument(
     "points",
     "POINTS.csv",
     "A CSV file of points at any settings, with the columns zoom and/or focus; - is standard input.",
 )
-@plot_option("the error over the settings, and the errors of the baseline models")
-@json_option
+@options.plot("the error over the settings, and the errors of the baseline models")
+@options.json
 def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> None:
     """Measure the reprojection error of a zoom lens.
 
@@ -322,7 +266,7 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     """  # noqa: D301 - as in the group
     compute_in_one_thread()
     check_one_stdin(lens_file, points)
-    check_plot(plot, None)
+    options.check_plot(plot, None)
     check_outputs((plot,), (lens_file, points))
     from neurocal_cli.io.lens_points import read_lens_points
     from neurocal_cli.io.lens_yaml import read_lens
@@ -337,10 +281,9 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     evaluation = evaluate_lens(learnt, data)
     verdict = judge_lens(learnt, evaluation.rmse_px)
     if plot is not None:
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.zoom_lens.plots import draw_evaluation
 
-        write_whole(plot, draw_evaluation(evaluation, learnt.controls, os.path.splitext(plot)[1][1:].lower()))
+        write_plot(plot, partial(draw_evaluation, evaluation, learnt.controls))
     if as_json:
         print_summary(evaluation_json(evaluation, verdict))
     else:

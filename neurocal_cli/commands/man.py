@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import click
 
 from neurocal_cli import __version__
-from neurocal_cli.commands.options import Argument
+from neurocal_cli.commands import options
 
 _EXIT_STATUS = (
     ("0", "Done."),
@@ -56,7 +56,7 @@ _ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, an unexpected error shows where
     "directory",
     metavar="DIR",
     type=click.Path(file_okay=False),
-    cls=Argument,
+    cls=options.Argument,
     description="Folder for the man pages.",
 )
 @click.pass_context
@@ -102,6 +102,7 @@ def _page(ctx: click.Context, names: list[str]) -> str:
     """One man page in the macros of man(7)."""
     summary, description, examples = _split_help(ctx.command.help or "")
     name = _page_name(ctx)
+    others = [other for other in names if other != name]
     lines = [
         r".\" Made by `neurocal man` from the command's help; edit that instead.",
         f'.TH "{_escape(name.upper())}" 1 "{_DATE}" "neurocal {__version__}" "neurocal manual"',
@@ -115,7 +116,7 @@ def _page(ctx: click.Context, names: list[str]) -> str:
         *_section("EXIT STATUS", _terms(_EXIT_STATUS)),
         *_section("FILES", _terms(_FILES)),
         *_section("ENVIRONMENT", _terms(_ENVIRONMENT)),
-        *_section("SEE ALSO", [", ".join(rf"\fB{_escape(n)}\fR(1)" for n in _neighbours(name, names))]),
+        *_section("SEE ALSO", [", ".join(rf"\fB{_escape(n)}\fR(1)" for n in others)]),
     ]
     return "\n".join(lines) + "\n"
 
@@ -154,7 +155,7 @@ def _subcommands(ctx: click.Context) -> list[tuple[str, str]]:
 
 
 def _arguments(ctx: click.Context) -> list[tuple[str, str]]:
-    return [(str(p.metavar), p.description) for p in ctx.command.params if isinstance(p, Argument)]
+    return [(str(p.metavar), p.description) for p in ctx.command.params if isinstance(p, options.Argument)]
 
 
 def _options(ctx: click.Context) -> list[tuple[str, str]]:
@@ -180,10 +181,6 @@ def _default(option: click.Option) -> str:
     if option.is_flag or option.default is None:
         return ""
     return f"Default: {option.default}."
-
-
-def _neighbours(name: str, names: list[str]) -> list[str]:
-    return [other for other in names if other != name]
 
 
 def _section(title: str, body: list[str]) -> list[str]:

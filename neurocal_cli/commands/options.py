@@ -1,4 +1,7 @@
-"""Arguments and options that several commands share, so that they cannot diverge."""
+"""Arguments and options of commands: the kinds that there are, and those that several commands share.
+
+Commands write them as ``@options.path(...)``, so that two with the same meaning cannot diverge.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +19,12 @@ _PICTURES = (".png", ".pdf", ".svg")
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# Existence and readability are the reader's business: a file that cannot be read is exit code 1.
-INPUT = click.Path(readable=False, allow_dash=True)
+# What is there and may be read or written is found by who does it: that is exit code 1, not wrong usage.
+PATH = click.Path(readable=False, allow_dash=True)
+
+
+METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
+"""Those of `comparison.by_method`, which a test compares."""
 
 
 class Argument(click.Argument):
@@ -73,37 +80,100 @@ class FiniteNumber(FloatParamType):
         return number
 
 
-def input_argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
+class _MethodNames(click.ParamType):  # type: ignore[type-arg]
+    """Names of methods, separated by commas; a tuple without repetitions."""
+
+    name = "methods"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Split, or fail as click does."""
+        if isinstance(value, tuple):
+            return value
+        names = tuple(dict.fromkeys(name.strip() for name in value.split(",") if name.strip()))
+        if not names or any(name not in METHODS for name in names):
+            self.fail(f"{value!r} is not a list of {', '.join(METHODS)}.", param, ctx)
+        return names
+
+
+def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
+    """An option that names a file or a folder, or as many as its metavar has words.
+
+    In this and the following, `without` is what ``--help`` says of the option's absence.
+    """
+    return _option(name, help, without, metavar=metavar, type=PATH, **more)
+
+
+def number(
+    name: str, metavar: str, help: str, without: str | None = None, *, positive: bool = False, **more: Any
+) -> Callable[[F], F]:
+    """An option that is a finite number, or as many as its metavar has words."""
+    return _option(name, help, without, metavar=metavar, type=FiniteNumber(positive), **more)
+
+
+def count(
+    name: str,
+    metavar: str,
+    help: str,
+    without: str | None = None,
+    *,
+    least: int = 1,
+    most: int | None = None,
+    **more: Any,
+) -> Callable[[F], F]:
+    """An option that is a whole number, or as many as its metavar has words."""
+    return _option(name, help, without, metavar=metavar, type=click.IntRange(least, most), **more)
+
+
+def choice(name: str, words: str, help: str, without: str | None = None, **more: Any) -> Callable[[F], F]:
+    """An option that is one of some words."""
+    return _option(name, help, without, type=click.Choice(words.split()), **more)
+
+
+def flag(name: str, help: str, without: str = "no", **more: Any) -> Callable[[F], F]:
+    """An option without a value."""
+    return _option(name, help, without, is_flag=True, **more)
+
+
+def _option(
+    names: str | tuple[str, ...],
+    help: str,
+    without: str | None,
+    *,
+    to: str | None = None,
+    **attributes: Any,
+) -> Callable[[F], F]:
+    """An option whose value goes to the argument `to` of the command, that of its own name by default."""
+    if without is not None:
+        attributes["show_default"] = without
+    if "metavar" in attributes:
+        attributes["nargs"] = len(attributes["metavar"].split())
+    names = (names,) if isinstance(names, str) else names
+    return click.option(*names, *([] if to is None else [to]), help=help, **attributes)
+
+
+def argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
     """Add an argument that names what is read."""
-    return click.argument(name, metavar=metavar, type=INPUT, cls=Argument, description=description, **more)
+    return click.argument(name, metavar=metavar, type=PATH, cls=Argument, description=description, **more)
 
 
-def points_argument(f: F) -> F:
-    """Add POINTS..., one or more CSV files that are read as one."""
-    return input_argument(
-        "points",
-        "POINTS...",
-        "CSV files with the columns X,Y,Z,u,v and optionally view. Several files are read as "
-        "one; - is standard input.",
-        nargs=-1,
-        required=True,
-    )(f)
+points = argument(
+    "points",
+    "POINTS...",
+    "CSV files with the columns X,Y,Z,u,v and optionally view. Several files are read as "
+    "one; - is standard input.",
+    nargs=-1,
+    required=True,
+)
 
 
-def output_option(metavar: str, what: str) -> Callable[[F], F]:
-    """Add ``-o``, where the result goes; stdout unless it is given."""
-    return click.option(
-        "-o",
-        "--output",
-        metavar=metavar,
-        type=click.Path(writable=False, readable=False, allow_dash=True),
-        default="-",
-        show_default="standard output",
-        help=f"Write {what} to this file.",
-    )
+def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], F]:
+    """Add ``-o``, where the result goes; stdout unless it is given or has to be."""
+    usual = {"required": True} if required else {"default": "-"}
+    without = "required" if required else "standard output"
+    return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
 
 
-camera_name_option = click.option(
+camera_name = click.option(
     "--camera-name", metavar="NAME", default="camera", help="Name of the camera in the output file."
 )
 
@@ -119,14 +189,13 @@ def check_camera_name(name: str) -> None:
         raise UsageError("--camera-name must hold printable characters only; give another name")
 
 
-def alpha_option(default: str) -> Callable[[F], F]:
+def alpha(default: str) -> Callable[[F], F]:
     """Add ``--alpha``, how much of the original images is shown; see `check_alpha`."""
-    return click.option(
+    return number(
         "--alpha",
-        metavar="ALPHA",
-        type=FiniteNumber(),
-        show_default=default,
-        help="Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
+        "ALPHA",
+        "Zoom of the images: 0 shows valid pixels only, 1 shows all pixels of the original images.",
+        without=default,
     )
 
 
@@ -141,44 +210,49 @@ def check_alpha(alpha: float | None) -> None:
         raise UsageError(f"--alpha is {alpha:g}; give a number from 0 to 1")
 
 
-interpolation_option = click.option(
+def methods(default: str) -> Callable[[F], F]:
+    """Add ``--methods``, the methods to compare."""
+    return click.option(
+        "--methods",
+        metavar="M,...",
+        type=_MethodNames(),
+        default=default,
+        help="Methods to compare, of neuro, backprop, nonlinear, linear, tsai and opencv. backprop is neuro "
+        "with the paper's trainer.",
+    )
+
+
+seed = count(
+    "--seed", "S", "Seed of the random weights. The same seed gives the same output.", default=0, least=0
+)
+
+no_skew = flag(
+    "--no-skew", "Fix the angle between the image axes at 90 degrees.", without="estimate the angle"
+)
+
+interpolation = choice(
     "--interpolation",
-    type=click.Choice(["nearest", "linear", "cubic", "lanczos"]),
+    "nearest linear cubic lanczos",
+    "Interpolation between the pixels of an image.",
     default="cubic",
-    help="Interpolation between the pixels of an image.",
 )
 
 
-def json_option(f: F) -> F:
-    """Add ``--json``, for programs that read the result."""
-    return click.option(
-        "--json",
-        "as_json",
-        is_flag=True,
-        show_default="print tables",
-        help="Print one JSON object instead of tables.",
-    )(f)
+json = flag("--json", "Print one JSON object instead of tables.", without="print tables", to="as_json")
+
+summary = flag(
+    "--json",
+    "Print the summary as one JSON object on standard output, instead of tables; needs -o FILE.",
+    without="print tables",
+    to="as_json",
+)
+
+lean = flag("--lean", "Leave the points, the poses and the network out of the file, so that it is short.")
 
 
-def lean_option(f: F) -> F:
-    """Add ``--lean``, for a file without the points."""
-    return click.option(
-        "--lean",
-        is_flag=True,
-        show_default="no",
-        help="Leave the points, the poses and the network out of the file, so that it is short.",
-    )(f)
-
-
-def plot_option(what: str) -> Callable[[F], F]:
+def plot(what: str) -> Callable[[F], F]:
     """Add ``--plot``, a picture of something; see `check_plot`."""
-    return click.option(
-        "--plot",
-        metavar="FILE.png",
-        type=click.Path(writable=False, readable=False),
-        show_default="none",
-        help=f"Plot {what} to this .png, .pdf or .svg file.",
-    )
+    return path("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
 
 
 def check_plot(plot: str | None, output: str | None = None) -> None:

@@ -2,30 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.streams import TYPED
 
 if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.stereo.rig import Rig
 
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def html_option(f: F) -> F:
-    """Add ``--html``, the page that ``neurocal report`` makes."""
-    return click.option(
-        "--html",
-        metavar="REPORT.html",
-        type=click.Path(writable=False, readable=False),
-        show_default="none",
-        help="Also write the page that `neurocal report` makes, with this command and the SHA-256 of its "
-        "inputs.",
-    )(f)
+html_option = options.path(
+    "--html",
+    "REPORT.html",
+    "Also write the page that `neurocal report` makes, with this command and the SHA-256 of its inputs.",
+)
 
 
 def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None) -> None:

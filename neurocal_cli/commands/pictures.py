@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import click
 
-from neurocal_cli.commands.options import check_plot
+from neurocal_cli.commands import options
 
 F = TypeVar("F", bound=Callable[..., Any])
 Plots = tuple[tuple[str | None, str], ...]  # panel, or None for all of them, and file
@@ -39,7 +39,7 @@ def panels_option(what: str, panels: Sequence[str]) -> Callable[[F], F]:
 def check_plots(plots: Plots, output: str | None = None) -> None:
     """Refuse pictures that cannot be drawn; see `options.check_plot`."""
     for _, file in plots:
-        check_plot(file, output)
+        options.check_plot(file, output)
 
 
 def write_plots(plots: Plots, draw: Callable[[str, str | None], bytes]) -> None:
@@ -51,7 +51,12 @@ def write_plots(plots: Plots, draw: Callable[[str, str | None], bytes]) -> None:
     draw : callable
         Gives a picture of a kind ("png") and of a panel.
     """
+    for panel, file in plots:
+        write_plot(file, lambda kind, panel=panel: draw(kind, panel))  # type: ignore[misc]
+
+
+def write_plot(file: str, draw: Callable[[str], bytes]) -> None:
+    """Draw and write a picture of the kind that its name ends in."""
     from neurocal_cli.io.writing import write_whole
 
-    for panel, file in plots:
-        write_whole(file, draw(os.path.splitext(file)[1][1:].lower(), panel))
+    write_whole(file, draw(os.path.splitext(file)[1][1:].lower()))

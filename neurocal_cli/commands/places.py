@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from neurocal_cli.errors import UsageError
+
 
 def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -> None:
     """Refuse outputs that cannot be written, or that are one of the inputs.
@@ -22,3 +24,20 @@ def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -
     if held is not None:
         held.protect(*inputs)
     check_places(*outputs)
+
+
+def check_one_stdin(*names: str | None) -> None:
+    """Refuse a request to read standard input twice."""
+    if names.count("-") > 1:
+        raise UsageError("standard input (-) can be read only once; give the other inputs as files")
+
+
+def check_summary(as_json: bool, output: str) -> None:
+    """Refuse two results on one stream.
+
+    Raises
+    ------
+    UsageError
+    """
+    if as_json and output == "-":
+        raise UsageError("--json prints to standard output, where the result would go too; give -o FILE")

@@ -8,17 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    alpha_option,
-    check_alpha,
-    input_argument,
-    interpolation_option,
-    json_option,
-)
+from neurocal_cli.commands import options
+from neurocal_cli.commands.places import check_one_stdin, check_outputs
 from neurocal_cli.commands.progress import each_of
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.errors import FormatError, InputError, UsageError
 
 if TYPE_CHECKING:
@@ -31,43 +24,27 @@ if TYPE_CHECKING:
 _SIDES = ("left", "right")
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "rig",
     "RIG.yaml",
     "A rig of neurocal, or of another program that neurocal convert reads; - is standard input.",
 )
-@input_argument(
+@options.argument(
     "files",
     "LEFT... RIGHT...",
     "Images of the left camera and as many of the right one, in the same order: files, file name "
     "patterns or one folder each. Or CSV files of points.",
     nargs=-1,
 )
-@alpha_option("not scaled")
-@interpolation_option
-@click.option(
-    "--side-by-side",
-    is_flag=True,
-    show_default="no",
-    help="Also write each pair as one picture with lines along the rows, to DIR/pairs.",
+@options.alpha("not scaled")
+@options.interpolation
+@options.flag(
+    "--side-by-side", "Also write each pair as one picture with lines along the rows, to DIR/pairs."
 )
-@click.option(
-    "--maps",
-    is_flag=True,
-    show_default="no",
-    help="Also write DIR/maps.npz: tables for cv2.remap, and R1, R2, P1, P2, Q.",
-)
-@json_option
-@click.option(
-    "-o",
-    "--output",
-    metavar="DIR",
-    required=True,
-    type=click.Path(writable=False, readable=False),
-    show_default="required",
-    help="Write to the folders left and right in this folder.",
-)
+@options.flag("--maps", "Also write DIR/maps.npz: tables for cv2.remap, and R1, R2, P1, P2, Q.")
+@options.json
+@options.output("DIR", "Write to the folders left and right in this folder.", required=True)
 def rectify(
     rig: str,
     files: tuple[str, ...],
@@ -107,7 +84,7 @@ def rectify(
           --side-by-side --json -o pairs
     """  # noqa: D301 - as in the group
     check_one_stdin(rig, *files)
-    check_alpha(alpha)
+    options.check_alpha(alpha)
     if not files and not maps:
         raise UsageError("there is nothing to rectify; give LEFT and RIGHT, or --maps")
     if os.path.exists(output) and not os.path.isdir(output):
@@ -115,7 +92,7 @@ def rectify(
     from neurocal_cli.io.image_paths import is_image
 
     sides = _sides(files)
-    _check_outputs(sides, output)
+    _check_folders(sides, output)
     found = _read_rig(rig)
     work = _Work(found, alpha, interpolation, output, side_by_side, as_json)
     work.tell_rows_of_rig()
@@ -148,13 +125,9 @@ def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
     return left, right
 
 
-def _check_outputs(sides: tuple[tuple[str, ...], tuple[str, ...]], output: str) -> None:
+def _check_folders(sides: tuple[tuple[str, ...], tuple[str, ...]], output: str) -> None:
     """Refuse to write over inputs."""
-    from neurocal_cli.io.outputs import held_back
-
-    held = held_back()
-    if held is not None:
-        held.protect(*sides[0], *sides[1])
+    check_outputs((), (*sides[0], *sides[1]))
     for side, paths in zip(_SIDES, sides, strict=True):
         folder = os.path.realpath(os.path.join(output, side))
         if any(os.path.dirname(os.path.realpath(path)) == folder for path in paths):
@@ -202,8 +175,10 @@ class _Work:
 
         error = row_error_of_rig(self.rig, self.pair)
         if error is not None:
-            rows = "rows" if self.pair.axis == 0 else "columns"
-            self._tell(f"{rows} of the rig's own {error.n_points} points differ by {error.rms_px:.3g} px rms")
+            along = self.summary["along"]
+            self._tell(
+                f"{along} of the rig's own {error.n_points} points differ by {error.rms_px:.3g} px rms"
+            )
             self.summary["rig"] = {"n_points": error.n_points, "rms_px": number_or_none(error.rms_px)}
         verdict = self.rig.verdict
         if verdict is not None and verdict.word == "poor":
@@ -231,15 +206,14 @@ class _Work:
         for name, (path,), points in zip(_SIDES, sides, moved, strict=True):
             self._write(os.path.join(name, os.path.basename(path)), format_points(points))
         error = row_error(self.pair, moved[0], moved[1])
-        rows = "rows" if self.pair.axis == 0 else "columns"
         self.summary["points"] = {
             "n_points": error.n_points,
             "rms_px": number_or_none(error.rms_px),
             "max_px": number_or_none(error.max_px),
         }
         self._tell(
-            f"{rows} of the {error.n_points} points given differ by {error.rms_px:.3g} px rms, "
-            f"{error.max_px:.3g} px at most"
+            f"{self.summary['along']} of the {error.n_points} points given differ by {error.rms_px:.3g} px "
+            f"rms, {error.max_px:.3g} px at most"
         )
 
     def rectify_images(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
@@ -255,12 +229,12 @@ class _Work:
 
         pictures = []
         for remapping, path in zip(self._remappings(), pair, strict=True):
-            picture = read_picture(path)
-            note(f"{picture.source}: {text}" for text in picture.notes)
+            pixels, source, notes = read_picture(path)
+            note(f"{source}: {text}" for text in notes)
             try:
-                pictures.append(remapping(picture.pixels))
+                pictures.append(remapping(pixels))
             except InputError as error:
-                raise InputError(f"{picture.source}: {error}") from error
+                raise InputError(f"{source}: {error}") from error
         names = [os.path.splitext(os.path.basename(path))[0] for path in pair]
         for side, name, pixels in zip(_SIDES, names, pictures, strict=True):
             self._write(os.path.join(side, f"{name}.png"), encode_image(pixels, ".png"))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from neurocal_cli.commands.options import Command, input_argument, output_option
+from neurocal_cli.commands import options
 from neurocal_cli.commands.places import check_outputs
 from neurocal_cli.commands.streams import note
 from neurocal_cli.errors import UsageError
@@ -18,23 +18,21 @@ if TYPE_CHECKING:
 _MOST_BYTES = 1_400_000  # of all photographs; as text in the page they take a third more
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "result",
     "CAMERA.yaml|RIG.yaml|LENS.yaml",
     "What neurocal calibrate, stereo or lens fit wrote; - is standard input.",
 )
-@click.option(
+@options.path(
     "--images",
-    metavar="DIR",
-    multiple=True,
-    type=click.Path(readable=False),
-    show_default="none",
-    help="Show the photographs of the views, with the residuals over them: a folder or a pattern such as "
+    "DIR",
+    "Show the photographs of the views, with the residuals over them: a folder or a pattern such as "
     "'left*.png', whose files have the names of the views. For a rig give it twice, left and right, or once "
     "for both.",
+    multiple=True,
 )
-@output_option("REPORT.html", "the page")
+@options.output("REPORT.html", "Write the page to this file.")
 def report(result: str, images: tuple[str, ...], output: str) -> None:
     """Show a calibration, a rig or a zoom lens as one HTML page.
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from neurocal_cli.commands.method_names import methods_option
-from neurocal_cli.commands.options import INPUT, Command, FiniteNumber, check_plot, json_option, plot_option
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands import options
+from neurocal_cli.commands.pictures import write_plot
+from neurocal_cli.commands.places import check_one_stdin, check_outputs
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note
-from neurocal_cli.commands.summaries import print_summary
+from neurocal_cli.commands.streams import note, print_summary
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import DegenerateGeometryError, UsageError
 
@@ -25,7 +25,7 @@ _FLAT_VIEWS = 10
 _STARTS_SIGMA = 0.5  # px
 
 
-class _Command(Command):
+class _Command(options.Command):
     """A command that takes several values after --sigma, as in ``--sigma 0.5 1 2``."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -49,89 +49,66 @@ def _is_number(word: str) -> bool:
 
 
 @click.command(cls=_Command)
-@click.option(
+@options.path(
     "--camera",
-    metavar="CAMERA.yaml",
-    type=INPUT,
-    show_default="the camera of the paper's Table 1",
-    help="The true camera: a neurocal, ROS or OpenCV file. A neurocal file also brings its points and poses.",
+    "CAMERA.yaml",
+    "The true camera: a neurocal, ROS or OpenCV file. A neurocal file also brings its points and poses.",
+    without="the camera of the paper's Table 1",
 )
-@click.option(
+@options.path(
     "--board",
-    metavar="BOARD.yaml",
-    type=INPUT,
-    show_default="two boards at a right angle, 440 points",
-    help="The target, as for detect; the points are its mid-points.",
+    "BOARD.yaml",
+    "The target, as for detect; the points are its mid-points.",
+    without="two boards at a right angle, 440 points",
 )
-@click.option(
+@options.count(
     "--views",
-    metavar="N",
-    type=click.IntRange(1, 1000),
-    show_default="1, and 10 of a flat board",
-    help="Number of random poses of the target. Without it, that of Table 1 or those of CAMERA.yaml.",
+    "N",
+    "Number of random poses of the target. Without it, that of Table 1 or those of CAMERA.yaml.",
+    without="1, and 10 of a flat board",
+    most=1000,
 )
-@click.option(
+@options.number(
     "--sigma",
-    metavar="PX...",
-    type=FiniteNumber(positive=True),
-    multiple=True,
+    "PX...",
+    "Standard deviations of the noise in u and in v.",
+    without="0.1 0.2 0.5 1 2",
     default=_SIGMA,
-    show_default="0.1 0.2 0.5 1 2",
-    help="Standard deviations of the noise in u and in v.",
+    positive=True,
+    multiple=True,
 )
-@click.option(
-    "--trials",
-    metavar="N",
-    type=click.IntRange(min=1),
-    default=50,
-    help="Number of trials at each sigma, as in the paper.",
-)
-@methods_option(_DEFAULT_METHODS)
-@click.option(
+@options.count("--trials", "N", "Number of trials at each sigma, as in the paper.", default=50)
+@options.methods(_DEFAULT_METHODS)
+@options.count(
     "--random-starts",
-    metavar="N",
-    type=click.IntRange(min=0),
+    "N",
+    "Number of single random starts of the network and of plain Levenberg-Marquardt; 0 leaves them out.",
     default=50,
-    help="Number of single random starts of the network and of plain Levenberg-Marquardt; 0 leaves them out.",
+    least=0,
 )
-@click.option(
+@options.flag(
     "--rates",
-    is_flag=True,
-    show_default="noise and random starts",
-    help="Study the two learning rates of backprop instead, on many data sets.",
+    "Study the two learning rates of backprop instead, on many data sets.",
+    without="noise and random starts",
 )
-@click.option(
-    "--data-sets",
-    metavar="N",
-    type=click.IntRange(min=1),
-    default=70,
-    help="With --rates: number of data sets.",
-)
-@click.option(
-    "--seed", metavar="S", type=click.IntRange(min=0), default=0, help="Seed of everything that is random."
-)
-@click.option(
+@options.count("--data-sets", "N", "With --rates: number of data sets.", default=70)
+@options.count("--seed", "S", "Seed of everything that is random.", default=0, least=0)
+@options.count(
     "--jobs",
-    metavar="N",
-    type=click.IntRange(min=1),
-    show_default="the number of cores",
-    help="Number of processes; the results are the same for any number.",
+    "N",
+    "Number of processes; the results are the same for any number.",
+    without="the number of cores",
 )
-@click.option(
-    "--save",
-    metavar="DIR",
-    type=click.Path(readable=False),
-    show_default="none",
-    help="Write the true camera, its exact points and noisy points of each sigma to this folder.",
+@options.path(
+    "--save", "DIR", "Write the true camera, its exact points and noisy points of each sigma to this folder."
 )
-@click.option(
+@options.flag(
     "--images",
-    is_flag=True,
-    show_default="points only",
-    help="With --save: also write rendered images of the target, and the exact points that they show.",
+    "With --save: also write rendered images of the target, and the exact points that they show.",
+    without="points only",
 )
-@plot_option("the errors over the noise and the random starts, or with --rates the rates,")
-@json_option
+@options.plot("the errors over the noise and the random starts, or with --rates the rates,")
+@options.json
 def simulate(
     camera: str | None,
     board: str | None,
@@ -178,21 +155,44 @@ def simulate(
     """  # noqa: D301 - as in the group
     check_one_stdin(camera, board)
     _check(rates, save, images, (camera, board, views))
-    if plot is not None:
-        check_plot(plot, "-")
+    options.check_plot(plot, "-")
     check_outputs((plot,), (camera, board))
     compute_in_one_thread()
 
     from neurocal_cli.processes import usable_cores
 
-    processes = jobs or usable_cores()
+    jobs = jobs or usable_cores()
     if rates:
-        _rates(data_sets, seed, processes, plot, as_json)
+        _rates(data_sets, seed, jobs, plot, as_json)
         return
     scene, paper = _scene(camera, board, views, seed)
     if save is not None:
         _save(scene, save, sigma, seed, images)
-    _compare(scene, paper, sigma, trials, methods, random_starts, seed, processes, plot, as_json)
+    from neurocal_cli.simulation.noise import study_noise
+    from neurocal_cli.simulation.report import noise_json, simulation_tables, starts_json, text_of
+    from neurocal_cli.simulation.starts import study_starts
+
+    levels = tuple(sorted(set(sigma)))
+    with ProgressBar() as progress:
+        study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
+        starts = None
+        if random_starts:
+            try:
+                starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
+            except DegenerateGeometryError as error:
+                note([f"no random starts: {error}"])
+    if plot is not None:
+        from neurocal_cli.simulation.plots import draw_simulation
+
+        write_plot(plot, partial(draw_simulation, study, starts, scene.unit))
+    if as_json:
+        found: dict[str, Any] = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
+        found |= noise_json(study)
+        if starts is not None:
+            found["random_starts"] = starts_json(starts)
+        print_summary(found)
+    else:
+        click.echo(text_of(*simulation_tables(study, starts, paper)))
 
 
 def _check(rates: bool, save: str | None, images: bool, scene: tuple[object, ...]) -> None:
@@ -235,71 +235,20 @@ def _scene(
     return scenes.scene_of(camera, board, poses), False
 
 
-def _compare(
-    scene: SimulatedScene,
-    paper: bool,
-    sigma: tuple[float, ...],
-    trials: int,
-    methods: tuple[str, ...],
-    random_starts: int,
-    seed: int,
-    jobs: int,
-    plot: str | None,
-    as_json: bool,
-) -> None:
-    from neurocal_cli.simulation.noise import study_noise
-    from neurocal_cli.simulation.report import noise_json, simulation_tables, starts_json
-    from neurocal_cli.simulation.starts import study_starts
-
-    levels = tuple(sorted(set(sigma)))
-    with ProgressBar() as progress:
-        study = study_noise(scene, levels, trials, methods, seed, jobs, progress)
-        starts = None
-        if random_starts:
-            try:
-                starts = study_starts(scene, _STARTS_SIGMA, random_starts, seed, jobs, progress)
-            except DegenerateGeometryError as error:
-                note([f"no random starts: {error}"])
-    if plot is not None:
-        from neurocal_cli.io.writing import write_whole
-        from neurocal_cli.simulation.plots import draw_simulation
-
-        write_whole(plot, draw_simulation(study, starts, scene.unit, _kind(plot)))
-    if as_json:
-        found: dict[str, Any] = {"n_points": len(scene.world), "n_views": len(scene.poses), "seed": seed}
-        found |= noise_json(study)
-        if starts is not None:
-            found["random_starts"] = starts_json(starts)
-        print_summary(found)
-    else:
-        _show(*simulation_tables(study, starts, paper))
-
-
 def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool) -> None:
     from neurocal_cli.simulation.rates import study_rates
-    from neurocal_cli.simulation.report import rates_json, rates_tables
+    from neurocal_cli.simulation.report import rates_json, rates_tables, text_of
 
     with ProgressBar() as progress:
         study = study_rates(data_sets, seed, jobs, progress)
     if plot is not None:
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.simulation.plots import draw_rates
 
-        write_whole(plot, draw_rates(study, _kind(plot)))
+        write_plot(plot, partial(draw_rates, study))
     if as_json:
         print_summary(rates_json(study))
     else:
-        _show(*rates_tables(study))
-
-
-def _show(tables: list[tuple[str, list[list[str]]]], below: list[str]) -> None:
-    from neurocal_cli.simulation.report import text_of
-
-    click.echo(text_of(tables, below))
-
-
-def _kind(plot: str) -> str:
-    return os.path.splitext(plot)[1][1:].lower()
+        click.echo(text_of(*rates_tables(study)))
 
 
 def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: int, images: bool) -> None:

@@ -4,52 +4,35 @@ from __future__ import annotations
 
 import os
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from functools import partial
 
 import click
 
+from neurocal_cli.commands import options
 from neurocal_cli.commands.calibration_options import Estimation, estimation_options_without_files
-from neurocal_cli.commands.options import (
-    INPUT,
-    Command,
-    input_argument,
-    lean_option,
-    output_option,
-)
 from neurocal_cli.commands.pages import html_option, write_page
 from neurocal_cli.commands.pictures import Plots, check_plots, panels_option, write_plots
-from neurocal_cli.commands.places import check_outputs
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
 from neurocal_cli.commands.progress import ProgressBar
-from neurocal_cli.commands.streams import check_one_stdin, note, say, warn
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands.streams import note, print_summary, say, warn
 from neurocal_cli.commands.threads import compute_in_one_thread
 from neurocal_cli.errors import UsageError
 from neurocal_cli.plots import RIG_PANELS
 
-if TYPE_CHECKING:
-    from neurocal_cli.points import Correspondences
-    from neurocal_cli.stereo.rig import Rig
-
 _NOT_CONVERGED = 3
 
 
-@click.command(cls=Command)
-@input_argument("left", "LEFT.csv", "Points of the left camera; - is standard input.")
-@input_argument("right", "RIGHT.csv", "Points of the right camera.")
+@click.command(cls=options.Command)
+@options.argument("left", "LEFT.csv", "Points of the left camera; - is standard input.")
+@options.argument("right", "RIGHT.csv", "Points of the right camera.")
 @estimation_options_without_files
-@click.option(
+@options.path(
     "--left-intrinsics",
-    type=INPUT,
-    metavar="CAMERA.yaml",
-    show_default="none",
-    help="The left camera, if it is known: a neurocal, ROS or OpenCV file. Only its poses are estimated.",
+    "CAMERA.yaml",
+    "The left camera, if it is known: a neurocal, ROS or OpenCV file. Only its poses are estimated.",
 )
-@click.option(
-    "--right-intrinsics",
-    type=INPUT,
-    metavar="CAMERA.yaml",
-    show_default="none",
-    help="The right camera, if it is known. Only its poses are estimated.",
+@options.path(
+    "--right-intrinsics", "CAMERA.yaml", "The right camera, if it is known. Only its poses are estimated."
 )
 @click.option(
     "--alpha",
@@ -59,19 +42,16 @@ _NOT_CONVERGED = 3
     help="Zoom of the rectified images: 0 shows valid pixels only, 1 shows all pixels of the original "
     "images.",
 )
-@click.option(
+@options.path(
     "--ros",
-    nargs=2,
-    metavar="LEFT.yaml RIGHT.yaml",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Also write two camera_info files for the stereo nodes of ROS, in metres.",
+    "LEFT.yaml RIGHT.yaml",
+    "Also write two camera_info files for the stereo nodes of ROS, in metres.",
 )
 @panels_option("the residuals, coverage and uncertainty of both cameras and the poses", RIG_PANELS)
 @html_option
-@lean_option
-@summary_option
-@output_option("RIG.yaml", "the rig")
+@options.lean
+@options.summary
+@options.output("RIG.yaml", "Write the rig to this file.")
 @click.pass_context
 def stereo(
     ctx: click.Context,
@@ -136,10 +116,37 @@ def stereo(
     _check_outputs(output, ros)
     inputs = left, right, left_intrinsics, right_intrinsics
     check_outputs((output, html, *(ros or ()), *(file for _, file in plots)), inputs)
-    rig = _estimate((left, right), sides, estimation)
-    _write(rig, output, alpha, ros, plots, lean)
+    from neurocal_cli.io.points_csv import read_points
+    from neurocal_cli.io.result_files import write_result
+    from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
+    from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
+
+    prepared = []
+    for name, side in zip((left, right), sides, strict=True):
+        notes: list[str] = []
+        prepared.append(side.prepare(read_points(name, notes=notes)))
+        note(notes)
+    points, arguments = zip(*prepared, strict=True)
+    with ProgressBar() as progress:
+        rig = calibrate_stereo(*points, *arguments, outliers=estimation.outliers, progress=progress)
+    if plots:
+        from neurocal_cli.plots.pages import draw_rig
+
+        write_plots(plots, partial(draw_rig, rig))
+    if ros is not None:
+        from neurocal_cli.io.rig_yaml import format_ros_pair
+        from neurocal_cli.io.writing import write_whole
+
+        for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
+            write_whole(name, text)
+    warn(write_result(rig, output, lean=lean, alpha=alpha))
     write_page(html, rig, *inputs)
-    _report(rig, as_json)
+    note(views_alone(rig.alone))
+    if as_json:
+        print_summary(rig_json(rig))
+    else:
+        say(rig_report(rig))
+    warn(rig.warnings)
     if not rig.converged:
         ctx.exit(_NOT_CONVERGED)
 
@@ -172,57 +179,3 @@ def _check_outputs(output: str, ros: tuple[str, str] | None) -> None:
     names = [os.path.realpath(name) for name in (output, *(ros or ())) if name != "-"]
     if len(set(names)) < len(names):
         raise UsageError("-o and --ros name the same file twice; give three different files")
-
-
-def _estimate(names: tuple[str, str], sides: tuple[Estimation, Estimation], estimation: Estimation) -> Rig:
-    from neurocal_cli.io.points_csv import read_points
-
-    points: list[Correspondences] = []
-    arguments = []
-    for name, side in zip(names, sides, strict=True):
-        notes: list[str] = []
-        one, given = side.prepare(read_points(name, notes=notes))
-        note(notes)
-        points.append(one)
-        arguments.append(given)
-
-    from neurocal_cli.stereo.calibrate_stereo import calibrate_stereo
-
-    with ProgressBar() as progress:
-        return calibrate_stereo(
-            points[0],
-            points[1],
-            arguments[0],
-            arguments[1],
-            outliers=estimation.outliers,
-            progress=progress,
-        )
-
-
-def _write(
-    rig: Rig, output: str, alpha: float | None, ros: tuple[str, str] | None, plots: Plots, lean: bool
-) -> None:
-    """Write all files."""
-    from neurocal_cli.io.result_files import write_result
-    from neurocal_cli.io.rig_yaml import format_ros_pair
-    from neurocal_cli.io.writing import write_whole
-
-    if plots:
-        from neurocal_cli.plots.pages import draw_rig
-
-        write_plots(plots, lambda kind, panel: draw_rig(rig, kind, panel))
-    if ros is not None:
-        for name, text in zip(ros, format_ros_pair(rig, alpha), strict=True):
-            write_whole(name, text)
-    warn(write_result(rig, output, lean=lean, alpha=alpha))
-
-
-def _report(rig: Rig, as_json: bool) -> None:
-    from neurocal_cli.stereo.report import rig_json, rig_report, views_alone
-
-    note(views_alone(rig.alone))
-    if as_json:
-        print_summary(rig_json(rig))
-    else:
-        say(rig_report(rig))
-    warn(rig.warnings)

@@ -1,14 +1,13 @@
-"""What a command says on stderr, so that stdout holds results only."""
+"""What a command says: all on stderr, so that stdout holds results only, such as a summary for programs."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Sequence
 from contextvars import ContextVar
-from typing import TextIO
+from typing import Any, TextIO
 
 import click
-
-from neurocal_cli.errors import UsageError
 
 TYPED = "neurocal.typed"  # where a context keeps the words of the command line
 
@@ -67,7 +66,11 @@ def is_terminal(stream: TextIO | None) -> bool:
     return stream is not None and not stream.closed and stream.isatty()
 
 
-def check_one_stdin(*names: str | None) -> None:
-    """Refuse a request to read standard input twice."""
-    if names.count("-") > 1:
-        raise UsageError("standard input (-) can be read only once; give the other inputs as files")
+def some_of(names: Sequence[str]) -> str:
+    """The first of several names, and how many there are more."""
+    return names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
+
+
+def print_summary(tree: dict[str, Any]) -> None:
+    """Print what a command found as JSON on stdout; None for numbers that do not exist."""
+    click.echo(json.dumps(tree, indent=2, allow_nan=False))

@@ -12,16 +12,17 @@ from neurocal_cli.commands.streams import is_terminal
 _WIDEST = 10_000  # characters; no table is wider
 
 
-def show(report: str, tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str] = ()) -> None:
-    """Print a report on stdout: plain text, or its tables, drawn, and lines below them on a terminal."""
+def show(tables: Sequence[Sequence[Sequence[str]]], below: Sequence[str]) -> None:
+    """Print tables and lines below them on stdout: plain text, or the tables drawn on a terminal."""
+    from neurocal_cli.report import align
+
     if not is_terminal(sys.stdout):
-        click.echo(report)
+        blocks = [*map(align, tables), *([below] if below else [])]
+        click.echo("\n\n".join("\n".join(block) for block in blocks))
         return
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
-
-    from neurocal_cli.report import align
 
     console = Console()
     for rows in tables:

@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import os
+from functools import partial
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    check_plot,
-    input_argument,
-    output_option,
-    plot_option,
-)
-from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import say
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands import options
+from neurocal_cli.commands.pictures import write_plot
+from neurocal_cli.commands.places import check_outputs, check_summary
+from neurocal_cli.commands.streams import print_summary, say
 from neurocal_cli.errors import InputError
 
 
-@click.command(cls=Command)
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument(
     "camera", "CAMERA.yaml", "A calibration that `neurocal calibrate` wrote; - is standard input."
 )
-@plot_option("the heights of the board's points and their shifts")
-@summary_option
-@output_option("BOARD.yaml", "the board")
+@options.plot("the heights of the board's points and their shifts")
+@options.summary
+@options.output("BOARD.yaml", "Write the board to this file.")
 def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
     """Write the board as it was found.
 
@@ -42,7 +36,7 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
       neurocal target camera.yaml -o board.yaml --plot board.png --json
       neurocal calibrate sample_data/bent.csv | neurocal target - -o board.yaml
     """  # noqa: D301 - as in the group
-    check_plot(plot, output)
+    options.check_plot(plot, output)
     check_summary(as_json, output)
     check_outputs((output, plot), (camera,))
 
@@ -58,11 +52,9 @@ def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
             "--target free to find it"
         )
     if plot is not None:
-        from neurocal_cli.io.writing import write_whole
         from neurocal_cli.target_plot import draw_target
 
-        kind = os.path.splitext(plot)[1][1:].lower()
-        write_whole(plot, draw_target(calibration.target, calibration.unit, kind))
+        write_plot(plot, partial(draw_target, calibration.target, calibration.unit))
     board = board_of(calibration.target, calibration.unit, calibration.points.distances)
     write_board(board, output)
     if as_json:

@@ -6,80 +6,52 @@ from functools import partial
 
 import click
 
-from neurocal_cli.commands.options import (
-    Command,
-    FiniteNumber,
-    alpha_option,
-    check_alpha,
-    input_argument,
-    interpolation_option,
-)
-from neurocal_cli.commands.places import check_outputs
-from neurocal_cli.commands.streams import check_one_stdin, say
-from neurocal_cli.commands.summaries import check_summary, print_summary, summary_option
+from neurocal_cli.commands import options
+from neurocal_cli.commands.places import check_one_stdin, check_outputs, check_summary
+from neurocal_cli.commands.streams import print_summary, say
 from neurocal_cli.commands.undistorted_places import check_distinct, places_of
 from neurocal_cli.errors import UsageError
 
 
-@click.command(cls=Command)
-@input_argument("camera", "CAMERA.yaml", "The camera, a neurocal, ROS or OpenCV file; - is standard input.")
-@input_argument(
+@click.command(cls=options.Command)
+@options.argument("camera", "CAMERA.yaml", "The camera, a neurocal, ROS or OpenCV file; - is standard input.")
+@options.argument(
     "files",
     "FILE...",
     "Images (PNG, JPEG, TIFF, BMP, PGM or PPM, of 8 or 16 bits, grey or colour), folders of "
     "images, file name patterns, or CSV files of points; - is points from standard input.",
     nargs=-1,
 )
-@click.option(
+@options.choice(
     "--to",
-    "shape",
-    type=click.Choice(["plane", "cylinder", "equirectangular"]),
-    default="plane",
-    help="What to project on. A plane keeps straight lines straight and shows less than 180 degrees; a "
+    "plane cylinder equirectangular",
+    "What to project on. A plane keeps straight lines straight and shows less than 180 degrees; a "
     "cylinder keeps vertical lines straight, and equirectangular shows all there is.",
+    default="plane",
+    to="shape",
 )
-@click.option(
+@options.number(
     "--fov",
-    metavar="DEG",
-    type=FiniteNumber(),
-    show_default="a plane keeps the scale of the middle, the others show the image from left to right",
-    help="Field of view of the result from left to right, in degrees.",
+    "DEG",
+    "Field of view of the result from left to right, in degrees.",
+    without="a plane keeps the scale of the middle, the others show the image from left to right",
 )
-@click.option(
-    "--size",
-    nargs=2,
-    type=click.IntRange(2, 32767),
-    metavar="W H",
-    show_default="that of the images",
-    help="Size of the result in pixels.",
+@options.count(
+    "--size", "W H", "Size of the result in pixels.", without="that of the images", least=2, most=32767
 )
-@alpha_option("keep the camera matrix")
-@interpolation_option
-@click.option(
+@options.alpha("keep the camera matrix")
+@options.interpolation
+@options.path(
     "--camera",
-    "new_camera",
-    metavar="NEW.yaml",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Write the camera of the undistorted images to this file: a ROS camera_info without distortion, or "
+    "NEW.yaml",
+    "Write the camera of the undistorted images to this file: a ROS camera_info without distortion, or "
     "for --to cylinder and equirectangular the formula.",
+    to="new_camera",
 )
-@click.option(
-    "--maps",
-    metavar="FILE.npz",
-    type=click.Path(writable=False, readable=False),
-    show_default="none",
-    help="Write the tables u and v for cv2.remap to this file.",
-)
-@summary_option
-@click.option(
-    "-o",
-    "--output",
-    metavar="DIR|FILE",
-    type=click.Path(writable=False, readable=False, allow_dash=True),
-    default="-",
-    show_default="standard output",
-    help="Write to this folder, under the names of the inputs. A single input may go to a file.",
+@options.path("--maps", "FILE.npz", "Write the tables u and v for cv2.remap to this file.")
+@options.summary
+@options.output(
+    "DIR|FILE", "Write to this folder, under the names of the inputs. A single input may go to a file."
 )
 def undistort(
     camera: str,
@@ -131,7 +103,6 @@ def undistort(
     if not files and maps is None and new_camera is None:
         raise UsageError("there is nothing to undistort; give FILE, --maps or --camera")
     check_summary(as_json and bool(files), output)
-    from neurocal_cli.commands.undistorted_view import summary, tell_loss, write_camera, write_maps
     from neurocal_cli.commands.undistorting import Undistorting
     from neurocal_cli.distortion.undistortion import chosen_view
     from neurocal_cli.io.camera_files import read_intrinsics
@@ -147,20 +118,20 @@ def undistort(
     failed = work.correct_all(paths, outputs)
     work.tell_notes()
     if new_camera is not None:
-        write_camera(work, new_camera)
+        work.write_camera(new_camera)
     if maps is not None:
-        write_maps(work, maps)
+        work.write_maps(maps)
     if as_json:
         written = {path: place for path, place in zip(paths, outputs, strict=True) if path not in failed}
-        print_summary({"files": written, "failed": failed, **summary(work)})
+        print_summary({"files": written, "failed": failed, **work.summary()})
         return
-    tell_loss(work)
+    work.tell_loss()
     if len(paths) > 1:
         say(f"undistorted {len(paths) - len(failed)} of {len(paths)} files")
 
 
 def _check_view(shape: str, fov: float | None, size: tuple[int, int] | None, alpha: float | None) -> None:
-    check_alpha(alpha)
+    options.check_alpha(alpha)
     if alpha is not None and (shape != "plane" or fov is not None or size is not None):
         raise UsageError(
             "--alpha chooses the field of view and keeps the size; leave out --to, --fov and --size"

@@ -1,22 +1,25 @@
-"""The files of ``neurocal undistort``, corrected one by one."""
+"""The files of ``neurocal undistort``, corrected one by one, and what the results show."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.commands.progress import each_of
-from neurocal_cli.commands.streams import note
-from neurocal_cli.distortion.undistorted_view import Undistorted
+from neurocal_cli.commands.streams import note, say, some_of
+from neurocal_cli.distortion.panorama import Panorama
+from neurocal_cli.distortion.undistorted_view import Undistorted, field_of_view
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.image_paths import is_image
 from neurocal_cli.io.writing import write_whole
 
 if TYPE_CHECKING:
     from neurocal_cli.distortion.remapping import Remapping
+
+_UNTOLD = 2.0  # degrees that nobody misses
 
 
 @dataclass
@@ -79,8 +82,62 @@ class Undistorting:
     def tell_notes(self) -> None:
         """Say what was done to images, each thing once."""
         for text, names in self.notes.items():
-            some = names[0] if len(names) == 1 else f"{names[0]} and {len(names) - 1} more"
-            note([f"{some}: {text}"])
+            note([f"{some_of(names)}: {text}"])
+
+    def tell_loss(self) -> None:
+        """Say how much of a wide lens's field of view the results leave out."""
+        if not self.camera.distortion.wide or self.size is None:
+            return
+        parts = [
+            f"{shown:.0f} of the {there:.0f} degrees {where}"
+            for shown, there, where in zip(
+                *self._fields_of_view(self.size), ("from left to right", "from top to bottom"), strict=True
+            )
+            if there - shown >= _UNTOLD
+        ]
+        if parts:
+            shape = self._described()["projection"]
+            more = {"plane": "--to cylinder", "cylinder": "--to equirectangular"}.get(
+                shape, "another --fov or --size"
+            )
+            name = f"a {shape}" if shape != "equirectangular" else "the picture"
+            say(f"{name} shows {' and '.join(parts)} that the images span; {more} shows more")
+
+    def summary(self) -> dict[str, Any]:
+        """What the results are, for programs."""
+        shown, spanned = (None, None) if self.size is None else self._fields_of_view(self.size)
+        camera = {key: getattr(x, "tolist", lambda x=x: x)() for key, x in self._described().items()}
+        return {"n_left_out": self.left_out, "shown_deg": shown, "spanned_deg": spanned, "camera": camera}
+
+    def write_camera(self, path: str) -> None:
+        """Write the camera of what was corrected."""
+        from neurocal_cli.io.camera_info import format_camera_info, format_panorama
+
+        new = self.new()
+        if isinstance(new, Panorama):
+            write_whole(path, format_panorama(new))
+        else:
+            write_whole(path, format_camera_info(replace(new, image_size=new.image_size or self.size)))
+
+    def write_maps(self, path: str) -> None:
+        """Write the tables, and the camera of the pictures that they make."""
+        from neurocal_cli.io.exchange.dictionary import npz_bytes
+
+        u, v = self.remap().tables()
+        write_whole(path, npz_bytes({"u": u, "v": v, **self._described()}))
+
+    def _fields_of_view(self, size: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float]]:
+        """What the results show and what the images span, from left to right and top to bottom [degrees]."""
+        new = self.new()
+        whole = field_of_view(self.camera, size)
+        return field_of_view(new, new.image_size or size).common(whole).degrees, whole.degrees
+
+    def _described(self) -> dict[str, Any]:
+        """The camera of the results, by names."""
+        new = self.new()
+        if isinstance(new, Panorama):
+            return {"projection": new.shape, "f": new.f, "u0": new.u0, "v0": new.v0}
+        return {"projection": "plane", "K": new.A}
 
     def _correct(self, place: tuple[str, str]) -> None:
         path, output = place
@@ -92,15 +149,15 @@ class Undistorting:
     def _image(self, path: str, output: str) -> bytes:
         from neurocal_cli.io.images import encode_image, read_picture
 
-        picture = read_picture(path)
-        self.size = self.size or picture.size
+        pixels, source, notes = read_picture(path)
+        self.size = self.size or (pixels.shape[1], pixels.shape[0])
         remapping = self.remap()
         try:
-            corrected = remapping(picture.pixels)
+            corrected = remapping(pixels)
             content = encode_image(corrected, ".png" if output == "-" else os.path.splitext(output)[1])
         except InputError as error:
-            raise InputError(f"{picture.source}: {error}") from error
-        for text in picture.notes:
+            raise InputError(f"{source}: {error}") from error
+        for text in notes:
             self.notes.setdefault(text, []).append(path)
         return content
 

@@ -7,6 +7,7 @@ from html import escape
 
 from neurocal_cli import __version__
 from neurocal_cli.calibration import Verdict
+from neurocal_cli.verdict.report import facts
 
 _LONG = 40  # characters of a cell, beyond which it is a text
 
@@ -118,18 +119,16 @@ def figure(drawing: str, caption: str) -> str:
     return f"<figure>{drawing}<figcaption>{escape(caption)}</figcaption></figure>" if drawing else ""
 
 
-def verdict_block(verdict: Verdict | None, facts: str) -> str:
+def verdict_block(verdict: Verdict | None) -> str:
     """The word, what it rests on, the reasons and the advice."""
     if verdict is None:
-        return (
-            f'<div class="verdict">no verdict: the file has no points to be judged by. {escape(facts)}</div>'
-        )
+        return '<div class="verdict">no verdict: the file has no points to be judged by. </div>'
     lists = ""
     for title, entries in (("Reasons", verdict.reasons), ("Advice", verdict.advice)):
         if entries:
             lists += f"<p>{title}</p><ul>{''.join(f'<li>{escape(entry)}</li>' for entry in entries)}</ul>"
     word = escape(verdict.word)  # of a file that anybody may have written
-    return f'<div class="verdict {word}"><b>{word}</b> <span>{escape(facts)}</span>{lists}</div>'
+    return f'<div class="verdict {word}"><b>{word}</b> <span>{escape(facts(verdict))}</span>{lists}</div>'
 
 
 def definitions(entries: Mapping[str, str]) -> str:

@@ -7,7 +7,7 @@ from html import escape
 
 import numpy as np
 
-from neurocal_cli.calibration import Calibration, Verdict
+from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.html_report.drawings import enlargement, error_bars, residual_map, scatter
@@ -18,7 +18,6 @@ from neurocal_cli.report import parameter_rows, printable
 from neurocal_cli.stereo.report import camera_rows, rig_rows
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.verdict.assessment import uncertainty_over_image
-from neurocal_cli.verdict.report import verdict_lines
 from neurocal_cli.zoom_lens.judgement import judge_lens
 from neurocal_cli.zoom_lens.report import lens_report
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
@@ -43,9 +42,9 @@ def calibration_page(
     head = f"{size}, {len(calibration.views)} views, {len(calibration.points)} points, distortion model "
     parts = [
         f'<p class="soft">{escape(head + calibration.distortion_model)}</p>',
-        verdict_block(calibration.verdict, _facts(calibration.verdict)),
+        verdict_block(calibration.verdict),
         *_camera_parts(calibration, photographs or {}),
-        _repeat(_command(calibration), calibration, origin),
+        _repeat(f"neurocal calibrate POINTS.csv{_options(calibration)}", calibration, origin),
     ]
     return page(f"Calibration of {printable(calibration.camera_name)}", parts)
 
@@ -65,7 +64,7 @@ def rig_page(
     left_out += [[printable(f"{a} / {b}"), reason] for (a, b), reason in rig.left_out.items()]
     parts = [
         f'<p class="soft">{escape(head)}</p>',
-        verdict_block(rig.verdict, _facts(rig.verdict)),
+        verdict_block(rig.verdict),
         section("The right camera relative to the left one", table(rig_rows(rig))),
         section("Both cameras", table(camera_rows(rig))),
         section("Pairs", table(pairs, sortable=True) if len(pairs) > 1 else ""),
@@ -85,7 +84,7 @@ def lens_page(lens: ZoomLens, origin: Origin) -> str:
     """The page of a zoom lens; see `calibration_page`."""
     verdict = judge_lens(lens)
     parts = [
-        verdict_block(verdict, _facts(verdict)),
+        verdict_block(verdict),
         section("Summary", f'<div class="wide"><pre>{escape(lens_report(lens))}</pre></div>'),
         section("Uncertainty over the settings", f'<div class="figures">{_over_settings(lens)}</div>'),
         section(
@@ -257,15 +256,6 @@ def _warnings(warnings: tuple[str, ...]) -> str:
     return section("Warnings", f"<ul>{entries}</ul>" if entries else "")
 
 
-def _facts(verdict: Verdict | None) -> str:
-    """What a verdict rests on, as its report has it."""
-    if verdict is None:
-        return ""
-    return "; ".join(
-        line.strip() for line in verdict_lines(verdict)[1:] if not line.startswith(("  reason:", "  advice:"))
-    )
-
-
 def _size(calibration: Calibration) -> str:
     size = calibration.image_size
     return "images of unknown size" if size is None else f"images of {size[0]} x {size[1]} px"
@@ -282,10 +272,6 @@ def _options(calibration: Calibration) -> str:
     if not calibration.intrinsics.skewed:
         options += " --no-skew"
     return f"{options} --seed {calibration.seed}"
-
-
-def _command(calibration: Calibration) -> str:
-    return f"neurocal calibrate POINTS.csv{_options(calibration)}"
 
 
 def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:

@@ -10,7 +10,8 @@ import numpy as np
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.distances import Distance
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import FormatError
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
@@ -76,12 +77,10 @@ def _board(root: Field) -> Board:
     fields = list(root["planes"].items())
     if not fields:
         root["planes"].fail("a list of at least one plane")
-    unit = root["unit"].text() if "unit" in root else "mm"
+    unit = root.get("unit", "mm").text()
     planes = tuple(_plane(field, alone=len(fields) == 1) for field in fields)
-    try:
+    with value_failures(root.source, "planes: "):
         board = Board(planes, unit)
-    except InputError as error:
-        raise FormatError(f"planes: {error}", root.source) from error
     return replace(board, distances=_distances(root, board)) if "distances" in root else board
 
 
@@ -90,12 +89,10 @@ def _distances(root: Field, board: Board) -> tuple[Distance, ...]:
     for field in root["distances"].items():
         _only(field, _DISTANCE_KEYS)
         start, end = (field[key].text() for key in ("from", "to"))
-        try:
+        with value_failures(field.source, f"{field.path}: "):
             found.append(Distance(start, end, field["length"].number(), field["std"].number()))
             for label in (start, end):
                 board.place(label)
-        except InputError as error:
-            raise FormatError(f"{field.path}: {error}", field.source) from error
     return tuple(found)
 
 
@@ -110,15 +107,13 @@ def _plane(field: Field, *, alone: bool) -> Plane:
     if "points" in field:
         place["measured"] = tuple(map(tuple, field["points"].array(-1, 5).tolist()))
     name = field["name"].text() if not alone or "name" in field else ""
-    try:
+    with value_failures(field.source, f"{field.path}."):
         return Plane(name, cols, rows, square, **place)
-    except InputError as error:
-        raise FormatError(f"{field.path}.{error}", field.source) from error
 
 
 def _only(field: Field, known: tuple[str, ...]) -> None:
     """Refuse keys that would be passed over: a misspelt axis would silently be the default one."""
-    for key in field.keys():  # noqa: SIM118
+    for key in field.entries():
         if key not in known:
             where = f"{field.path}: " if field.path else ""
             raise FormatError(

@@ -9,7 +9,9 @@ from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.calibration_yaml import FORMATS
+from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.distortion_names import own_length
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.named_entries import read_named
 from neurocal_cli.io.observations_yaml import read_observations
 from neurocal_cli.io.rejected_yaml import read_rejected
@@ -71,15 +73,17 @@ def calibration_from_field(root: Field) -> Calibration:
         distortion=coefficients,
         covariance=covariance,
         covariance_names=names,
-        network=_network(block.get("network")),
-        straight_lines=_straight_lines(block.get("straight_lines")),
-        camera_name=root["camera_name"].text() if "camera_name" in root else "camera",
-        warnings=tuple(entry.text() for entry in block["warnings"].items()) if "warnings" in block else (),
+        network=block.read("network", _network),
+        straight_lines=block.read("straight_lines", _straight_lines),
+        camera_name=root.get("camera_name", "camera").text(),
+        warnings=tuple(block.get("warnings", []).texts()),
         rejected=rejected,
-        target=read_target(block.get("target")),
-        judgement=read_verdict(block.get("verdict")),
-        lens_choice=_lens_choice(block.get("lens_choice")),
-        target_stretched=block["target_stretched"].number() if "target_stretched" in block else 0.0,
+        target=block.read("target", read_target),
+        judgement=block.read("verdict", read_verdict),
+        lens_choice={
+            name: error.number_or_nan() for name, error in block.get("lens_choice", {}).entries().items()
+        },
+        target_stretched=block.get("target_stretched", 0.0).number(),
     )
 
 
@@ -113,11 +117,11 @@ def intrinsics_from_field(root: Field) -> tuple[Intrinsics, dict[str, float], fr
     values = [parameters[name]["value"].number() for name in INTRINSIC_NAMES]
     std = {}
     fixed = set()
-    for name in parameters.keys():  # noqa: SIM118 - a Field, not a dict
-        entry = parameters[name]
-        if "std" in entry.keys():  # noqa: SIM118
+    for name, parameter in parameters.entries().items():
+        entry = parameter.entries()
+        if "std" in entry:
             std[name] = entry["std"].number_or_nan()
-        if "fixed" in entry and entry["fixed"].boolean():
+        if parameter.get("fixed", False).boolean():
             fixed.add(name)
     try:
         intrinsics = Intrinsics(*values)
@@ -145,10 +149,8 @@ def _type(field: Field) -> int:
 
 
 def _covariance(block: Field) -> tuple[tuple[str, ...], Array]:
-    field = block.get("covariance")
-    if field is None:
-        return (), np.zeros((0, 0))
-    names = tuple(name.text() for name in field["names"].items())
+    field = block.get("covariance", {"names": []})
+    names = tuple(field["names"].texts())
     if not names:
         return (), np.zeros((0, 0))
     return names, field["data"].array(len(names), len(names), unknown=True)
@@ -157,24 +159,16 @@ def _covariance(block: Field) -> tuple[tuple[str, ...], Array]:
 def distortion_from_field(root: Field) -> tuple[str, Array]:
     """Read the distortion model of a neurocal file, by our name, and its coefficients."""
     block = neurocal_block(root)
-    model = block["distortion"].text() if "distortion" in block else "none"
-    try:
+    model = block.get("distortion", "none").text()
+    with value_failures(root.source, f"{block.path}.distortion: "):
         length = own_length(model)
-    except InputError as error:
-        raise FormatError(f"{block.path}.distortion: {error}", root.source) from error
     coefficients = root["distortion_coefficients"]["data"].array(-1)
     if len(coefficients) < length:
         root["distortion_coefficients"]["data"].fail(f"{length} numbers or more")
     return model, coefficients[:length]
 
 
-def _lens_choice(field: Field | None) -> dict[str, float]:
-    return {} if field is None else {name: field[name].number_or_nan() for name in field.keys()}  # noqa: SIM118
-
-
-def _network(field: Field | None) -> NetworkRecord | None:
-    if field is None:
-        return None
+def _network(field: Field) -> NetworkRecord:
     return NetworkRecord(
         W=field["W"].array(3, 3),
         V=_matrices(field["V"], 3, 4),
@@ -193,18 +187,15 @@ def _network(field: Field | None) -> NetworkRecord | None:
 
 def _matrices(field: Field, *shape: int) -> dict[str, Array]:
     """Read a matrix for each view; in a long file the names, and all numbers as texts."""
-    data = field.get("data") if isinstance(field.value, dict) else None
-    if data is None or "views" not in field or not all(isinstance(e.value, str) for e in data.items()):
-        return {view: entry.array(*shape) for view, entry in read_named(field).items()}
-    names = [entry.text() for entry in field["views"].items()]
-    numbers = Field(read_numbers(list(data.items())), data.source, data.path)
-    stack = numbers.array(len(names) * shape[0] * shape[1]).reshape(-1, *shape)
-    return dict(zip(names, stack, strict=True))
+    if "data" in field and "views" in field and all(isinstance(e.value, str) for e in field["data"].items()):
+        names, data = field["views"].texts(), field["data"]
+        numbers = Field(read_numbers(list(data.items())), data.source, data.path)
+        stack = numbers.array(len(names) * shape[0] * shape[1]).reshape(-1, *shape)
+        return dict(zip(names, stack, strict=True))
+    return {view: entry.array(*shape) for view, entry in read_named(field).items()}
 
 
-def _straight_lines(field: Field | None) -> StraightLines | None:
-    if field is None:
-        return None
+def _straight_lines(field: Field) -> StraightLines:
     u, v = field["center"].array(2).tolist()
     return StraightLines(
         n_lines=field["n_lines"].integer(),
@@ -217,10 +208,9 @@ def _straight_lines(field: Field | None) -> StraightLines | None:
 
 def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspondences:
     observations = block["observations"]
-    unit = block["unit"].text() if "unit" in block else "mm"
-    center = block.get("image_center")
-    u0_v0 = None if center is None else tuple(center.array(2).tolist())
-    points = read_observations(observations, unit, _image_size(root), u0_v0, none)
+    unit = block.get("unit", "mm").text()
+    center = block.read("image_center", lambda field: tuple(field.array(2).tolist()))
+    points = read_observations(observations, unit, image_size(root), center, none)
     strange = set() if points.view is None else set(points.view_names) - views
     if strange:
         raise FormatError(
@@ -229,8 +219,3 @@ def _points(root: Field, block: Field, views: set[str], none: bool) -> Correspon
             root.source,
         )
     return points
-
-
-def _image_size(root: Field) -> tuple[int, int] | None:
-    width, height = (root[key].integer() if key in root else 0 for key in ("image_width", "image_height"))
-    return (width, height) if width and height else None

@@ -28,7 +28,7 @@ from neurocal_cli.io.target_yaml import target_lines
 from neurocal_cli.io.text_columns import column_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
 from neurocal_cli.io.views_yaml import alike, view_lines
-from neurocal_cli.io.yaml_text import flow, flows, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import flow, flows, list_lines, mapping, number, quoted, text
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -99,10 +99,9 @@ def calibration_lines(
     by_rows : bool
         See `format_calibration`.
     """
-    long = not by_rows and _is_long(cal)
-    yield from camera_info_lines(
-        cal.camera_name, cal.image_size, cal.K, cal.distortion_model, cal.distortion, rectified
-    )
+    large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
+    long = large and not by_rows and alike(cal.views)
+    yield from camera_info_lines(cal.camera, rectified)
     yield "neurocal:"
     for lines in (
         _record_lines(cal, long),
@@ -117,10 +116,6 @@ def calibration_lines(
     if cal.straight_lines is not None:
         yield f"  straight_lines: {_straight_lines(cal.straight_lines)}"
     yield from (f"  {line}" for line in observation_lines(cal.points, long))
-
-
-def _is_long(cal: Calibration) -> bool:
-    return (len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS) and alike(cal.views)
 
 
 def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
@@ -163,9 +158,7 @@ def _parameter_lines(cal: Calibration) -> Iterator[str]:
         rmse_px=number(cal.rmse_px),
         max_px=number(cal.max_px),
     )
-    yield "warnings:" if cal.warnings else "warnings: []"
-    for warning in cal.warnings:
-        yield f"  - {quoted(warning)}"
+    yield from list_lines("warnings", map(quoted, cal.warnings))
 
 
 def _network_lines(network: NetworkRecord | None, long: bool) -> Iterator[str]:

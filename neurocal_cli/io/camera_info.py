@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from neurocal_cli.camera.camera import Camera
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.distortion_names import to_ros
 from neurocal_cli.io.yaml_text import flow, mapping, number, text
@@ -20,44 +21,31 @@ _FORMULAS = {
 }
 
 
-def camera_info_lines(
-    name: str,
-    size: tuple[int, int] | None,
-    A: Array,
-    model: str,
-    coefficients: Array,
-    rectified: tuple[Array, Array] | None = None,
-) -> Iterator[str]:
+def camera_info_lines(camera: Camera, rectified: tuple[Array, Array] | None = None) -> Iterator[str]:
     """Lines of the file, without line ends.
 
     Parameters
     ----------
-    name : str
-        Of the camera.
-    size : (width, height) or None [px]
-    A : (3, 3) array
-    model : str
-        One of `lens.MODELS`.
-    coefficients : (K,) array
+    camera : Camera
     rectified : (3, 3) and (3, 4) arrays, optional
         Rectification and projection matrix of a camera on a rig; default: of a camera alone.
     """
-    R, P = rectified or (np.eye(3), np.column_stack([A, np.zeros(3)]))
-    width, height = size or (0, 0)  # ROS's readers want numbers
-    model, coefficients = to_ros(model, coefficients)
-    yield f"camera_name: {text(name)}"
+    R, P = rectified or (np.eye(3), np.column_stack([camera.A, np.zeros(3)]))
+    width, height = camera.image_size or (0, 0)  # ROS's readers want numbers
+    model, coefficients = to_ros(camera.distortion.model, camera.distortion.coefficients)
+    yield f"camera_name: {text(camera.name)}"
     yield f"image_width: {width}"
     yield f"image_height: {height}"
-    yield f"camera_matrix: {_matrix(A)}"
+    yield f"camera_matrix: {_matrix(camera.A)}"
     yield f"distortion_model: {model}"
     yield f"distortion_coefficients: {_matrix(coefficients[None])}"
     yield f"rectification_matrix: {_matrix(R)}"
     yield f"projection_matrix: {_matrix(P)}"
 
 
-def format_camera_info(name: str, size: tuple[int, int] | None, A: Array) -> str:
-    """Text of the file of a camera without a lens; `read_intrinsics` reads it."""
-    return "\n".join([*camera_info_lines(name, size, A, "none", np.zeros(0)), ""])
+def format_camera_info(camera: Camera, rectified: tuple[Array, Array] | None = None) -> str:
+    """Text of the file, which `read_intrinsics` reads; see `camera_info_lines`."""
+    return "\n".join([*camera_info_lines(camera, rectified), ""])
 
 
 def format_panorama(panorama: Panorama) -> str:

@@ -19,32 +19,13 @@ from neurocal_cli.io.tree_fields import Field
 
 # Ours and ROS's first; a stereo file of OpenCV's sample has M1, D1 for the left camera.
 _MATRIX_KEYS = (
-    "camera_matrix",
-    "cameraMatrix",
-    "camera_Matrix",
-    "CameraMatrix",
-    "K",
-    "k",
-    "mtx",
-    "M",
-    "M1",
-    "intrinsic_matrix",
-    "intrinsics_matrix",
-)
+    "camera_matrix", "cameraMatrix", "camera_Matrix", "CameraMatrix", "K", "k", "mtx", "M", "M1",
+    "intrinsic_matrix", "intrinsics_matrix",
+)  # fmt: skip
 _DISTORTION_KEYS = (
-    "distortion_coefficients",
-    "distCoeffs",
-    "dist_coeffs",
-    "dist_coeff",
-    "dist_coefs",
-    "distortion_coeffs",
-    "DistCoeffs",
-    "distortion",
-    "dist",
-    "D",
-    "d",
-    "D1",
-)
+    "distortion_coefficients", "distCoeffs", "dist_coeffs", "dist_coeff", "dist_coefs", "distortion_coeffs",
+    "DistCoeffs", "distortion", "dist", "D", "d", "D1",
+)  # fmt: skip
 _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
 _SIZE_KEYS = ("imageSize", "image_size", "img_size", "resolution")
@@ -92,7 +73,7 @@ def boofcv_camera(root: Field) -> Camera:
         A lens model that is not known.
     """
     pinhole = root["pinhole"]
-    model = root["model"].text() if "model" in root else ""
+    model = root.get("model", "").text()
     omni = model == "omnidirectional_universal"
     if ("mirror_offset" in root) != omni or model not in (*_BOOFCV, ""):
         raise InputError(
@@ -102,8 +83,8 @@ def boofcv_camera(root: Field) -> Camera:
     fx, fy, cx, cy, skew = (pinhole[name].number() for name in ("fx", "fy", "cx", "cy", "skew"))
     lens = root.get("radial_tangential")
     coefficients = np.zeros(5)
-    if lens is not None:
-        radial = lens["radial"].array(-1) if "radial" in lens else np.zeros(0)
+    if lens.value is not None:
+        radial = lens.get("radial", []).array(-1)
         if len(radial) > 3:
             lens["radial"].fail("3 numbers at most")
         k1, k2, k3 = [*radial, 0.0, 0.0, 0.0][:3]
@@ -214,7 +195,7 @@ def _omnidirectional(xi: Field, coefficients: Array, model: str) -> tuple[str, A
 
 def _refuse_unread(root: Field) -> None:
     """Refuse a key that may be the distortion under a name that is not known."""
-    for key in root.keys():  # noqa: SIM118 - a Field, not a dict
+    for key in root.entries():
         if ("dist" in key.lower() and key not in _OTHERS) or key.lower() in ("k1", "k2", "coeffs"):
             raise InputError(
                 f"the key {key[:60]!r} may be the distortion, and is not a known name of it; rename it to "

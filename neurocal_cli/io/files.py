@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import IO, TYPE_CHECKING
 
-from neurocal_cli.errors import FormatError, NeurocalError
+from neurocal_cli.errors import FormatError, InputError, NeurocalError
 from neurocal_cli.io.outputs import held_back
 
 if TYPE_CHECKING:
@@ -41,7 +41,8 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
         The file cannot be read: missing, a folder, not permitted.
     """
     if str(path) == "-":
-        return _read_stdin(), "<stdin>"
+        with _stdin_failures():
+            return sys.stdin.buffer.read(), "<stdin>"
     source = one_line(path)
     with reading_failures(source), open(path, "rb") as file:
         _protect(file)
@@ -104,6 +105,15 @@ def reading_failures(source: str) -> Iterator[None]:
         raise FormatError(f"cannot be read ({reason(error)}); check the path", source) from error
 
 
+@contextmanager
+def value_failures(source: str, where: str = "") -> Iterator[None]:
+    """Turn a value that cannot be used into a line about its file, and the place in it."""
+    try:
+        yield
+    except InputError as error:
+        raise FormatError(f"{where}{error}", source) from error
+
+
 def read_text(path: str | Path, kind: str = "a text file") -> tuple[str, str]:
     """Read a whole UTF-8 file; see `read_bytes` and `decode`."""
     data, source = read_bytes(path)
@@ -144,11 +154,6 @@ def decode(data: bytes, source: str, kind: str = "a text file", instead: str = "
         raise FormatError(
             f"byte 0x{data[error.start]:02x} is not UTF-8 text; save the file as UTF-8", source, line
         ) from error
-
-
-def _read_stdin() -> bytes:
-    with _stdin_failures():
-        return sys.stdin.buffer.read()
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -100,6 +100,39 @@ def read_header(data: bytes, source: str) -> Header:
     if header.width <= 0 or header.height <= 0:
         raise FormatError(f"has {header.width} x {header.height} px; give an image with pixels", source)
     return header
+
+
+def stated_sizes(paths: Iterable[str]) -> Iterator[tuple[int, int] | None]:
+    """Larger and smaller side [px] of PNG and JPEG files by their beginnings, for a look before the work.
+
+    Sorted, so that images turned by their EXIF orientation have one size. None for standard input, other
+    kinds of files and unreadable ones: this serves to find different cameras, and decoding says the rest.
+    """
+    for path in paths:
+        size = None if path == "-" else _stated_size(path)
+        yield None if size is None else (max(size), min(size))
+
+
+def _stated_size(path: str) -> tuple[int, int] | None:
+    try:
+        with open(path, "rb") as file:
+            head = file.read(24)
+            if head.startswith(b"\x89PNG\r\n\x1a\n"):
+                width, height = struct.unpack_from(">II", head, 16)
+                return width, height
+            if not head.startswith(b"\xff\xd8"):
+                return None
+            file.seek(2)
+            while True:
+                mark, kind, length = struct.unpack(">BBH", file.read(4))
+                if mark != 0xFF:
+                    return None
+                if kind in _JPEG_FRAMES:
+                    height, width = struct.unpack(">xHH", file.read(5))
+                    return width, height
+                file.seek(length - 2, 1)
+    except (OSError, ValueError, struct.error):
+        return None
 
 
 def is_video_header(head: bytes) -> bool:

@@ -18,6 +18,8 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.image_headers import Header, read_header
 
+Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+
 MOST_PIXELS = 200_000_000  # larger than any camera's; a file that states more is refused
 
 _TURNS = {
@@ -50,7 +52,7 @@ class Image:
         What was done to the pixels that a user may not expect.
     """
 
-    grey: NDArray[np.uint8] | NDArray[np.uint16]
+    grey: Pixels
     source: str = "image"
     notes: tuple[str, ...] = ()
 
@@ -58,30 +60,6 @@ class Image:
     def size(self) -> tuple[int, int]:
         """Width and height [px]."""
         return self.grey.shape[1], self.grey.shape[0]
-
-
-@frozen_dataclass(eq=False)
-class Picture:
-    """A picture with its colours.
-
-    Attributes
-    ----------
-    pixels : (height, width) or (height, width, 3) uint8 or uint16 array [DN]
-        Colours in the order red, green, blue; transparency is left out.
-    source : str
-        Name for messages.
-    notes : tuple of str
-        What was done to the pixels that a user may not expect.
-    """
-
-    pixels: NDArray[np.uint8] | NDArray[np.uint16]
-    source: str = "image"
-    notes: tuple[str, ...] = ()
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height [px]."""
-        return self.pixels.shape[1], self.pixels.shape[0]
 
 
 def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
@@ -105,11 +83,21 @@ def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
     return parse_image(*read_bytes(path), most_pixels)
 
 
-def read_picture(path: str | Path) -> Picture:
-    """Read an image with its colours; else as `read_image` does."""
+def read_picture(path: str | Path) -> tuple[Pixels, str, tuple[str, ...]]:
+    """Read an image with its colours; else as `read_image` does.
+
+    Returns
+    -------
+    pixels : (height, width) or (height, width, 3) uint8 or uint16 array [DN]
+        Colours in the order red, green, blue; transparency is left out.
+    source : str
+        Name for messages.
+    notes : tuple of str
+        What was done to the pixels that a user may not expect.
+    """
     data, source = read_bytes(path)
     pixels, notes = _upright(data, source, MOST_PIXELS, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
-    return Picture(pixels if pixels.ndim == 2 else pixels[..., ::-1], source, notes)
+    return _reversed(pixels), source, notes
 
 
 def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXELS) -> Image:
@@ -118,9 +106,7 @@ def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXE
     return Image(grey, source, notes)
 
 
-def _upright(
-    data: bytes, source: str, most_pixels: int, flags: int
-) -> tuple[NDArray[np.uint8] | NDArray[np.uint16], tuple[str, ...]]:
+def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pixels, tuple[str, ...]]:
     """Pixels of a file, its EXIF orientation applied, and what is to be said of that."""
     header = read_header(data, source)
     if header.width * header.height > most_pixels:
@@ -152,17 +138,25 @@ def encode_png(picture: NDArray[np.uint8]) -> bytes:
     InputError
         The picture cannot be written as PNG.
     """
-    ordered = picture[..., ::-1] if picture.ndim == 3 else picture
+    return _encoded(picture, ".png", "PNG", [cv2.IMWRITE_PNG_COMPRESSION, 6])
+
+
+def _encoded(picture: Pixels, ending: str, kind: str, settings: list[int]) -> bytes:
     try:
-        done, data = cv2.imencode(".png", np.ascontiguousarray(ordered), [cv2.IMWRITE_PNG_COMPRESSION, 6])
+        done, data = cv2.imencode(ending, np.ascontiguousarray(_reversed(picture)), settings)
     except cv2.error as error:
-        raise InputError(f"a picture of the shape {picture.shape} cannot be written as PNG") from error
+        raise InputError(f"a picture of the shape {picture.shape} cannot be written as {kind}") from error
     if not done:
-        raise NeurocalError("the picture cannot be written as PNG")
+        raise NeurocalError(f"the picture cannot be written as {kind}")
     return data.tobytes()
 
 
-def shrink(grey: NDArray[np.uint8] | NDArray[np.uint16], width: int) -> NDArray[np.uint8]:
+def _reversed(picture: Pixels) -> Pixels:
+    """Colours in the order of OpenCV from ours, or back."""
+    return picture[..., ::-1] if picture.ndim == 3 else picture
+
+
+def shrink(grey: Pixels, width: int) -> NDArray[np.uint8]:
     """The (H, W) image with 8 bits, and no wider than so many pixels."""
     eight = (grey // 257 if grey.dtype == np.uint16 else grey).astype(np.uint8, copy=False)
     if eight.shape[1] <= width:
@@ -171,9 +165,7 @@ def shrink(grey: NDArray[np.uint8] | NDArray[np.uint16], width: int) -> NDArray[
     return np.asarray(cv2.resize(eight, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
-def encode_image(
-    pixels: NDArray[np.uint8] | NDArray[np.uint16], ending: str, quality: int = _QUALITY
-) -> bytes:
+def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
     """Picture as the bytes of an image file.
 
     Parameters
@@ -196,18 +188,12 @@ def encode_image(
         )
     if pixels.ndim == 3 and ending.lower() == ".pgm":
         raise InputError("a colour image cannot be written to a .pgm file; use .ppm or .png")
-    ordered = pixels[..., ::-1] if pixels.ndim == 3 else pixels
-    settings = [cv2.IMWRITE_JPEG_QUALITY, quality] if ending.lower() in _JPEG else []
-    try:
-        done, data = cv2.imencode(ending.lower(), np.ascontiguousarray(ordered), settings)
-    except cv2.error as error:
-        raise InputError(f"a picture of the shape {pixels.shape} cannot be written as {ending}") from error
-    if not done:
-        raise NeurocalError(f"the picture cannot be written as {ending}")
-    return data.tobytes()
+    return _encoded(
+        pixels, ending.lower(), ending, [cv2.IMWRITE_JPEG_QUALITY, quality] if ending.lower() in _JPEG else []
+    )
 
 
-def _decoded(data: bytes, header: Header, source: str, flags: int) -> NDArray[np.uint8] | NDArray[np.uint16]:
+def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
     """Pixels of a file that looks whole; the decoder's complaints stay off the user's screen."""
     with captured_stderr() as complaints:
         try:

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from neurocal_cli.camera.distortion import MODELS
+from neurocal_cli.camera.distortion import MODELS, Distortion
 from neurocal_cli.errors import FormatError, InputError
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.camera_files import read_intrinsics
 from neurocal_cli.io.table import Table, parse_table
@@ -25,26 +24,8 @@ _LIST = Schema(kind="cameras", required=(_FILES,), optional=("t_z", *CONTROLS), 
 _NESTED = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")  # each begins with the one before
 
 
-@frozen_dataclass(eq=False)
-class _Rows:
-    """Cameras of one file.
-
-    Attributes
-    ----------
-    columns : dict of (n,) arrays
-        Settings, `_PARAMETERS` and perhaps t_z.
-    theta : (n,) array [rad]
-    models : list of str
-        Distortion model of each.
-    coefficients : list of arrays
-    sizes : set of (width, height)
-    """
-
-    columns: dict[str, Array]
-    theta: Array
-    models: list[str]
-    coefficients: list[Array]
-    sizes: set[tuple[int, int]]
+# Of one file: columns of settings, `_PARAMETERS`, theta and perhaps t_z; each camera's lens; image sizes.
+_Rows = tuple[dict[str, Array], list[Distortion], set[tuple[int, int]]]
 
 
 def names_cameras(data: bytes) -> bool:
@@ -68,57 +49,58 @@ def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> Len
     FormatError, InputError
         An unreadable file, a missing setting, or cameras that are not of one lens.
     """
-    tables = [parse_table(data, source, _schema(data)) for data, source in contents]
+    tables = [
+        parse_table(data, source, _TABLE if "alpha_u" in _header(data) else _LIST)
+        for data, source in contents
+    ]
     for table in tables:
         table.note_unknown(notes)
     require_setting(tables)
     parts = [_listed(table) if _FILES in table.labels else _tabled(table) for table in tables]
-    sizes = set().union(*(part.sizes for part in parts))
+    tabled, lenses, stated = zip(*parts, strict=True)
+    sizes = set().union(*stated)
     if len(sizes) > 1:
         raise InputError(f"{tables[0].source}: the cameras differ in image_size; give cameras of one lens")
-    model, coefficients = _common_model(parts, tables[0].source)
-    shared = [name for name in parts[0].columns if all(name in part.columns for part in parts)]
-    columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in shared}
+    model, coefficients = _common_model([lens for part in lenses for lens in part], tables[0].source)
+    shared = [name for name in tabled[0] if all(name in part for part in tabled)]
+    columns = {name: np.concatenate([part[name] for part in tabled]) for name in shared}
+    theta = float(np.median(columns.pop("theta")))
     return LensCameras.of(
         columns | dict(zip(MODELS[model], coefficients.T, strict=True)),
         next(iter(sizes), None),
         tables[0].metadata.unit or "mm",
         tables[0].source,
         model,
-        float(np.median(np.concatenate([part.theta for part in parts]))),
+        theta,
     )
-
-
-def _schema(data: bytes) -> Schema:
-    return _TABLE if "alpha_u" in _header(data) else _LIST
 
 
 def _tabled(table: Table) -> _Rows:
     n, size = len(table), table.metadata.image_size
     sizes = set() if size is None else {size}
-    return _Rows(table.numbers, np.full(n, np.pi / 2), ["none"] * n, [np.zeros(0)] * n, sizes)
+    return {**table.numbers, "theta": np.full(n, np.pi / 2)}, [Distortion()] * n, sizes
 
 
 def _listed(table: Table) -> _Rows:
     """Read the calibration files that a table names; their paths are relative to its folder."""
     folder = Path(table.source).parent
     cameras = [read_intrinsics(folder / name) for name in table.labels[_FILES].tolist()]
-    K = [camera.intrinsics for camera in cameras]
-    parameters = {name: np.array([getattr(k, name) for k in K]) for name in _PARAMETERS}
+    parameters = {
+        name: np.array([getattr(camera.intrinsics, name) for camera in cameras])
+        for name in (*_PARAMETERS, "theta")
+    }
     sizes = {camera.image_size for camera in cameras} | {table.metadata.image_size}
-    return _Rows(
-        dict(table.numbers) | parameters,
-        np.array([k.theta for k in K]),
-        [camera.distortion.model for camera in cameras],
-        [camera.distortion.coefficients for camera in cameras],
+    return (
+        {**table.numbers, **parameters},
+        [camera.distortion for camera in cameras],
         {size for size in sizes if size is not None},
     )
 
 
-def _common_model(parts: Sequence[_Rows], source: str) -> tuple[str, Array]:
+def _common_model(lenses: Sequence[Distortion], source: str) -> tuple[str, Array]:
     """The simplest distortion model that includes those of all cameras, and its coefficients (S, K)."""
-    models = [model for part in parts for model in part.models]
-    rows = [row for part in parts for row in part.coefficients]
+    models = [lens.model for lens in lenses]
+    rows = [lens.coefficients for lens in lenses]
     if "fisheye" in models:
         if set(models) != {"fisheye"}:
             raise InputError(

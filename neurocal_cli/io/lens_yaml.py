@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 
 from neurocal_cli import __version__
 from neurocal_cli.camera.distortion import coefficient_names
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.target_yaml import read_target, target_lines
+from neurocal_cli.io.text_columns import table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.writing import write_whole
-from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
 from neurocal_cli.io.yaml_tree import read_yaml
 from neurocal_cli.zoom_lens.mlfn import Topology
 from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, ParameterNet
@@ -67,10 +69,8 @@ def read_lens(path: str | Path) -> ZoomLens:
 
 def lens_from_field(root: Field) -> ZoomLens:
     """Read a lens from the tree of its file; see `read_lens`."""
-    try:
+    with value_failures(root.source):
         return _lens(root[_BLOCK])
-    except InputError as error:
-        raise FormatError(str(error), root.source) from error
 
 
 def _bool(value: bool) -> str:
@@ -103,12 +103,11 @@ def _record_lines(lens: ZoomLens) -> Iterator[str]:
         variance=number(lens.variance),
     )
     yield f"scatter: {flow(lens.scatter)}"
-    yield "rejected:" if lens.rejected else "rejected: []"
-    for bad in lens.rejected:
-        yield f"  - {mapping(setting=flow(np.array(bad.setting)), reason=quoted(bad.reason))}"
-    yield "warnings:" if lens.warnings else "warnings: []"
-    for warning in lens.warnings:
-        yield f"  - {quoted(warning)}"
+    rejected = [
+        mapping(setting=flow(np.array(bad.setting)), reason=quoted(bad.reason)) for bad in lens.rejected
+    ]
+    yield from list_lines("rejected", rejected)
+    yield from list_lines("warnings", map(quoted, lens.warnings))
 
 
 def _coupling_lines(lens: ZoomLens) -> Iterator[str]:
@@ -116,9 +115,7 @@ def _coupling_lines(lens: ZoomLens) -> Iterator[str]:
         yield f"target_coupling: {flow(lens.target_coupling.reshape(len(lens.settings), -1))}"
 
 
-def _coupling(field: Field | None, S: int, size: int) -> Array | None:
-    if field is None:
-        return None
+def _coupling(field: Field, S: int, size: int) -> Array:
     flat = field.array(S, -1)
     if flat.shape[1] % size:
         field.fail(f"rows of a multiple of {size} numbers")
@@ -126,11 +123,10 @@ def _coupling(field: Field | None, S: int, size: int) -> Array | None:
 
 
 def _setting_lines(lens: ZoomLens) -> Iterator[str]:
+    columns = dict(zip(lens.controls, lens.settings.T, strict=True))
+    columns |= {"n_points": lens.counts, "rmse_px": lens.rmse}
     yield "settings:"
-    yield f"  columns: [{', '.join([*lens.controls, 'n_points', 'rmse_px'])}]"
-    yield "  rows:"
-    for setting, count, rmse in zip(lens.settings, lens.counts.tolist(), lens.rmse.tolist(), strict=True):
-        yield f"    - [{', '.join(map(number, setting.tolist()))}, {count}, {number(rmse)}]"
+    yield from (f"  {line}" for line in table_lines(columns, long=False, indent=2))
 
 
 def _member_lines(lens: ZoomLens) -> Iterator[str]:
@@ -172,7 +168,7 @@ def _lens(block: Field) -> ZoomLens:
             f"{block.path}.format is not {_FORMAT}: another version of neurocal wrote it; fit the lens again",
             block.source,
         )
-    controls = _names(block["controls"])
+    controls = tuple(block["controls"].texts())
     if not controls or any(name not in CONTROLS for name in controls) or len(set(controls)) < len(controls):
         block["controls"].fail("zoom, focus or both")
     camera = block["camera"].text()
@@ -202,21 +198,20 @@ def _lens(block: Field) -> ZoomLens:
         free_theta=block["skew"].boolean(),
         counts=counts,
         rmse=rmse,
-        rejected=tuple(_rejected(field, len(controls)) for field in block["rejected"].items()),
+        rejected=tuple(
+            RejectedSetting(tuple(bad["setting"].array(len(controls)).tolist()), bad["reason"].text())
+            for bad in block["rejected"].items()
+        ),
         left_out_px=fit["left_out_px"].number_or_nan(),
         training=block["training"].text(),
         seed=block["seed"].integer(),
         converged=block["converged"].boolean(),
         image_size=(width, height) if width and height else None,
         unit=block["unit"].text(),
-        warnings=tuple(field.text() for field in block["warnings"].items()),
-        target=read_target(block.get("target")),
-        target_coupling=_coupling(block.get("target_coupling"), S, L + Q),
+        warnings=tuple(block["warnings"].texts()),
+        target=block.read("target", read_target),
+        target_coupling=block.read("target_coupling", lambda field: _coupling(field, S, L + Q)),
     )
-
-
-def _names(field: Field) -> tuple[str, ...]:
-    return tuple(name.text() for name in field.items())
 
 
 def _positive(field: Field) -> float:
@@ -229,11 +224,9 @@ def _positive(field: Field) -> float:
 def _parameter_names(block: Field, camera: str) -> tuple[tuple[str, ...], str]:
     """Names of the local parameters, which the kind of camera and the distortion model determine."""
     model = block["distortion"].text()
-    try:
+    with value_failures(block.source, f"{block.path}.distortion: "):
         coefficients = coefficient_names(model)
-    except InputError as error:
-        raise FormatError(f"{block.path}.distortion: {error}", block.source) from error
-    names = _names(block["parameters"])
+    names = tuple(block["parameters"].texts())
     t_z = ("t_z",) if camera == "still" or (camera == "known" and "t_z" in names) else ()
     expected = (*_CAMERA, *t_z, *coefficients)
     if names != expected:
@@ -274,10 +267,6 @@ def _net(field: Field, D: int) -> ParameterNet:
 
 def _read_constants(field: Field) -> Constants:
     return Constants(field["theta"].number(), field["R"].array(3, 3), field["t"].array(2))
-
-
-def _rejected(field: Field, D: int) -> RejectedSetting:
-    return RejectedSetting(tuple(field["setting"].array(D).tolist()), field["reason"].text())
 
 
 def _table(field: Field, S: int, L: int, Q: int) -> Tables:

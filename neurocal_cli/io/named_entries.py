@@ -46,7 +46,7 @@ def read_named(field: Field) -> dict[str, Field]:
         Neither of them, or a name twice.
     """
     if isinstance(field.value, dict):
-        return {name: field[name] for name in field.keys()}  # noqa: SIM118 - a Field, not a dict
+        return field.entries()
     found: dict[str, Field] = {}
     for entry in field.items():
         parts = list(entry.items())

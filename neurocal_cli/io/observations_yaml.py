@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.distances import Distance
-from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.files import value_failures
+from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE, measured
 from neurocal_cli.io.text_columns import (
     LONGEST,
     column_lines,
@@ -32,28 +33,13 @@ from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flow, number, quoted
 from neurocal_cli.points import Correspondences
 
-_PLACE = ("X", "Y", "Z")
-_PIXEL = ("u", "v")
-_COVARIANCE = ("suu", "suv", "svv")
-_WORLD_STD = ("sX", "sY", "sZ")
-_ACROSS = ("nu", "nv")
-
 _MOST_CHARACTERS = 1_500_000  # of decimals: half a second of PyYAML
 
 
 def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
     """Lines of the block ``observations``."""
-    measured, blocks = list(_PIXEL), [points.pixels]
-    if points.covariance is not None:
-        measured += _COVARIANCE
-        blocks.append(points.covariance)
-    if points.world_std is not None:
-        measured += _WORLD_STD
-        blocks.append(points.world_std)
-    if points.across is not None:
-        measured += _ACROSS
-        blocks.append(points.across)
-    columns = ["view", *(["point"] if points.point is not None else []), *_PLACE, *measured]
+    names, blocks = measured(points)
+    columns = ["view", *(["point"] if points.point is not None else []), *PLACE, *names]
     yield "observations:"
     yield f"  columns: [{', '.join(columns)}]"
     if points.distances:
@@ -81,13 +67,13 @@ def _rows(points: Correspondences, numbers: Array) -> Iterator[str]:
     return map(add, heads, flow(numbers)[2:-1].split(", ["))
 
 
-def _long_lines(points: Correspondences, measured: Array) -> Iterator[str]:
+def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:
     place, first = _places(points)
     labels = {} if points.point is None else {"point": np.asarray(points.point)[first].astype(str).tolist()}
-    coordinates = {name: points.world[first, k] for k, name in enumerate(_PLACE)}
+    coordinates = {name: points.world[first, k] for k, name in enumerate(PLACE)}
     yield "places:  # each place of the target once; its columns"
     yield from (f"  {line}" for line in column_lines({**labels, **coordinates}))
-    words = [number_words(column) for column in measured.T]
+    words = [number_words(column) for column in values.T]
     characters = sum(len(word) + 1 for column in words for word in column)
     packed = characters > _MOST_CHARACTERS
     if packed:
@@ -101,7 +87,7 @@ def _long_lines(points: Correspondences, measured: Array) -> Iterator[str]:
         for k in range(start, end, LONGEST):
             rows = slice(k, min(k + LONGEST, end))
             if packed:
-                texts = [packed_text(column) for column in measured[rows].T]
+                texts = [packed_text(column) for column in values[rows].T]
             else:
                 texts = [f"'{','.join(column[rows])}'" for column in words]
             yield f"    - [{name}, {', '.join([repr(join_ranges(place[rows])), *texts])}]"
@@ -155,28 +141,28 @@ def read_observations(
     labels = {
         name: _labels(columns[name], observations, name) for name in ("view", "point") if name in columns
     }
-    try:
+    with value_failures(""):
+        world, pixels = numbers(PLACE), numbers(PIXEL)
+        known: dict[str, Any] = {
+            attribute: numbers(names) for attribute, names in OPTIONAL.items() if set(names) <= set(columns)
+        }
         return Correspondences(
-            numbers(_PLACE),
-            numbers(_PIXEL),
+            world,
+            pixels,
             view=labels.get("view"),
             point=labels.get("point"),
-            covariance=numbers(_COVARIANCE) if set(_COVARIANCE) <= set(columns) else None,
-            world_std=numbers(_WORLD_STD) if set(_WORLD_STD) <= set(columns) else None,
-            across=numbers(_ACROSS) if set(_ACROSS) <= set(columns) else None,
-            distances=_distances(observations.get("distances")),
+            **known,
+            distances=_distances(observations.get("distances", [])),
             image_size=image_size,
             image_center=image_center,
             unit=unit,
             source=observations.source,
         )
-    except InputError as error:
-        raise FormatError(str(error)) from error
 
 
-def _distances(field: Field | None) -> tuple[Distance, ...]:
+def _distances(field: Field) -> tuple[Distance, ...]:
     found = []
-    for row in [] if field is None else field.items():
+    for row in field.items():
         cells = list(row.items())
         if len(cells) != len(fields(Distance)):
             row.fail("a list of from, to, length, std")
@@ -186,8 +172,8 @@ def _distances(field: Field | None) -> tuple[Distance, ...]:
 
 
 def _names(observations: Field) -> list[str]:
-    names = [name.text() for name in observations["columns"].items()]
-    missing = [name for name in (*_PLACE, *_PIXEL) if name not in names]
+    names = observations["columns"].texts()
+    missing = [name for name in (*PLACE, *PIXEL) if name not in names]
     if missing or len(set(names)) < len(names):
         observations["columns"].fail("a list of different names with X, Y, Z, u, v among them")
     return names
@@ -212,7 +198,7 @@ def _long_columns(observations: Field) -> dict[str, list[Any]]:
     packed = "numbers" in observations
     if packed and observations["numbers"].text() != "packed":
         observations["numbers"].fail("packed, or not there")
-    if set(places) - {"point"} != set(_PLACE) or "view" not in names:
+    if set(places) - {"point"} != set(PLACE) or "view" not in names:
         observations["places"].fail("the columns X, Y, Z and point, if the points have names")
     columns: dict[str, list[Any]] = {name: [] for name in names}
     for entry in observations["views"].items():

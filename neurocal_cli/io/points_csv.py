@@ -5,23 +5,25 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
 from neurocal_cli.errors import InputError
-from neurocal_cli.io.points_join import ACROSS, COVARIANCE, SETTINGS, WORLD_STD, correspondences
+from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE, measured
+from neurocal_cli.io.points_join import SETTINGS, correspondences
 from neurocal_cli.io.table import read_table
-from neurocal_cli.io.table_header import Schema
+from neurocal_cli.io.table_header import Schema, quoted_field
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
 
 POINTS = Schema(
     kind="points",
-    required=("X", "Y", "Z", "u", "v"),
-    optional=("view", "point", "sigma", *COVARIANCE, *WORLD_STD, *ACROSS, *SETTINGS),
+    required=(*PLACE, *PIXEL),
+    optional=("view", "point", "sigma", *chain(*OPTIONAL.values()), *SETTINGS),
     labels=frozenset({"view", "point"}),
-    headerless=("X", "Y", "Z", "u", "v"),
+    headerless=(*PLACE, *PIXEL),
     instead="; neurocal convert --to neurocal makes one of another program's corners",
 )
 
@@ -71,22 +73,16 @@ def format_points(points: Correspondences) -> str:
     InputError
         A label that no CSV file can hold: empty or with a line break.
     """
-    columns = {name: _quoted_labels(name, points) for name in ("view", "point")}
-    labels = {name: column for name, column in columns.items() if column is not None}
-    blocks = [points.world, points.pixels]
-    names = [*labels, *POINTS.required]
-    if points.covariance is not None:
-        blocks.append(points.covariance)
-        names += COVARIANCE
-    if points.world_std is not None:
-        blocks.append(points.world_std)
-        names += WORLD_STD
-    if points.across is not None:
-        blocks.append(points.across)
-        names += ACROSS
-    numbers = json.dumps(np.hstack(blocks).tolist(), separators=(",", ":"))[2:-2].split("],[")
-    rows = map(",".join, zip(*labels.values(), numbers, strict=True)) if labels else numbers
-    return "\n".join([*_metadata_lines(points), ",".join(names), *rows, ""])
+    labels = {}
+    if points.view is not None:
+        quoted = [_quoted(label, "view") for label in points.view_names]
+        labels["view"] = [quoted[k] for k in points.view_index.tolist()]
+    if points.point is not None:
+        labels["point"] = [_quoted(str(label), "point") for label in np.asarray(points.point).tolist()]
+    names, blocks = measured(points)
+    numbers = json.dumps(np.hstack([points.world, *blocks]).tolist(), separators=(",", ":"))
+    rows = map(",".join, zip(*labels.values(), numbers[2:-2].split("],["), strict=True))
+    return "\n".join([*_metadata_lines(points), ",".join([*labels, *PLACE, *names]), *rows, ""])
 
 
 def _metadata_lines(points: Correspondences) -> list[str]:
@@ -103,19 +99,7 @@ def _metadata_lines(points: Correspondences) -> list[str]:
     return [*lines, f"# unit: {points.unit}"]
 
 
-def _quoted_labels(name: str, points: Correspondences) -> list[str] | None:
-    labels = getattr(points, name)
-    if labels is None:
-        return None
-    if name == "view":
-        quoted = [_quoted(label, name) for label in points.view_names]
-        return [quoted[k] for k in points.view_index.tolist()]
-    return [_quoted(str(label), name) for label in labels.tolist()]
-
-
 def _quoted(label: str, name: str) -> str:
     if not label or "\n" in label or "\r" in label or "\0" in label:
         raise InputError(f"the {name} label {label[:40]!r} cannot be written to CSV; rename it")
-    if re.search(r'[",;\t]|^[ #]|[ ]$', label):
-        return '"' + label.replace('"', '""') + '"'
-    return label
+    return quoted_field(label)

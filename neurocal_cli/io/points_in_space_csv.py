@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.io.table_header import quoted_field
 from neurocal_cli.stereo.triangulation import Triangulated
 
 COLUMNS = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ", "epipolar", "flag")
@@ -55,9 +55,5 @@ def _rows(found: Triangulated, labels: NDArray[Any] | None, sigma: float, limit:
     columns: list[list[Any]] = [*numbers.T.tolist(), flags]
     row = _ROW
     if labels is not None:
-        columns, row = [[_quoted(label) for label in labels.tolist()], *columns], f"%s,{_ROW}"
+        columns, row = [list(map(quoted_field, labels.tolist())), *columns], f"%s,{_ROW}"
     return "\n".join(map(row.__mod__, zip(*columns, strict=True))) + "\n"
-
-
-def _quoted(label: str) -> str:
-    return '"' + label.replace('"', '""') + '"' if re.search(r'[",;\t]|^[ #]|[ ]$', label) else label

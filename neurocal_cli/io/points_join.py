@@ -10,12 +10,10 @@ from numpy.typing import NDArray
 
 from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
+from neurocal_cli.io.point_columns import OPTIONAL, PIXEL, PLACE
 from neurocal_cli.io.table import Table
 from neurocal_cli.points import Correspondences
 
-COVARIANCE = ("suu", "suv", "svv")
-ACROSS = ("nu", "nv")
-WORLD_STD = ("sX", "sY", "sZ")
 SETTINGS = ("zoom", "focus")
 
 
@@ -37,57 +35,41 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
     for table in tables:
         table.note_unknown(notes)
     _check_settings(tables, notes)
-    return _single(tables[0]) if len(tables) == 1 else _as_one(tables, notes)
-
-
-def _single(table: Table) -> Correspondences:
+    several = len(tables) > 1
+    views = [_views_of_file(table) for table in tables] if several or "view" in tables[0].labels else None
+    owners = _owners(tables, views) if several and views else None
+    points = _points(tables, notes)
     return Correspondences(
-        *_numbers(table),
-        view=table.labels.get("view"),
-        point=_distinct(table),
-        covariance=_covariance(table),
-        world_std=_together(table, WORLD_STD),
-        across=_together(table, ACROSS),
-        image_size=table.metadata.image_size,
-        image_center=table.metadata.image_center,
-        distances=table.metadata.distances or (),
-        unit=table.metadata.unit or "mm",
-        source=table.source,
-        lines=table.lines,
-    )
-
-
-def _as_one(tables: list[Table], notes: list[str]) -> Correspondences:
-    views = [_views_of_file(table) for table in tables]
-    owners = _owners(tables, views)
-    with_point = [table.source for table in tables if "point" in table.labels]
-    points = None
-    if len(with_point) == len(tables):
-        points = np.concatenate([_distinct(table) for table in tables])
-    elif with_point:
-        without = next(table.source for table in tables if table.source not in with_point)
-        notes.append(f"{without}: has no column point, so the point ids of the other files are not used")
-    world, pixels = (np.vstack(blocks) for blocks in zip(*map(_numbers, tables), strict=True))
-    return Correspondences(
-        world,
-        pixels,
-        view=np.concatenate(views),
+        _joined([table.stack(PLACE) for table in tables]),
+        _joined([table.stack(PIXEL) for table in tables]),
+        view=None if views is None else _joined(views),
         point=points,
-        covariance=_joined_covariance(tables),
-        world_std=_joined(tables, WORLD_STD),
-        across=_joined(tables, ACROSS),
+        covariance=_covariance(tables),
+        world_std=_where_known(tables, OPTIONAL["world_std"]),
+        across=_where_known(tables, OPTIONAL["across"]),
         image_size=_agreed("image_size", tables),
         image_center=_agreed("image_center", tables),
-        distances=_agreed("distances", tables) or () if points is not None else (),
+        distances=_agreed("distances", tables) or () if points is not None or not several else (),
         unit=_agreed("unit", tables) or "mm",
         source=tables[0].source,
-        lines=np.concatenate([table.lines for table in tables]),
+        lines=_joined([table.lines for table in tables]),
         sources=owners,
     )
 
 
-def _numbers(table: Table) -> tuple[Array, Array]:
-    return table.stack(("X", "Y", "Z")), table.stack(("u", "v"))
+def _joined(blocks: list[NDArray[Any]]) -> NDArray[Any]:
+    """One below the other; a single one is not copied, as it may have a million rows."""
+    return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
+
+
+def _points(tables: list[Table], notes: list[str]) -> NDArray[Any] | None:
+    """The ids of the points, None where a table has none."""
+    without = [table.source for table in tables if "point" not in table.labels]
+    if not without:
+        return _joined([_distinct(table) for table in tables])
+    if len(without) < len(tables):
+        notes.append(f"{without[0]}: has no column point, so the point ids of the other files are not used")
+    return None
 
 
 def _views_of_file(table: Table) -> NDArray[Any]:
@@ -155,37 +137,34 @@ def _check_settings(tables: list[Table], notes: list[str]) -> None:
             notes.append(f"{tables[0].source}: {name} is {setting:g} throughout; the column is not used")
 
 
-def _covariance(table: Table) -> Array | None:
-    """(N, 3) covariance from the columns sigma or suu, suv, svv, if there."""
-    given = [name for name in COVARIANCE if name in table.numbers]
-    if "sigma" in table.numbers:
-        if given:
-            raise FormatError("has both sigma and suu,suv,svv; keep one", table.source)
-        sigma = table.numbers["sigma"]
-        if not (sigma > 0).all():
-            row = int(np.argmin(sigma > 0))
-            raise InputError(
-                f"{table.source}:{table.lines[row]}: sigma is {sigma[row]:g}, but must be positive; "
-                "correct or remove the row"
-            )
-        with np.errstate(over="ignore", under="ignore"):  # Correspondences refuses what comes out
-            return np.column_stack([sigma * sigma, np.zeros_like(sigma), sigma * sigma])
-    if given and len(given) < len(COVARIANCE):
-        raise FormatError(f"has {', '.join(given)} only; give all of suu,suv,svv", table.source)
-    return table.stack(COVARIANCE) if given else None
-
-
-def _joined_covariance(tables: list[Table]) -> Array | None:
-    blocks = [_covariance(table) for table in tables]
+def _covariance(tables: list[Table]) -> Array | None:
+    """(N, 3) covariance from the columns sigma or suu, suv, svv, which all files have or none."""
+    blocks = [_covariance_of(table) for table in tables]
     present = [block for block in blocks if block is not None]
     if present and len(present) < len(blocks):
         without = next(table.source for table, block in zip(tables, blocks, strict=True) if block is None)
         raise FormatError("has no sigma (or suu,suv,svv) as other files do; give it in all or none", without)
-    return np.vstack(present) if present else None
+    return _joined(present) if present else None
+
+
+def _covariance_of(table: Table) -> Array | None:
+    if "sigma" not in table.numbers:
+        return _together(table, OPTIONAL["covariance"])
+    if any(name in table.numbers for name in OPTIONAL["covariance"]):
+        raise FormatError("has both sigma and suu,suv,svv; keep one", table.source)
+    sigma = table.numbers["sigma"]
+    if not (sigma > 0).all():
+        row = int(np.argmin(sigma > 0))
+        raise InputError(
+            f"{table.source}:{table.lines[row]}: sigma is {sigma[row]:g}, but must be positive; "
+            "correct or remove the row"
+        )
+    with np.errstate(over="ignore", under="ignore"):  # Correspondences refuses what comes out
+        return np.column_stack([sigma * sigma, np.zeros_like(sigma), sigma * sigma])
 
 
 def _together(table: Table, names: tuple[str, ...]) -> Array | None:
-    """Columns of which a file has all or none: the direction of a measurement, the world point's std."""
+    """Columns of which a file has all or none."""
     given = [name for name in names if name in table.numbers]
     if given and len(given) < len(names):
         raise FormatError(
@@ -195,20 +174,18 @@ def _together(table: Table, names: tuple[str, ...]) -> Array | None:
     return table.stack(names) if given else None
 
 
-def _joined(tables: list[Table], names: tuple[str, ...]) -> Array | None:
-    """The same of several files, zero where one has none."""
+def _where_known(tables: list[Table], names: tuple[str, ...]) -> Array | None:
+    """Columns of several files, zero where one has none."""
     blocks = [_together(table, names) for table in tables]
     if all(block is None for block in blocks):
         return None
     zeros = [np.zeros((len(table), len(names))) for table in tables]
-    return np.vstack([zero if block is None else block for zero, block in zip(zeros, blocks, strict=True)])
+    return _joined([zero if block is None else block for zero, block in zip(zeros, blocks, strict=True)])
 
 
-def _distinct(table: Table) -> NDArray[Any] | None:
+def _distinct(table: Table) -> NDArray[Any]:
     """Check that no view has a point id twice and return the ids."""
-    points = table.labels.get("point")
-    if points is None:
-        return None
+    points = table.labels["point"]
     views = table.labels.get("view")
     labels = [points] if views is None else [points, views]
     hashes = _hashes(labels)

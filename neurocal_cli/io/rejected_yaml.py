@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Rejected
-from neurocal_cli.errors import FormatError, InputError
+from neurocal_cli.io.files import value_failures
 from neurocal_cli.io.named_entries import named_lines, read_named
-from neurocal_cli.io.text_columns import read_table, table_lines
+from neurocal_cli.io.text_columns import numbers_of, read_table, table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import quoted
 from neurocal_cli.points import Correspondences
@@ -43,7 +43,7 @@ def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
     yield from (f"  {line}" for line in table_lines(columns, long))
 
 
-def read_rejected(field: Field | None, unit: str) -> Rejected:
+def read_rejected(field: Field, unit: str) -> Rejected:
     """Read the block ``rejected`` back.
 
     Raises
@@ -51,7 +51,7 @@ def read_rejected(field: Field | None, unit: str) -> Rejected:
     FormatError
         A table that is not as it was written.
     """
-    if field is None:
+    if field.value is None:
         return Rejected()
     views = {name: entry.text() for name, entry in read_named(field["views"]).items()}
     columns = read_table(field, frozenset(("view", "point")))
@@ -59,17 +59,15 @@ def read_rejected(field: Field | None, unit: str) -> Rejected:
         return Rejected(views=views)
     if set(columns) - {"line", "point"} != {"view", *_NUMBERS}:
         field.fail(f"a table with view, {', '.join(_NUMBERS)}")
-    numbers = np.array([columns[name].array(-1, unknown=True) for name in _NUMBERS])
-    try:
+    numbers = numbers_of(columns, _NUMBERS, unknown=True)
+    with value_failures(""):
         points = Correspondences(
             numbers[:3].T,
             numbers[3:5].T,
-            view=[cell.text() for cell in columns["view"].items()],
-            point=[cell.text() for cell in columns["point"].items()] if "point" in columns else None,
+            view=columns["view"].texts(),
+            point=columns["point"].texts() if "point" in columns else None,
             lines=np.array([n.integer() for n in columns["line"].items()]) if "line" in columns else None,
             unit=unit,
             source=field.source,
         )
-    except InputError as error:
-        raise FormatError(str(error)) from error
     return Rejected(points, numbers[5], views)

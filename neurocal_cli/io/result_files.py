@@ -19,7 +19,6 @@ from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
 
 if TYPE_CHECKING:
-    from neurocal_cli.io.exchange.camera_set import CameraSet
     from neurocal_cli.stereo.rig import Rig
 
 
@@ -55,8 +54,9 @@ def write_result(
     if ending == ".xml":
         from neurocal_cli.io.exchange.dictionary import OPENCV
         from neurocal_cli.io.exchange.fitting_in import fitted_in
+        from neurocal_cli.io.exchange.neurocal import camera_set
 
-        fitted = fitted_in(_cameras(result), OPENCV, force=False)
+        fitted = fitted_in(replace(camera_set(result), unit=result.unit), OPENCV, force=False)
         write_whole(path, OPENCV.text(fitted.cameras, ending)[""])
         return (*fitted.losses, *fitted.remarks)
     by_rows = ending == ".json"  # which loads at once however long it is
@@ -93,17 +93,6 @@ def lean_rig(rig: Rig) -> Rig:
         left_out={},
         judgement=rig.verdict,
     )
-
-
-def _cameras(result: Calibration | Rig) -> CameraSet:
-    from neurocal_cli.io.exchange.camera_set import CameraSet
-
-    if not isinstance(result, Calibration):
-        poses = {name: view.pose for name, view in result.left.views.items()}
-        cameras = result.left.camera, result.right.camera
-        return CameraSet(cameras, (result.pose,), poses, result.unit, result, "neurocal")
-    poses = {name: view.pose for name, view in result.views.items()}
-    return CameraSet((result.camera,), (), poses, result.unit, result, "neurocal")
 
 
 def _as_json(text: str) -> str:

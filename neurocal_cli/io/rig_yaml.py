@@ -16,16 +16,16 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array, euler_to_rotation
 from neurocal_cli.io.calibration_tree import calibration_from_field
 from neurocal_cli.io.calibration_yaml import HEADER, calibration_lines
+from neurocal_cli.io.exchange.camera_set import METRES
 from neurocal_cli.io.file_storage import read_tree
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.verdict_yaml import read_verdict, verdict_lines
-from neurocal_cli.io.yaml_text import flow, mapping, number, quoted, text
+from neurocal_cli.io.yaml_text import flow, list_lines, mapping, number, quoted, text
 from neurocal_cli.stereo.rectification import Rectification, rectify
 from neurocal_cli.stereo.rig import Rig
 
 FORMAT = 1  # of the stereo block; a change that older readers cannot follow makes it 2
 _GROUPS = (("rotation", POSE_NAMES[:3]), ("translation", POSE_NAMES[3:]))
-_METRES = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "inch": 0.0254, "in": 0.0254}
 _SAME = 1e-6  # E, F and the baseline follow from R, t and the cameras; more means an edit of one
 
 
@@ -61,15 +61,15 @@ def format_ros_pair(rig: Rig, alpha: float | None = None) -> tuple[str, str]:
     InputError
         A unit that is no length, or images without one known size.
     """
-    if rig.unit not in _METRES:
-        raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(_METRES)}")
+    if rig.unit not in METRES:
+        raise InputError(f"ROS needs metres, but the unit is {rig.unit!r}; use one of {', '.join(METRES)}")
     rectified = rectify(rig, alpha)
     if rectified is None:
         raise InputError(
             "ROS's files need images of one known size; put image_size into both files of points"
         )
     metres = rectified.P2.copy()
-    metres[:, 3] *= _METRES[rig.unit]
+    metres[:, 3] *= METRES[rig.unit]
     sides = (rig.left, rectified.R1, rectified.P1), (rig.right, rectified.R2, metres)
     first, second = ("\n".join([*calibration_lines(camera, (R, P)), ""]) for camera, R, P in sides)
     return first, second
@@ -83,37 +83,37 @@ def _rig_lines(rig: Rig, rectified: Rectification | None, by_rows: bool) -> Iter
         yield f"{name}:"
         yield from (f"  {line}" for line in calibration_lines(camera, pair, by_rows))
     yield "stereo:"
-    yield f"  format: {FORMAT}"
-    yield f"  unit: {text(rig.unit)}"
+    yield from (f"  {line}" for line in _stereo_lines(rig, rectified))
+
+
+def _stereo_lines(rig: Rig, rectified: Rectification | None) -> Iterator[str]:
+    yield f"format: {FORMAT}"
+    yield f"unit: {text(rig.unit)}"
     for key, matrix in (("R", rig.R), ("t", rig.t), ("E", rig.E), ("F", rig.F)):
-        yield f"  {key}: {flow(matrix)}"
-    yield f"  baseline: {number(rig.baseline)}"
-    yield f"  baseline_std: {number(rig.std['baseline'])}"
+        yield f"{key}: {flow(matrix)}"
+    yield f"baseline: {number(rig.baseline)}"
+    yield f"baseline_std: {number(rig.std['baseline'])}"
     values = dict(zip(POSE_NAMES, [*rig.pose.euler.tolist(), *rig.t.tolist()], strict=True))
     for group, members in _GROUPS:
         entries = {n: mapping(value=number(values[n]), std=number(rig.std[n])) for n in members}
-        yield f"  {group}: {mapping(**entries)}"
-    names = f"[{', '.join(POSE_NAMES)}]"
-    yield f"  covariance: {mapping(names=names, data=flow(rig.covariance))}"
-    yield f"  rmse_px: {number(rig.rmse_px)}"
-    yield f"  max_px: {number(rig.max_px)}"
-    yield f"  converged: {str(bool(rig.converged)).lower()}"
-    yield f"  stop_reason: {text(str.__str__(rig.stop_reason))}"
-    yield f"  iterations: {rig.iterations}"
+        yield f"{group}: {mapping(**entries)}"
+    parameters = f"[{', '.join(POSE_NAMES)}]"
+    yield f"covariance: {mapping(names=parameters, data=flow(rig.covariance))}"
+    yield f"rmse_px: {number(rig.rmse_px)}"
+    yield f"max_px: {number(rig.max_px)}"
+    yield f"converged: {str(bool(rig.converged)).lower()}"
+    yield f"stop_reason: {text(str.__str__(rig.stop_reason))}"
+    yield f"iterations: {rig.iterations}"
     if rectified is not None:
-        yield "  rectification:"
+        yield "rectification:"
         for key in ("R1", "R2", "P1", "P2", "Q"):
-            yield f"    {key}: {flow(getattr(rectified, key))}"
-    yield "  pairs:" if rig.pairs else "  pairs: []"
-    for left, right in rig.pairs:
-        yield f"    - [{quoted(left)}, {quoted(right)}]"
-    yield "  left_out:" if rig.left_out else "  left_out: []"
-    for (left, right), reason in rig.left_out.items():
-        yield f"    - [{quoted(left)}, {quoted(right)}, {quoted(reason)}]"
-    yield "  warnings:" if rig.warnings else "  warnings: []"
-    for warning in rig.warnings:
-        yield f"    - {quoted(warning)}"
-    yield from (f"  {line}" for line in verdict_lines(rig.verdict))
+            yield f"  {key}: {flow(getattr(rectified, key))}"
+    names = {pair: f"{quoted(pair[0])}, {quoted(pair[1])}" for pair in (*rig.pairs, *rig.left_out)}
+    yield from list_lines("pairs", [f"[{names[pair]}]" for pair in rig.pairs])
+    left_out = [f"[{names[pair]}, {quoted(reason)}]" for pair, reason in rig.left_out.items()]
+    yield from list_lines("left_out", left_out)
+    yield from list_lines("warnings", map(quoted, rig.warnings))
+    yield from verdict_lines(rig.verdict)
 
 
 def read_rig(path: str | Path) -> Rig:
@@ -161,8 +161,8 @@ def rig_from_field(root: Field) -> Rig:
         converged=block["converged"].boolean(),
         stop_reason=block["stop_reason"].text(),
         iterations=block["iterations"].integer(),
-        warnings=tuple(entry.text() for entry in block["warnings"].items()),
-        judgement=read_verdict(block.get("verdict")),
+        warnings=tuple(block["warnings"].texts()),
+        judgement=block.read("verdict", read_verdict),
     )
     _check_consistent(rig, block)
     return rig
@@ -174,7 +174,7 @@ def _std(block: Field) -> dict[str, float]:
 
 
 def _names(entry: Field, count: int) -> tuple[str, ...]:
-    names = tuple(name.text() for name in entry.items())
+    names = tuple(entry.texts())
     if len(names) != count:
         entry.fail(f"a list of {count} texts")
     return names

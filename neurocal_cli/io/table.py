@@ -98,8 +98,7 @@ def read_table(path: str | Path, schema: Schema) -> Table:
     FormatError
         The file cannot be read, or a line of it is wrong; the message names the line.
     """
-    data, source = read_bytes(path)
-    return parse_table(data, source, schema)
+    return parse_table(*read_bytes(path), schema)
 
 
 def parse_table(data: bytes, source: str, schema: Schema) -> Table:

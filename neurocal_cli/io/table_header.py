@@ -212,6 +212,11 @@ def split_fields(line: str, separator: str | None, source: str, number: int) -> 
         position = match.end()
 
 
+def quoted_field(text: str) -> str:
+    """A field as `split_fields` reads it back, in quotes where it needs them."""
+    return '"' + text.replace('"', '""') + '"' if re.search(r'[",;\t]|^[ #]|[ ]$', text) else text
+
+
 def _lines(data: bytes) -> Iterator[tuple[int, int, int, str]]:
     """Go through the lines: number, first byte, byte after the end and stripped text."""
     start, number = 0, 1

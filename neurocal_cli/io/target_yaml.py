@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bends import Bends
-from neurocal_cli.io.text_columns import read_table, table_lines
+from neurocal_cli.io.text_columns import numbers_of, read_table, table_lines
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import mapping, number
 from neurocal_cli.target import Target
@@ -47,7 +47,7 @@ def _bends_lines(bends: Bends, long: bool) -> Iterator[str]:
     yield from (f"  {line}" for line in table_lines({"view": list(bends.names), **columns}, long, indent=2))
 
 
-def read_target(field: Field | None) -> Target | None:
+def read_target(field: Field) -> Target:
     """Read the block ``target`` back.
 
     Raises
@@ -55,35 +55,28 @@ def read_target(field: Field | None) -> Target | None:
     FormatError
         A table that is not as it was written.
     """
-    if field is None:
-        return None
     columns = read_table(field, frozenset(("point",)))
     stated = _STATED if set(_STATED) <= set(columns) else ()
     if set(columns) - {"point", *stated} != {"plane", *_NUMBERS}:
         field.fail(f"a table with plane, {', '.join(_NUMBERS)}")
-    numbers = np.array([columns[name].array(-1) for name in _NUMBERS]).T
-    std = np.array([columns[name].array(-1) for name in stated]).T if stated else None
-    sizes = {name: field["sizes"][name].number() for name in field["sizes"].keys()}  # noqa: SIM118
+    numbers = numbers_of(columns, _NUMBERS).T
     return Target(
         found=numbers[:, :3],
         given=numbers[:, 3:6],
         std=numbers[:, 6:],
         plane=np.array([cell.integer() for cell in columns["plane"].items()], dtype=np.intp),
-        sizes=sizes,
+        sizes={name: size.number() for name, size in field["sizes"].entries().items()},
         flat=field["flat"].boolean(),
         evidence=field["evidence"].number(),
-        point=np.array([cell.text() for cell in columns["point"].items()]) if "point" in columns else None,
-        stated=std,
-        bends=_read_bends(field.get("bends")),
+        point=np.array(columns["point"].texts()) if "point" in columns else None,
+        stated=numbers_of(columns, stated).T if stated else None,
+        bends=field.read("bends", _read_bends),
     )
 
 
-def _read_bends(field: Field | None) -> Bends | None:
-    if field is None:
-        return None
+def _read_bends(field: Field) -> Bends:
     columns = read_table(field, frozenset(("view",)))
     if set(columns) != {"view", *_SHAPES}:
         field.fail(f"a table with view, {', '.join(_SHAPES)}")
-    names = tuple(cell.text() for cell in columns["view"].items())
-    coefficients = np.array([columns[name].array(-1) for name in _SHAPES]).T
-    return Bends(field["size"].number(), names, coefficients)
+    coefficients = numbers_of(columns, _SHAPES).T
+    return Bends(field["size"].number(), tuple(columns["view"].texts()), coefficients)

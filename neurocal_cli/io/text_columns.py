@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.geometry import Array
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flows, quoted
 
@@ -27,12 +28,6 @@ _NUMBERS = re.compile(r"(?:[-+0-9.eE, ]|null)+").fullmatch
 _RANGES = re.compile(r"[0-9]{1,12}(?:-[0-9]{1,12})?(?:,[0-9]{1,12}(?:-[0-9]{1,12})?)*").fullmatch
 
 
-def number_texts(values: NDArray[Any]) -> list[str]:
-    """Write numbers as texts in quotes; ``null`` for what is not finite."""
-    words = number_words(values)
-    return [f"'{','.join(words[k : k + LONGEST])}'" for k in range(0, len(words), LONGEST)]
-
-
 def number_words(values: NDArray[Any]) -> list[str]:
     """Write each number as text; ``null`` for what is not finite."""
     flat = np.ravel(values)
@@ -42,7 +37,11 @@ def number_words(values: NDArray[Any]) -> list[str]:
 def column_lines(columns: Mapping[str, NDArray[Any] | Sequence[str]]) -> Iterator[str]:
     """Lines of a table, one for each column: arrays as texts of numbers, labels one by one."""
     for name, values in columns.items():
-        parts = number_texts(values) if isinstance(values, np.ndarray) else map(quoted, values)
+        if isinstance(values, np.ndarray):
+            words = number_words(values)
+            parts = [f"'{','.join(words[k : k + LONGEST])}'" for k in range(0, len(words), LONGEST)]
+        else:
+            parts = list(map(quoted, values))
         yield f"{name}: [{', '.join(parts)}]"
 
 
@@ -74,14 +73,14 @@ def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
     if isinstance(field["columns"].value, dict):
         table = read_columns(field["columns"], labels)
     else:
-        names = [name.text() for name in field["columns"].items()]
+        names = field["columns"].texts()
         rows = [row.value for row in field["rows"].items()]
         if len(set(names)) < len(names) or any(
             type(row) is not list or len(row) != len(names) for row in rows
         ):
             field.fail(f"a table with {len(names)} columns")
         table = dict(zip(names, map(list, zip(*rows, strict=True)), strict=True)) if rows else {}
-    return {name: Field(values, field.source, f"{field.path}.{name}") for name, values in table.items()}
+    return as_fields(table, field)
 
 
 def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
@@ -92,17 +91,23 @@ def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
     FormatError
         What is no column, or columns of different lengths.
     """
-    columns: dict[str, list[Any]] = {}
-    for name in field.keys():  # noqa: SIM118 - a Field, not a dict
-        column = field[name]
-        columns[name] = (
-            [entry.text() for entry in column.items()]
-            if name in labels
-            else read_numbers(list(column.items()))
-        )
+    columns: dict[str, list[Any]] = {
+        name: column.texts() if name in labels else read_numbers(list(column.items()))
+        for name, column in field.entries().items()
+    }
     if len(set(map(len, columns.values()))) > 1:
         field.fail("columns of one length")
     return columns
+
+
+def as_fields(columns: Mapping[str, list[Any]], table: Field) -> dict[str, Field]:
+    """Columns of a table by their names."""
+    return {name: Field(values, table.source, f"{table.path}.{name}") for name, values in columns.items()}
+
+
+def numbers_of(columns: Mapping[str, Field], names: Sequence[str], unknown: bool = False) -> Array:
+    """(k, N) numbers of some columns; NaN for null, where that may be."""
+    return np.array([columns[name].array(-1, unknown=unknown) for name in names])
 
 
 def read_numbers(texts: Sequence[Field]) -> list[Any]:

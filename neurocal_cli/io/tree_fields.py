@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator
-from typing import Any, NoReturn
+from collections.abc import Callable, Iterator
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 
 from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array
+
+T = TypeVar("T")
 
 # YAML 1.1 takes 1e-05 for text, as it has no point; other programs write it for a number.
 _NUMBER_TEXT = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
@@ -55,19 +57,23 @@ class Field:
             raise FormatError(f"the key {path} is missing; add it or write the file again", self.source)
         return Field(self.value[key], self.source, self._below(key))
 
-    def get(self, key: str) -> Field | None:
-        """Take the value under a key, None where the key or its value is missing."""
+    def get(self, key: str, default: Any = None) -> Field:
+        """Take the value under a key, or a default where the key or its value is missing."""
         if not isinstance(self.value, dict):
             self.fail("a mapping (key: value)")
-        if key not in self:
-            return None
-        return self[key]
+        found = self.value.get(key)
+        return Field(default if found is None else found, self.source, self._below(key))
 
-    def keys(self) -> list[str]:
-        """List the keys of a mapping, as text."""
+    def read(self, key: str, reader: Callable[[Field], T]) -> T | None:
+        """Take what a function reads from the value under a key, None where that is missing."""
+        field = self.get(key)
+        return None if field.value is None else reader(field)
+
+    def entries(self) -> dict[str, Field]:
+        """Take all values of a mapping, by their keys."""
         if not isinstance(self.value, dict):
             self.fail("a mapping (key: value)")
-        return list(self.value)
+        return {key: self[key] for key in self.value}
 
     def items(self) -> Iterator[Field]:
         """Go through the entries of a list."""
@@ -75,6 +81,17 @@ class Field:
             self.fail("a list")
         for k, value in enumerate(self.value):
             yield Field(value, self.source, f"{self.path}[{k}]")
+
+    def texts(self) -> list[str]:
+        """Take a list of texts."""
+        return [entry.text() for entry in self.items()]
+
+    def names(self, count: int) -> list[str]:
+        """Take a list of so many different texts."""
+        texts = self.texts()
+        if len(texts) != count or len(set(texts)) < count:
+            self.fail(f"{count} different names")
+        return texts
 
     def number(self) -> float:
         """Take a finite number."""
@@ -139,12 +156,11 @@ class Field:
         objects = np.array(self.value, dtype=object)
         if objects.shape != array.shape:
             self.fail(expected)
-        flat = [math.nan if unknown and x is None else _as_float(x) for x in objects.ravel().tolist()]
-        if not all(
-            math.isfinite(x) or (unknown and y is None) for x, y in zip(flat, objects.ravel(), strict=True)
-        ):
+        flat = objects.ravel().tolist()
+        numbers = [_as_float(x) for x in flat]
+        if not all(math.isfinite(n) or (unknown and x is None) for n, x in zip(numbers, flat, strict=True)):
             self.fail(expected)
-        return np.array(flat, dtype=float).reshape(objects.shape)
+        return np.array(numbers, dtype=float).reshape(objects.shape)
 
     def _below(self, key: str) -> str:
         shown = key if re.fullmatch(r"[\w.-]{1,60}", key) else repr(key[:60])

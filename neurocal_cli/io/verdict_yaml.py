@@ -20,7 +20,7 @@ def verdict_lines(verdict: Verdict | None) -> Iterator[str]:
     yield f"  measures: {mapping(**{name: number(value) for name, value in verdict.measures.items()})}"
 
 
-def read_verdict(field: Field | None) -> Verdict | None:
+def read_verdict(field: Field) -> Verdict:
     """Read the block ``verdict`` back.
 
     Raises
@@ -28,12 +28,9 @@ def read_verdict(field: Field | None) -> Verdict | None:
     FormatError
         A key that is missing or wrong.
     """
-    if field is None:
-        return None
-    measures = field["measures"]
     return Verdict(
         field["word"].text(),
-        tuple(entry.text() for entry in field["reasons"].items()),
-        tuple(entry.text() for entry in field["advice"].items()),
-        {name: measures[name].number_or_nan() for name in measures.keys()},  # noqa: SIM118
+        tuple(field["reasons"].texts()),
+        tuple(field["advice"].texts()),
+        {name: measure.number_or_nan() for name, measure in field["measures"].entries().items()},
     )

@@ -11,7 +11,7 @@ from neurocal_cli.calibration import ViewResult
 from neurocal_cli.camera.pinhole import POSE_NAMES, Pose
 from neurocal_cli.errors import FormatError
 from neurocal_cli.geometry import Array, euler_to_rotation, rotation_to_euler
-from neurocal_cli.io.text_columns import column_lines, read_columns
+from neurocal_cli.io.text_columns import as_fields, column_lines, numbers_of, read_columns
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.io.yaml_text import flows, text
 
@@ -103,7 +103,7 @@ def read_views(field: Field) -> dict[str, ViewResult]:
 
 def _from_columns(field: Field) -> dict[str, ViewResult]:
     table = read_columns(field, frozenset((_NAME,)))
-    columns = {name: Field(values, field.source, f"{field.path}.{name}") for name, values in table.items()}
+    columns = as_fields(table, field)
     known = [name for name in POSE_NAMES if f"std_{name}" in columns]
     wanted = [_NAME, *POSE_NAMES, "rmse_px", "n_points", "fixed"]
     wanted += [f"R{row}{col}" for row in (1, 2, 3) for col in (1, 2, 3)]
@@ -111,9 +111,9 @@ def _from_columns(field: Field) -> dict[str, ViewResult]:
         field[name]  # which says what is missing
     if len(set(table[_NAME])) < len(table[_NAME]):
         field[_NAME].fail("names that differ")
-    pose = np.column_stack([columns[name].array(-1) for name in POSE_NAMES])
-    R = np.column_stack([columns[name].array(-1) for name in wanted[-9:]]).reshape(-1, 3, 3)
-    std = np.column_stack([columns[f"std_{name}"].array(-1, unknown=True) for name in known] or [pose[:, :0]])
+    pose = np.column_stack(list(numbers_of(columns, POSE_NAMES)))
+    R = np.column_stack(list(numbers_of(columns, wanted[-9:]))).reshape(-1, 3, 3)
+    std = numbers_of(columns, [f"std_{name}" for name in known], unknown=True).T
     if np.abs(R - np.stack([euler_to_rotation(*angles) for angles in pose[:, :3]])).max() > _SAME:
         raise FormatError(
             f"{field.path}: R11 to R33 and R_x, R_y, R_z disagree; correct those edited", field.source
@@ -121,7 +121,7 @@ def _from_columns(field: Field) -> dict[str, ViewResult]:
     return {
         name: ViewResult(
             pose=Pose(R[k], pose[k, 3:]),
-            std=dict(zip(known, std[k].tolist(), strict=True)),
+            std=dict(zip(known, std[k].tolist(), strict=True)) if known else {},
             n_points=Field(table["n_points"][k], field.source, f"{field.path}.n_points").integer(),
             rmse_px=Field(table["rmse_px"][k], field.source, f"{field.path}.rmse_px").number_or_nan(),
             fixed=bool(table["fixed"][k]),

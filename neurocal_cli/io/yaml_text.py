@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -48,6 +49,12 @@ def flows(stack: Array) -> list[str]:
     close = "]" * (np.ndim(stack) - 1)
     parts = flow(stack)[1:-1].split(f"{close}, ")
     return [part + close for part in parts[:-1]] + parts[-1:] if len(stack) else []
+
+
+def list_lines(key: str, entries: Iterable[str]) -> list[str]:
+    """Lines of a key whose value is a list, its entries already text."""
+    lines = [f"  - {entry}" for entry in entries]
+    return [f"{key}:", *lines] if lines else [f"{key}: []"]
 
 
 def mapping(**entries: str) -> str:

@@ -18,7 +18,7 @@ from neurocal_cli.stereo.rig import Rig
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, FigureBase
+    from matplotlib.figure import Figure
 
 _PAD = 0.12  # inches
 _PAGE = (16.0, 12.5)
@@ -51,7 +51,7 @@ def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -
     panels = _camera_panels(subject)
     if panel is not None:
         return _alone(panel, panels[panel], kind)
-    return picture(lambda figure: _fill(figure, panels, _title(subject)), _PAGE, _PAD, kind)
+    return _page([list(row) for row in _ROWS], (1, 1, 0.55), panels, _title(subject), _PAGE, kind)
 
 
 def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
@@ -73,19 +73,15 @@ def draw_rig(rig: Rig, kind: str = "png", panel: str | None = None) -> bytes:
         return _alone(panel, panels[panel], kind)
     rows = [[f"{side} {name}" for name in _ROWS[0]] for side in sides]
     rows.append(["poses", "left views", "right views"])
-    width, height = _PAGE
+    size = _PAGE
     if panel is not None:
         rows = [[f"{side} {panel}" for side in sides]]
-        width, height = 2 * _PANEL[0], _PANEL[1]
-
-    def draw(figure: Figure) -> None:
-        _mosaic(figure, rows, panels, (1,) * len(rows))
-        figure.suptitle(
-            f"rms {rig.rmse_px:.4g} px, max {rig.max_px:.4g} px, {len(rig.pairs)} pairs of views, baseline "
-            f"{rig.baseline:.6g} {plain(rig.unit)}"
-        )
-
-    return picture(draw, (width, height), _PAD, kind)
+        size = 2 * _PANEL[0], _PANEL[1]
+    title = (
+        f"rms {rig.rmse_px:.4g} px, max {rig.max_px:.4g} px, {len(rig.pairs)} pairs of views, baseline "
+        f"{rig.baseline:.6g} {plain(rig.unit)}"
+    )
+    return _page(rows, (1,) * len(rows), panels, title, size, kind)
 
 
 def _with_side(side: str, draw: Draw) -> Draw:
@@ -122,16 +118,12 @@ def draw_points_in_space(
     }
     if panel is not None:
         return _alone(panel, panels[panel], kind)
-
-    def draw(figure: Figure) -> None:
-        rows = [["across", "depth", "poses"], ["depths", "views", "views"]]
-        _mosaic(figure, rows, panels, (1, 1))
-        figure.suptitle(
-            f"{found.n_points} triangulated points: rms {found.rmse:.4g} {unit}, NSCE {found.nsce:.3g}, "
-            f"epipolar rms {found.epipolar_px:.3g} px"
-        )
-
-    return picture(draw, (16.0, 9.0), _PAD, kind)
+    rows = [["across", "depth", "poses"], ["depths", "views", "views"]]
+    title = (
+        f"{found.n_points} triangulated points: rms {found.rmse:.4g} {unit}, NSCE {found.nsce:.3g}, "
+        f"epipolar rms {found.epipolar_px:.3g} px"
+    )
+    return _page(rows, (1, 1), panels, title, (16.0, 9.0), kind)
 
 
 def _camera_panels(subject: Subject) -> dict[str, Draw]:
@@ -154,21 +146,27 @@ def _title(subject: Subject) -> str:
     )
 
 
-def _fill(figure: FigureBase, panels: Mapping[str, Draw], title: str) -> None:
-    _mosaic(figure, [list(row) for row in _ROWS], panels, (1, 1, 0.55))
-    figure.suptitle(title)
+def _page(
+    rows: list[list[str]],
+    heights: tuple[float, ...],
+    panels: Mapping[str, Draw],
+    title: str,
+    size: tuple[float, float],
+    kind: str,
+) -> bytes:
+    """All panels of some rows on one page."""
 
+    def draw(figure: Figure) -> None:
+        axes = figure.subplot_mosaic(
+            rows,  # type: ignore[arg-type]
+            height_ratios=list(heights),
+            per_subplot_kw={"poses": {"projection": "3d"}} if any("poses" in row for row in rows) else None,
+        )
+        for name, place in axes.items():
+            panels[name](place)
+        figure.suptitle(title)
 
-def _mosaic(
-    figure: FigureBase, rows: list[list[str]], panels: Mapping[str, Draw], heights: tuple[float, ...]
-) -> None:
-    axes = figure.subplot_mosaic(
-        rows,  # type: ignore[arg-type]
-        height_ratios=list(heights),
-        per_subplot_kw={"poses": {"projection": "3d"}} if any("poses" in row for row in rows) else None,
-    )
-    for name, place in axes.items():
-        panels[name](place)
+    return picture(draw, size, _PAD, kind)
 
 
 def _alone(name: str, draw: Draw, kind: str) -> bytes:

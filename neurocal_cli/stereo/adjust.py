@@ -8,10 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import FLOOR, OPTIONS
+from neurocal_cli.calibration import Calibration
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import minimise
 from neurocal_cli.least_squares.schur_complement import schur_step
+from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import Columns, Frames, Observations, RigState, rig_normal_blocks
 
 _DAMPING = 1e-6  # each camera was adjusted alone before, so the first step is nearly undamped
@@ -39,6 +41,33 @@ class AdjustedRig:
     def cost(self) -> float:
         """Sum of squared whitened residuals."""
         return float(self.normal[:, -1, -1].sum())
+
+
+@frozen_dataclass(eq=False)
+class RigFit:
+    """A problem, and what the common bundle adjustment made of it.
+
+    Attributes
+    ----------
+    problem : RigProblem
+    calibrations : two of Calibration
+        Each camera alone.
+    adjusted : AdjustedRig
+    free : (n_shared,) bool array
+        Which parameters of the cameras and the rig moved.
+    """
+
+    problem: RigProblem
+    calibrations: tuple[Calibration, Calibration]
+    adjusted: AdjustedRig
+    free: NDArray[np.bool_]
+
+    @property
+    def variance(self) -> float:
+        """Of the whitened residuals; 1 where both cameras alone leave no less."""
+        equations = sum(observed.n_equations for observed in self.problem.observations)
+        unknowns = int(self.free.sum()) + 6 * len(self.problem.frames.scale)
+        return self.adjusted.cost / max(equations - unknowns, 1)
 
 
 def adjust_rig(

@@ -20,31 +20,17 @@ from neurocal_cli.bundle_adjustment.open_coefficients import (
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.schur_complement import eliminate
-from neurocal_cli.stereo.adjust import AdjustedRig
-from neurocal_cli.stereo.problem import RigProblem
+from neurocal_cli.stereo.adjust import AdjustedRig, RigFit
 from neurocal_cli.stereo.reprojection import Columns, rig_normal_blocks
 
 
-def open_covariance(
-    problem: RigProblem,
-    calibrations: tuple[Calibration, Calibration],
-    adjusted: AdjustedRig,
-    free: NDArray[np.bool_],
-    variance: float,
-) -> Array | None:
-    """Covariance of the free shared unknowns that the choice of the models adds; None where it adds none.
-
-    Parameters
-    ----------
-    problem, calibrations, adjusted, free
-        As they were adjusted.
-    variance : float
-        Of the weighed residuals.
-    """
+def open_covariance(fit: RigFit) -> Array | None:
+    """Covariance of the free shared unknowns that the choice of the models adds; None where it adds none."""
+    problem, adjusted, free = fit.problem, fit.adjusted, fit.free
     own = Columns.of(adjusted.state)
     opened = [
         _opened(calibration, adjusted, side, free[place])
-        for side, (calibration, place) in enumerate(zip(calibrations, (own.left, own.right), strict=True))
+        for side, (calibration, place) in enumerate(zip(fit.calibrations, (own.left, own.right), strict=True))
     ]
     if opened == [None, None]:
         return None
@@ -64,7 +50,7 @@ def open_covariance(
     kept = np.append(np.flatnonzero(all_free), columns.width - 1)
     left, _ = eliminate(normal, kept, columns.pose)
     whole = left.sum(axis=0)
-    spread = spread_of_open(whole[:-1, :-1], whole[:-1, -1], variance, _joined(is_open, left_out, opened))
+    spread = spread_of_open(whole[:-1, :-1], whole[:-1, -1], fit.variance, _joined(is_open, left_out, opened))
     follow = spread.follow[~left_out]
     added = follow @ spread.E @ follow.T
     return added if np.isfinite(added).all() else None

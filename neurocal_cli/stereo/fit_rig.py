@@ -5,14 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import CoincidentCamerasError, DegenerateGeometryError, UsageError
 from neurocal_cli.geometry import Array
 from neurocal_cli.pipeline.common_target import on_one_target
-from neurocal_cli.stereo.adjust import AdjustedRig, adjust_rig
+from neurocal_cli.stereo.adjust import RigFit, adjust_rig
 from neurocal_cli.stereo.assessment import assess_rig
 from neurocal_cli.stereo.contradiction import contradiction, is_significant
 from neurocal_cli.stereo.pair_covariance import not_smaller, rig_covariance
@@ -80,19 +79,18 @@ def fit_rig(
     if sound.left_out:
         kept = tuple(pair for pair in views.both if pair not in sound.left_out)
         problem = rig_problem(left, right, ViewPairs(kept, (), ()))
-    adjusted, free, warnings = _adjusted(problem, (left, right), sound.rig, refine_cameras)
-    luck = sound.luck and not sound.left_out
-    least = _covariance(problem, (left, right), adjusted, free, luck)
+    fit, warnings = _adjusted(problem, (left, right), sound.rig, refine_cameras)
+    least = _covariance(fit, sound.luck and not sound.left_out)
     if left.target is not None and left.target is right.target:
-        uncertain = with_target_uncertainty(left.target, problem, adjusted, free)
+        uncertain = with_target_uncertainty(left.target, fit)
         least = uncertain if least is None or uncertain is None else not_smaller(least, uncertain)
     stretched = None
     if target_kept or left.target_stretched or right.target_stretched:
-        stretched = stretched_rig(problem, (left, right), adjusted, free)
+        stretched = stretched_rig(fit)
     if target_kept and stretched is not None:
         left, right = (replace(camera, target_stretched=stretched.probability) for camera in (left, right))
-    added = None if stretched is None else stretched.added
-    rig = assemble_rig(problem, (left, right), adjusted, free, sound.left_out, least, added)
+        fit = replace(fit, calibrations=(left, right))
+    rig = assemble_rig(fit, sound.left_out, least, None if stretched is None else stretched.added)
     _refuse_one_place(rig)
     if sound.left_out:
         warnings.insert(0, sound.contradiction(len(views.both)))
@@ -101,8 +99,8 @@ def fit_rig(
 
 def _adjusted(
     problem: RigProblem, calibrations: tuple[Calibration, Calibration], start: Pose, refine_cameras: bool
-) -> tuple[AdjustedRig, NDArray[np.bool_], list[str]]:
-    """The common bundle adjustment, which parameters moved in it, and what to warn of."""
+) -> tuple[RigFit, list[str]]:
+    """The common bundle adjustment, and what to warn of."""
     moving = [refine_cameras, refine_cameras]
     warnings = []
     while True:
@@ -111,48 +109,36 @@ def _adjusted(
             + [np.ones(6, dtype=bool)]
         )
         adjusted = adjust_rig(problem.frames, problem.observations, problem.start(start), free)
-        if any(moving) and _growth(problem, adjusted, free) > _SPOILS:
+        fit = RigFit(problem, calibrations, adjusted, free)
+        if any(moving) and np.sqrt(fit.variance) > _SPOILS:
             moving = [False, False]
             warnings = [
                 "the pairs of views contradict each other, so both cameras keep the result of their own views"
             ]
             continue
-        if not (not_monotonic := non_monotonic_sides(problem, calibrations, adjusted, free)):
-            return adjusted, free, warnings
+        if not (not_monotonic := non_monotonic_sides(fit)):
+            return fit, warnings
         for side in not_monotonic:
             moving[side] = False
             warnings.append(_kept_warning(("left", "right")[side]))
 
 
-def _growth(problem: RigProblem, adjusted: AdjustedRig, free: NDArray[np.bool_]) -> float:
-    """Rms residual over that of both cameras alone."""
-    equations = sum(observed.n_equations for observed in problem.observations)
-    unknowns = int(free.sum()) + 6 * len(problem.frames.scale)
-    return float(np.sqrt(adjusted.cost / max(equations - unknowns, 1)))
-
-
-def _covariance(
-    problem: RigProblem,
-    calibrations: tuple[Calibration, Calibration],
-    adjusted: AdjustedRig,
-    free: NDArray[np.bool_],
-    luck: bool,
-) -> Array | None:
+def _covariance(fit: RigFit, luck: bool) -> Array | None:
     """Covariance of the shared parameters where that of independent points is too small."""
-    sides = estimated_parameters(calibrations[0]), estimated_parameters(calibrations[1])
+    sides = estimated_parameters(fit.calibrations[0]), estimated_parameters(fit.calibrations[1])
     estimated = np.concatenate([*sides, np.ones(6, dtype=bool)])
-    held = bool((free != estimated).any())
+    held = bool((fit.free != estimated).any())
     if luck and not held:
         return None
-    rig = Pose(adjusted.state.R, adjusted.state.t * problem.frames.unit)
-    poses = relative_poses(problem, sides, rig)
+    state = fit.adjusted.state
+    poses = relative_poses(fit.problem, sides, Pose(state.R, state.t * fit.problem.frames.unit))
     if poses is None:
         return None
     used = np.ones(len(poses), dtype=bool)
     found = contradiction(poses, used, seek_odd=False)
     if not held and not is_significant(found.scatter**2 * found.degrees, found.degrees):
         return None
-    moved = free[estimated]
+    moved = fit.free[estimated]
     return rig_covariance(poses, used, found)[np.ix_(moved, moved)]
 
 

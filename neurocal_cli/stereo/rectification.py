@@ -128,19 +128,11 @@ def _scale(
         image = _rectified(camera, R, np.column_stack([u.ravel(), v.ravel()]) * last).reshape(_GRID, _GRID, 2)
         image = f * image.clip(-_WIDEST, _WIDEST)
         # What is behind sets no limit.
-        most = f * _WIDEST
-        inner = np.array(
-            [
-                [
-                    np.fmax.reduce(image[:, 0, 0], initial=-most),
-                    np.fmax.reduce(image[0, :, 1], initial=-most),
-                ],
-                [
-                    np.fmin.reduce(image[:, -1, 0], initial=most),
-                    np.fmin.reduce(image[-1, :, 1], initial=most),
-                ],
-            ]
+        left, top = (np.fmax.reduce(side, initial=-f * _WIDEST) for side in (image[:, 0, 0], image[0, :, 1]))
+        right, bottom = (
+            np.fmin.reduce(side, initial=f * _WIDEST) for side in (image[:, -1, 0], image[-1, :, 1])
         )
+        inner = np.array([[left, top], [right, bottom]])
         outer = np.array([np.nanmin(image, axis=(0, 1)), np.nanmax(image, axis=(0, 1))])
         signs = np.array([[-1.0], [1.0]])
         fill.append((room / (signs * inner)).max())

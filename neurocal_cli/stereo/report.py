@@ -20,14 +20,6 @@ _MOST_VIEWS = 20  # rows of a table that still fit on a screen
 _ERRORS = ("rmse", "rmse_x", "rmse_y", "rmse_z", "max", "nsce", "epipolar_px", "relative")
 
 
-def stereo_evaluation_report(evaluation: StereoEvaluation) -> str:
-    """Summary of an evaluation as aligned text."""
-    blocks = [align(table) for table in stereo_evaluation_tables(evaluation)]
-    if evaluation.verdict is not None:
-        blocks.append(verdict_lines(evaluation.verdict))
-    return "\n\n".join("\n".join(block) for block in blocks)
-
-
 def stereo_evaluation_tables(evaluation: StereoEvaluation) -> tuple[list[list[str]], ...]:
     """Rows of the tables of all points, of the depths and of the views, each with its heading."""
     unit = evaluation.unit
@@ -214,10 +206,10 @@ def _view_lines(rig: Rig) -> list[str]:
     rows = []
     for a, b in rig.pairs:
         left, right = rig.left.views[a], rig.right.views[b]
-        errors = left.rmse_px, right.rmse_px
-        label = printable(a if a == b else f"{a} / {b}")
-        rows.append((max(errors), [label, str(left.n_points), *map(_figure, errors[:1]),
-                                   str(right.n_points), _figure(errors[1])]))  # fmt: skip
+        cells = [printable(a if a == b else f"{a} / {b}")]
+        for view in (left, right):
+            cells += [str(view.n_points), _figure(view.rmse_px)]
+        rows.append((max(left.rmse_px, right.rmse_px), cells))
     hidden = len(rows) - _MOST_VIEWS
     if hidden > 0:
         rows = sorted(rows, key=lambda row: -row[0])[:_MOST_VIEWS]

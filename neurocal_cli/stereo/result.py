@@ -27,10 +27,9 @@ from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array, euler_jacobian
 from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.least_squares.schur_complement import SchurCovariance, schur_covariance
-from neurocal_cli.stereo.adjust import AdjustedRig
+from neurocal_cli.stereo.adjust import RigFit
 from neurocal_cli.stereo.choice_covariance import open_covariance
 from neurocal_cli.stereo.pair_covariance import not_smaller
-from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import Columns, Observations, rig_jacobian
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.target import scale_of
@@ -39,10 +38,7 @@ _SINGULAR = 1e-13  # a smaller eigenvalue of a normal matrix with unit diagonal 
 
 
 def assemble_rig(
-    problem: RigProblem,
-    calibrations: tuple[Calibration, Calibration],
-    adjusted: AdjustedRig,
-    free: NDArray[np.bool_],
+    fit: RigFit,
     left_out: Mapping[tuple[str, str], str],
     least: Array | None = None,
     stretched: Array | None = None,
@@ -51,8 +47,7 @@ def assemble_rig(
 
     Parameters
     ----------
-    problem, calibrations, adjusted, free
-        As they were adjusted.
+    fit : RigFit
     left_out : dict of str by (left name, right name)
     least : (f, f) array, optional
         Covariance of the free shared parameters, normalised, below which the result's must not be.
@@ -64,20 +59,16 @@ def assemble_rig(
     DegenerateGeometryError
         The points do not determine the parameters.
     """
-    return _RigAssembly(problem, calibrations, adjusted, free, least, stretched).rig(left_out)
+    return _RigAssembly(fit, least, stretched).rig(left_out)
 
 
-def non_monotonic_sides(
-    problem: RigProblem,
-    calibrations: tuple[Calibration, Calibration],
-    adjusted: AdjustedRig,
-    free: NDArray[np.bool_],
-) -> list[int]:
+def non_monotonic_sides(fit: RigFit) -> list[int]:
     """Cameras whose distortion is not monotonic inside the image after the common bundle adjustment."""
-    columns, shared = Columns.of(adjusted.state), np.flatnonzero(free)
+    state = fit.adjusted.state
+    columns, shared = Columns.of(state), np.flatnonzero(fit.free)
     found = []
     for side, own in enumerate((columns.left, columns.right)):
-        camera, observed, given = adjusted.state.cameras[side], problem.observations[side], calibrations[side]
+        camera, observed, given = state.cameras[side], fit.problem.observations[side], fit.calibrations[side]
         estimated = np.isin(own, shared)
         if not estimated.any():
             continue
@@ -88,39 +79,27 @@ def non_monotonic_sides(
 
 
 class _RigAssembly:
-    def __init__(
-        self,
-        problem: RigProblem,
-        calibrations: tuple[Calibration, Calibration],
-        adjusted: AdjustedRig,
-        free: NDArray[np.bool_],
-        least: Array | None,
-        stretched: Array | None,
-    ) -> None:
-        self.problem, self.calibrations, self.adjusted = problem, calibrations, adjusted
-        self.columns = Columns.of(adjusted.state)
-        self.scale_std = scale_of(calibrations[0].points).std
-        self.shared = np.flatnonzero(free)
-        inverse = schur_covariance(adjusted.normal, self.shared, self.columns.pose)
+    def __init__(self, fit: RigFit, least: Array | None, stretched: Array | None) -> None:
+        self.problem, self.calibrations, self.adjusted = fit.problem, fit.calibrations, fit.adjusted
+        self.columns = Columns.of(self.adjusted.state)
+        self.scale_std = scale_of(self.calibrations[0].points).std
+        self.shared = np.flatnonzero(fit.free)
+        inverse = schur_covariance(self.adjusted.normal, self.shared, self.columns.pose)
         if not inverse.smallest > _SINGULAR:
             raise DegenerateGeometryError(
                 "the points do not determine the rig and both cameras (the normal matrix is singular); "
                 "spread them in depth, or give known parameters (--no-skew, --left-intrinsics, "
                 "--right-intrinsics)"
             )
-        n_equations = sum(observed.n_equations for observed in problem.observations)
-        unknowns = len(self.shared) + 6 * len(problem.frames.scale)
-        variance = adjusted.cost / max(n_equations - unknowns, 1)
         self.covariance = replace(
             inverse,
-            shared=variance * inverse.shared,
-            own=variance * inverse.own,
-            cross=variance * inverse.cross,
+            shared=fit.variance * inverse.shared,
+            own=fit.variance * inverse.own,
+            cross=fit.variance * inverse.cross,
         )
         if least is not None:
             self.covariance = _widened(self.covariance, not_smaller(self.covariance.shared, least))
-        added = open_covariance(problem, calibrations, adjusted, free, variance)
-        for more in (added, stretched):
+        for more in (open_covariance(fit), stretched):
             if more is not None:
                 self.covariance = _widened(self.covariance, self.covariance.shared + more)
 

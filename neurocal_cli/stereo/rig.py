@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from neurocal_cli.calibration import Calibration, Verdict
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, cross_matrix
 
@@ -95,12 +95,16 @@ class Rig:
     @property
     def E(self) -> Array:
         """(3, 3) essential matrix [t]x R: x_right^T E x_left = 0."""
-        return essential_matrix(self.pose)
+        return np.asarray(cross_matrix(self.t) @ self.R)
 
     @property
     def F(self) -> Array:
-        """(3, 3) fundamental matrix of undistorted pixels, of unit norm."""
-        return fundamental_matrix(self.left.intrinsics, self.right.intrinsics, self.pose)
+        """(3, 3) fundamental matrix A_right^-T E A_left^-1 of unit norm: m_right^T F m_left = 0.
+
+        m are undistorted pixels.
+        """
+        F = np.linalg.solve(self.right.intrinsics.A.T, self.E) @ np.linalg.inv(self.left.intrinsics.A)
+        return np.asarray(F / np.linalg.norm(F))
 
     @property
     def sigma(self) -> float:
@@ -111,14 +115,3 @@ class Rig:
     def unit(self) -> str:
         """Unit of the world coordinates."""
         return self.left.unit
-
-
-def essential_matrix(pose: Pose) -> Array:
-    """Essential matrix (3, 3) ``[t]x R`` of ``X_right = R X_left + t``: x_right^T E x_left = 0."""
-    return np.asarray(cross_matrix(pose.t) @ pose.R)
-
-
-def fundamental_matrix(left: Intrinsics, right: Intrinsics, pose: Pose) -> Array:
-    """Fundamental matrix (3, 3) ``A_right^-T E A_left^-1`` of unit norm: m_right^T F m_left = 0."""
-    F = np.linalg.solve(right.A.T, essential_matrix(pose)) @ np.linalg.inv(left.A)
-    return np.asarray(F / np.linalg.norm(F))

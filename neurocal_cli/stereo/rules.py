@@ -11,8 +11,7 @@ from neurocal_cli.stereo.contradiction import Contradiction
 from neurocal_cli.stereo.evidence import RigEvidence
 from neurocal_cli.stereo.rig import Rig
 from neurocal_cli.stereo.sound_pairs import MOVED, pair_name, told_of_faults, told_of_move
-from neurocal_cli.verdict.findings import WORDS, Finding, verdict_of
-from neurocal_cli.verdict.limits import Limit
+from neurocal_cli.verdict.findings import WORDS, Finding, Limit, verdict_of
 
 # Repeated by tests/test_wrong_rigs.py, in which no wrong rig may be good, and tests/test_rig_verdict.py, in
 # which real and simulated good ones are. Real boards make the relative poses scatter 2 to 3 times as much as

@@ -7,15 +7,13 @@ adjustment.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.calibration import Calibration
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.schur_complement import eliminate
-from neurocal_cli.stereo.adjust import AdjustedRig
+from neurocal_cli.stereo.adjust import RigFit
 from neurocal_cli.stereo.problem import RigProblem, estimated_parameters
-from neurocal_cli.stereo.reprojection import Columns, rig_jacobian
+from neurocal_cli.stereo.reprojection import Columns, RigState, rig_jacobian
 from neurocal_cli.target import is_flat
 from neurocal_cli.target_shape.open_stretch import spread_of_stretch, stretched_blocks, stretches
 
@@ -36,43 +34,37 @@ class StretchedRig:
     added: Array
 
 
-def stretched_rig(
-    problem: RigProblem,
-    calibrations: tuple[Calibration, Calibration],
-    adjusted: AdjustedRig,
-    free: NDArray[np.bool_],
-) -> StretchedRig | None:
+def stretched_rig(fit: RigFit) -> StretchedRig | None:
     """What the stretch of a target adds; None where that is negligible, or the target is not flat.
 
     Cameras that were held follow the stretch as well: they were calibrated on the same target.
 
     Parameters
     ----------
-    problem, calibrations, adjusted, free
-        As they were adjusted, for the target as given.
+    fit : RigFit
+        For the target as given.
     """
-    world = np.concatenate([calibration.points.world for calibration in calibrations])
+    world = np.concatenate([calibration.points.world for calibration in fit.calibrations])
     if not is_flat(world):
         return None
-    sides = [estimated_parameters(calibration) for calibration in calibrations]
+    sides = [estimated_parameters(calibration) for calibration in fit.calibrations]
     estimated = np.concatenate([*sides, np.ones(6, dtype=bool)])
-    columns = Columns.of(adjusted.state)
-    normal = _with_stretches(problem, adjusted, columns, stretches(world))
+    columns = Columns.of(fit.adjusted.state)
+    normal = _with_stretches(fit.problem, fit.adjusted.state, columns, stretches(world))
     kept = np.append(np.flatnonzero(estimated), np.arange(columns.width - 1, columns.width + 2))
     whole = eliminate(normal, kept, columns.pose)[0].sum(axis=0)
-    equations = sum(observed.n_equations for observed in problem.observations)
-    unknowns = int(free.sum()) + 6 * len(problem.frames.scale)
-    variance = adjusted.cost / max(equations - unknowns, 1)
-    found = spread_of_stretch(whole[:-1, :-1], whole[:-1, -1], variance) if variance > 0 else None
+    if not fit.variance > 0:
+        return None
+    found = spread_of_stretch(whole[:-1, :-1], whole[:-1, -1], fit.variance)
     if found is None:
         return None
-    T = found.follow[:-2][free[estimated]]
+    T = found.follow[:-2][fit.free[estimated]]
     return StretchedRig(found.probability, T @ found.E @ T.T)
 
 
-def _with_stretches(problem: RigProblem, adjusted: AdjustedRig, columns: Columns, by: Array) -> Array:
+def _with_stretches(problem: RigProblem, state: RigState, columns: Columns, by: Array) -> Array:
     """(V, D + 2, D + 2) normal matrices with columns of two stretches before the residual's."""
-    frames, state, D = problem.frames, adjusted.state, columns.width
+    frames, D = problem.frames, columns.width
     normal = np.zeros((len(frames.scale), D + 2, D + 2))
     for side, observed in enumerate(problem.observations):
         blocks = stretched_blocks(observed.batches, state.camera_with_poses(side, frames, observed), by)

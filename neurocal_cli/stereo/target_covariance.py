@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.reprojection import POSE, camera_columns
 from neurocal_cli.geometry import Array
-from neurocal_cli.stereo.adjust import AdjustedRig
+from neurocal_cli.stereo.adjust import RigFit
 from neurocal_cli.stereo.problem import RigProblem
 from neurocal_cli.stereo.reprojection import Columns, Observations, RigState, rig_jacobian, rig_normal_blocks
 from neurocal_cli.target import Target
@@ -21,12 +21,10 @@ from neurocal_cli.target_shape.prior import prior_of_target
 from neurocal_cli.target_shape.surveyed import noise_variance
 
 
-def with_target_uncertainty(
-    target: Target, problem: RigProblem, adjusted: AdjustedRig, free: NDArray[np.bool_]
-) -> Array | None:
+def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
     """(F, F) covariance of the free shared parameters of the rig; None where nothing determines them."""
     prior = prior_of_target(target)
-    info = _information(target, problem, adjusted.state, free).turned(prior.axes)
+    info = _information(target, fit.problem, fit.adjusted.state, fit.free).turned(prior.axes)
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
     offsets = prior.along_axes(target.offsets)
     variance = info.cost / max(spare, 1.0)

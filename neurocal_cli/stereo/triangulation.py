@@ -104,7 +104,11 @@ def triangulate(
     if len(pixels[1]) != n:
         raise InputError(f"{n} left pixels but {len(pixels[1])} right ones; give one of each for every point")
     cameras = camera_of(left), camera_of(right)
-    rigs = _Rigs.of([pose] if isinstance(pose, Pose) else pose, which, n)
+    rigs = np.stack([pose.D] if isinstance(pose, Pose) else [one.D for one in pose])
+    if len(rigs) == 1:
+        which = None
+    elif which is None or len(which) != n:
+        raise InputError(f"with several rigs, give the number of the rig of each of the {n} points")
     wide = any(_sees_sideways(camera, seen) for camera, seen in zip(cameras, pixels, strict=True))
     batch_type: type[PointBatch] | type[WidePointBatch] = WidePointBatch if wide else PointBatch
     points, epipolar, behind = np.empty((n, 3)), np.empty(n), np.empty(n, dtype=bool)
@@ -113,7 +117,8 @@ def triangulate(
         for start in range(0, n, _BLOCK):
             rows = slice(start, start + _BLOCK)
             factors = None if whitening is None else (whitening[0][rows].T, whitening[1][rows].T)
-            batch = batch_type(cameras, rigs.of_points(rows), pixels[0][rows].T, pixels[1][rows].T, factors)
+            rig = np.moveaxis(rigs if which is None else rigs[which[rows]], 0, -1)
+            batch = batch_type(cameras, rig, pixels[0][rows].T, pixels[1][rows].T, factors)
             if covariance is None:
                 points[rows] = batch.linear() if method == "linear" else batch.midpoint()
                 epipolar[rows], behind[rows] = batch.compare(points[rows])
@@ -137,25 +142,3 @@ def _pixels(values: Array) -> Array:
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise InputError(f"pixels must have the shape (N, 2), found {pixels.shape}")
     return pixels
-
-
-@frozen_dataclass(eq=False)
-class _Rigs:
-    """R (V, 3, 3) and t (V, 3) of one or several rigs, and the rig of each point."""
-
-    R: Array
-    t: Array
-    which: NDArray[np.intp] | None
-
-    @classmethod
-    def of(cls, poses: Sequence[Pose], which: NDArray[np.intp] | None, n: int) -> _Rigs:
-        """Rigs with these poses, for n points."""
-        if len(poses) != 1 and (which is None or len(which) != n):
-            raise InputError(f"with several rigs, give the number of the rig of each of the {n} points")
-        R, t = np.stack([pose.R for pose in poses]), np.stack([pose.t for pose in poses])
-        return cls(R, t, None if len(poses) == 1 else which)
-
-    def of_points(self, rows: slice) -> Array:
-        """[R | t] with points along the last axis, (3, 4, n), or (3, 4, 1) for a common rig."""
-        P = np.concatenate([self.R, self.t[..., None]], axis=2)
-        return np.moveaxis(P if self.which is None else P[self.which[rows]], 0, -1)

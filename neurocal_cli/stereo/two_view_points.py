@@ -18,12 +18,9 @@ from neurocal_cli.camera.monotonic import nearly_undistorted
 from neurocal_cli.camera.projection import image_points_with_jacobian, normalised_points
 from neurocal_cli.geometry import Array
 
-_MAX_STEPS = 30
-_SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
-_RISE, _ROUNDING = (
-    1 + 1e-9,
-    1e-18,
-)  # a rise of the squared error by less, as a factor and in px^2, is rounding
+MAX_STEPS = 30
+SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
+RISE, ROUNDING = 1 + 1e-9, 1e-18  # a rise of the squared error by less, as a factor and in px^2, is rounding
 
 
 class PointBatch:
@@ -76,10 +73,10 @@ class PointBatch:
         left_out = ~np.isfinite(x + w)
         x[left_out], y[left_out], w[left_out] = 0.0, 0.0, 1.0  # any finite values
         N, cost = self._normal(x, y, w)
-        for _ in range(_MAX_STEPS):
+        for _ in range(MAX_STEPS):
             step = _solve(N)
             moved = _step_length(N, step)
-            if not moved.max(initial=0.0) > _SMALL_STEP:
+            if not moved.max(initial=0.0) > SMALL_STEP:
                 break
             x, y, w, N, cost = self._descend((x, y, w), step, N, cost)
         points = np.stack([x / w, y / w, 1 / w], axis=1)
@@ -96,7 +93,7 @@ class PointBatch:
         """One step of each point, halved where it raises the error."""
         x, y, w = (value + change for value, change in zip(state, step, strict=True))
         N_new, new = self._normal(x, y, w)
-        worse = ~(new <= cost * _RISE + _ROUNDING)
+        worse = ~(new <= cost * RISE + ROUNDING)
         length = 1.0
         while worse.any() and length > 1e-3:
             length *= 0.5
@@ -105,7 +102,7 @@ class PointBatch:
                 for value, change, now in zip(state, step, (x, y, w), strict=True)
             )
             N_new, new = self._normal(x, y, w)
-            worse = ~(new <= cost * _RISE + _ROUNDING)
+            worse = ~(new <= cost * RISE + ROUNDING)
         if worse.any():
             x, y, w = (np.where(worse, old, now) for old, now in zip(state, (x, y, w), strict=True))
             N_new, new = (

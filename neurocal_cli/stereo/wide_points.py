@@ -11,24 +11,13 @@ from numpy.typing import NDArray
 
 from neurocal_cli.camera.camera import Camera
 from neurocal_cli.geometry import Array
+from neurocal_cli.stereo.two_view_points import MAX_STEPS, RISE, ROUNDING, SMALL_STEP
 
-_MAX_STEPS = 30
 _HALVINGS = 10
-_SMALL_STEP = 1e-9  # px; a smaller change of all images ends the iteration
-_RISE, _ROUNDING = 1 + 1e-9, 1e-18  # a rise of the squared error by less is rounding
 
 
 class WidePointBatch:
-    """Some thousand points.
-
-    Parameters
-    ----------
-    cameras : two of Camera
-    rig : (3, 4, n) or (3, 4, 1) array
-        [R | t] of each point, or of all.
-    left, right : (2, n) arrays [px]
-    whitening : two of (3, n) array or None
-    """
+    """Some thousand points, from the same as a `PointBatch`."""
 
     def __init__(
         self,
@@ -54,14 +43,14 @@ class WidePointBatch:
         q = np.column_stack([np.zeros((len(w), 2)), np.where(lost, 1.0, w)])
         J, r, seen = self._linearised(basis, q)
         cost = (r * r).sum(axis=1)
-        for _ in range(_MAX_STEPS):
+        for _ in range(MAX_STEPS):
             step = _solved(J, r)
-            if not np.linalg.norm((J @ step[..., None])[..., 0], axis=1).max(initial=0.0) > _SMALL_STEP:
+            if not np.linalg.norm((J @ step[..., None])[..., 0], axis=1).max(initial=0.0) > SMALL_STEP:
                 break
             for _ in range(_HALVINGS):
                 trial = self._linearised(basis, q + step)
                 new = (trial[1] ** 2).sum(axis=1)
-                worse = ~(new <= cost * _RISE + _ROUNDING)
+                worse = ~(new <= cost * RISE + ROUNDING)
                 if not worse.any():
                     break
                 step[worse] *= 0.5

@@ -9,8 +9,7 @@ import numpy as np
 from neurocal_cli.geometry import Array
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.evidence import Evidence
-from neurocal_cli.verdict.findings import Finding, name_some
-from neurocal_cli.verdict.limits import Limit
+from neurocal_cli.verdict.findings import Finding, Limit, name_some
 from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
 

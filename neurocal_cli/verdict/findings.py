@@ -1,4 +1,4 @@
-"""What a verdict is made of: findings, each with a grade, a reason and an advice."""
+"""What a verdict is made of: findings, each with a grade, a reason and an advice; limits give the grades."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from neurocal_cli.calibration import Verdict
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.points import Correspondences
 
 WORDS = ("good", "usable", "poor")
@@ -16,6 +17,18 @@ Finding = tuple[int, str, str]
 """Grade (0 good, 1 usable, 2 poor), reason, advice."""
 
 _SHOWN = 3
+
+
+@frozen_dataclass
+class Limit:
+    """From where on a quantity is no longer good, and from where on it is poor."""
+
+    good: float
+    poor: float
+
+    def grade(self, value: float) -> int:
+        """0 good, 1 usable, 2 poor; what is unknown is good."""
+        return int(value > self.good) + int(value > self.poor)
 
 
 def verdict_of(findings: Iterable[Finding], measures: Mapping[str, float]) -> Verdict:

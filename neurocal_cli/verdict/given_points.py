@@ -9,8 +9,7 @@ import numpy as np
 from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.verdict.assessment import gather_evidence
-from neurocal_cli.verdict.findings import WORDS, Finding, image_diagonal, pixel_spread
-from neurocal_cli.verdict.limits import Limit
+from neurocal_cli.verdict.findings import WORDS, Finding, Limit, image_diagonal, pixel_spread
 from neurocal_cli.verdict.rules import ERROR, given_parameters
 
 # Times the error of the calibration. Good cameras stay below on 200 sets of new views of their own:

@@ -8,8 +8,7 @@ import numpy as np
 
 from neurocal_cli.calibration import Calibration
 from neurocal_cli.points import Correspondences
-from neurocal_cli.verdict.findings import Finding, name_some
-from neurocal_cli.verdict.limits import Limit
+from neurocal_cli.verdict.findings import Finding, Limit, name_some
 
 _SHARE = Limit(0.02, 0.2)  # of the points
 _OF_A_VIEW = 0.2  # share of its points; clean views lose none

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
 _SAME = 1e-3  # px
@@ -17,17 +16,11 @@ def repeated_views(points: Correspondences) -> tuple[str, ...]:
     table, view = table[order], points.view_index[order]
     again = (table[1:] == table[:-1]).all(axis=1) & (view[1:] == view[:-1])
     doubled = np.bincount(view[1:][again], minlength=points.n_views) > 0
+    of_views = np.split(np.round(table[:, :2]), np.cumsum(np.bincount(points.view_index))[:-1])
     found, known = [], set()
-    for name, pixels, twice in zip(
-        points.view_names, _by_view(points, np.round(table[:, :2])), doubled, strict=True
-    ):
+    for name, pixels, twice in zip(points.view_names, of_views, doubled, strict=True):
         key = pixels.tobytes()
         if key in known or twice:
             found.append(name)
         known.add(key)
     return tuple(found)
-
-
-def _by_view(points: Correspondences, rows: Array) -> list[Array]:
-    """Rows that are sorted by view, one array for each view."""
-    return np.split(rows, np.cumsum(np.bincount(points.view_index))[:-1])

@@ -11,9 +11,8 @@ from neurocal_cli.calibration import Verdict
 def verdict_lines(verdict: Verdict) -> list[str]:
     """The word, what it rests on, what speaks against it and what to do next."""
     lines = [f"verdict: {verdict.word}"]
-    facts = _facts(verdict)
-    if facts:
-        lines.append(f"  {', '.join(facts)}")
+    if found := facts(verdict):
+        lines.append(f"  {found}")
     lines += [f"  reason: {reason}" for reason in verdict.reasons]
     lines += [f"  advice: {advice}" for advice in verdict.advice]
     return lines
@@ -30,18 +29,19 @@ def verdict_json(verdict: Verdict) -> dict[str, Any]:
     }
 
 
-def _facts(verdict: Verdict) -> list[str]:
+def facts(verdict: Verdict) -> str:
+    """What a verdict rests on."""
     m = verdict.measures
     texts = (
         ("held_out_px", "cross-validation error {:.3g} px"),
         ("precision_px", "noise floor {:.3g} px"),
         ("projection_px", "std of predicted pixels {:.2g} px at most"),
     )
-    facts = [text.format(m[name]) for name, text in texts if math.isfinite(m.get(name, math.nan))]
+    found = [text.format(m[name]) for name, text in texts if math.isfinite(m.get(name, math.nan))]
     depth = m.get("depth_share", math.nan)
     if math.isfinite(depth):
-        facts.append(f"std of triangulated depth {100 * depth:.2g} % of the depth")
+        found.append(f"std of triangulated depth {100 * depth:.2g} % of the depth")
     coverage = m.get("coverage", math.nan)
     if math.isfinite(coverage):
-        facts.append(f"{100 * coverage:.0f} % of the image covered")
-    return facts
+        found.append(f"{100 * coverage:.0f} % of the image covered")
+    return ", ".join(found)

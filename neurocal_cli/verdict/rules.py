@@ -11,9 +11,8 @@ from neurocal_cli.calibration import Calibration, Verdict
 from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
-from neurocal_cli.verdict.findings import Finding, image_diagonal, name_some, pixel_spread, verdict_of
+from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
 from neurocal_cli.verdict.given_parameters import AskedFor
-from neurocal_cli.verdict.limits import Limit
 from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
 from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
 from neurocal_cli.verdict.units_of_views import views_of_another_scale

@@ -13,8 +13,7 @@ import numpy as np
 
 from neurocal_cli.calibration import Verdict
 from neurocal_cli.geometry import Array
-from neurocal_cli.verdict.findings import Finding, verdict_of
-from neurocal_cli.verdict.limits import Limit
+from neurocal_cli.verdict.findings import Finding, Limit, verdict_of
 from neurocal_cli.zoom_lens.settings import describe
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 

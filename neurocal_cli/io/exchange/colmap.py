@@ -19,7 +19,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.rotations import after, from_quaternion, to_quaternion
-from neurocal_cli.io.files import read_text
+from neurocal_cli.io.files import read_text, value_failures
 from neurocal_cli.io.yaml_text import number
 
 _HALF = 0.5  # of a pixel, from our origin to COLMAP's
@@ -70,13 +70,11 @@ def read_folder(folder: str) -> CameraSet:
             )
         raise FormatError("is a folder without COLMAP's cameras.txt; give a camera file", folder)
     text, source = read_text(path)
-    try:
+    with value_failures(source):
         cameras = _cameras(text, source)
         relative = _rig(folder, list(cameras))
         found = CameraSet(tuple(cameras.values()), relative, program="COLMAP")
         return replace(found, poses=_poses(folder, next(iter(cameras))))
-    except InputError as error:
-        raise error if isinstance(error, FormatError) else FormatError(str(error), source) from error
 
 
 def parse(text: str, source: str) -> CameraSet:

@@ -99,14 +99,6 @@ def _opencv(points: Correspondences, ending: str) -> str:
     return storage_text(tree, ending)
 
 
-def _json(points: Correspondences, ending: str) -> str:
-    return json_text(_tree(points))
-
-
-def _npz(points: Correspondences, ending: str) -> bytes:
-    return npz_bytes(_tree(points))
-
-
 def _matlab(points: Correspondences, ending: str) -> bytes:
     world, _, pixels = _array(points)
     flat = not world[:, 2].any()
@@ -147,6 +139,6 @@ _TEXTS: dict[str, Callable[[Correspondences, str], str | bytes]] = {
     "opencv": _opencv,
     "matlab": _matlab,
     "mrcal": _mrcal,
-    "json": _json,
-    "npz": _npz,
+    "json": lambda points, _: json_text(_tree(points)),
+    "npz": lambda points, _: npz_bytes(_tree(points)),
 }

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,33 +27,20 @@ from neurocal_cli.io.camera_tree import image_size
 from neurocal_cli.io.exchange.dictionary import arrays_of
 from neurocal_cli.io.exchange.matlab import FIRST_PIXEL, unit_of
 from neurocal_cli.io.file_storage import parse_tree
-from neurocal_cli.io.files import decode, read_bytes
+from neurocal_cli.io.files import decode, read_bytes, value_failures
 from neurocal_cli.io.mat_file import read_variables
 from neurocal_cli.io.points_csv import read_points
 from neurocal_cli.io.tree_fields import Field
 from neurocal_cli.points import Correspondences
 
 _IMAGE = (
-    "image_points",
-    "imagePoints",
-    "imgpoints",
-    "img_points",
-    "imgPoints",
-    "ImagePoints",
-    "corners",
+    "image_points", "imagePoints", "imgpoints", "img_points", "imgPoints", "ImagePoints", "corners",
     "all_corners",
-)
+)  # fmt: skip
 _WORLD = (
-    "object_points",
-    "objectPoints",
-    "objpoints",
-    "obj_points",
-    "objPoints",
-    "grid_points",
-    "worldPoints",
-    "WorldPoints",
-    "world_points",
-)
+    "object_points", "objectPoints", "objpoints", "obj_points", "objPoints", "grid_points", "worldPoints",
+    "WorldPoints", "world_points",
+)  # fmt: skip
 _VNL = re.compile(r"\A(?:##[^\n]*\n)*#\s*filename\s+x\s+y\b")
 _TABLE = re.compile(r"\A(?:#[^\n]*\n|\s*\n)*[^\n#]*\bX\b[^\n]*\bv\b", re.IGNORECASE)
 _KALIBR = re.compile(r"\ACalibration results\s*\n=+\s*\n")
@@ -110,13 +97,10 @@ def read_corners(
         return _separate(names, board, unit)
     if _TABLE.match(text):
         return read_points(names, notes=notes)
-    if text.lstrip()[:1] in ("{", "<", "%") or _names_points(text):
+    named = any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
+    if named or text.lstrip()[:1] in ("{", "<", "%"):
         return _dictionary(parse_tree(text, source), board, unit)
     return None
-
-
-def _names_points(text: str) -> bool:
-    return any(re.search(rf"^{name}\s*:", text, re.MULTILINE) for name in _IMAGE)
 
 
 def _npy(data: bytes, source: str) -> Any:
@@ -152,18 +136,15 @@ def _corners(
     views = len(pixels)
     names = [f"{k:0{len(str(views))}d}" for k in range(1, views + 1)]
     if "view_names" in root:
-        names = [entry.text() for entry in root["view_names"].items()]
-        if len(names) != views or len(set(names)) < views:
-            root["view_names"].fail(f"{views} different names")
+        names = root["view_names"].names(views)
     world = next((_stack(root[name], 3) for name in _WORLD if name in root), None)
     stated = root["unit"].text() if "unit" in root else unit
-    ids = [entry.text() for entry in root["points"].items()] if "points" in root else None
+    ids = root.read("points", Field.texts)
     if world is None:
         world, ids = _of_board(board, pixels.shape[1], field, down)
         stated = board.unit if board else stated
     if world.shape[1] != pixels.shape[1] or len(world) not in (1, views):
         field.fail(f"{world.shape[1]} points in each view, as there are places on the board")
-    world = np.broadcast_to(world, (views, *world.shape[1:]))
     points = _assembled(world, pixels, names, ids, stated, root.source)
     return replace(points, image_size=image_size(root))
 
@@ -222,30 +203,29 @@ def _stack(field: Field, width: int) -> Array:
 def _assembled(
     world: Array, pixels: Array, names: list[str], ids: list[str] | None, unit: str | None, source: str
 ) -> Correspondences:
-    """Rows of all views; corners that are NaN were not found."""
+    """Rows of all views; corners that are NaN were not found. Places of one view are those of all."""
     views, count = pixels.shape[:2]
     found = np.isfinite(pixels).all(axis=2)
     if not found.any():
         raise FormatError("holds no corner that was found; give another file", source)
     labels = ids if ids is not None else [str(k) for k in range(count)]
-    try:
+    with value_failures(""):
         return Correspondences(
-            world[found],
+            np.broadcast_to(world, (views, count, 3))[found],
             pixels[found],
             np.repeat(names, count).reshape(views, count)[found],
             point=np.tile(labels, views).reshape(views, count)[found],
             unit=unit or "unknown",
             source=source,
         )
-    except InputError as error:
-        raise FormatError(str(error)) from error
 
 
 def _matlab(data: bytes, source: str, board: Board | None, unit: str | None) -> Correspondences | None:
     tree = read_variables(data, source)
     if not any(name in tree for name in _IMAGE):
         return None
-    root = Field({name: _plain(value) for name, value in tree.items()}, source)
+    plain = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in tree.items()}
+    root = Field(plain, source)
     field = next(name for name in _IMAGE if name in tree)
     if np.size(tree.get("ImageSize", ())) == 2:  # MATLAB's is height and width
         root.value["image_size"] = [int(side) for side in np.ravel(tree["ImageSize"])[::-1]]
@@ -277,10 +257,6 @@ def _matlab_board(tree: dict[str, Any], unit: str | None, source: str) -> Board 
     return Board((plane,), "mm" if "squareSizeInMM" in tree else unit or "unknown")
 
 
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray) else value
-
-
 def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
     """Read mrcal's table; a corner that was not found is ``-``, and each level doubles the sigma."""
     rows: dict[str, list[tuple[float, float, float]]] = {}
@@ -306,19 +282,10 @@ def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
         )
     stack = np.array(list(seen.values()))
     world, ids = _of_board(board, counts.pop(), Field(None, source, "the table"))
-    names = [Path(name).stem for name in seen]
-    names = names if len(set(names)) == len(names) else list(seen)
     # A negative level marks a corner that mrcal itself takes for an outlier.
     pixels = np.where(stack[:, :, 2:] < 0, np.nan, stack[:, :, :2])
     found = np.isfinite(pixels).all(axis=2)
-    points = _assembled(
-        np.broadcast_to(world, (len(stack), *world.shape[1:])),
-        pixels,
-        names,
-        ids,
-        board.unit if board else None,
-        source,
-    )
+    points = _assembled(world, pixels, _stems(seen), ids, board.unit if board else None, source)
     sigma = 2.0 ** stack[:, :, 2][found]
     if not (sigma > 1).any():
         return points
@@ -343,11 +310,13 @@ def _separate(names: list[str], board: Board | None, unit: str | None) -> Corres
             raise FormatError(
                 f"has {len(table)} rows of {table.shape[1]}; give {world.shape[1]} rows of u and v", name
             )
+    return _assembled(world, np.stack(tables), _stems(names), ids, stated, names[0])
+
+
+def _stems(names: Iterable[str]) -> list[str]:
+    """Names of files without folder and ending, where they still differ."""
     stems = [Path(name).stem for name in names]
-    labels = stems if len(set(stems)) == len(stems) else names
-    pixels = np.stack(tables)
-    world = np.broadcast_to(world, (len(tables), *world.shape[1:]))
-    return _assembled(world, pixels, labels, ids, stated, names[0])
+    return stems if len(set(stems)) == len(stems) else list(names)
 
 
 def _table(name: str) -> Array:

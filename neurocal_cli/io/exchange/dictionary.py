@@ -49,7 +49,7 @@ def from_tree(root: Field) -> CameraSet:
     InputError, FormatError
         What is missing or wrong.
     """
-    unit = root["unit"].text() if "unit" in root else None
+    unit = root.read("unit", Field.text)
     sides = _sides(root)
     if sides is None:
         return CameraSet((camera_from_tree(root),), (), _poses(root), unit)
@@ -112,9 +112,7 @@ def _poses(root: Field) -> dict[str, Pose]:
         return {}
     names = [f"{number}" for number in range(1, len(rows) + 1)]
     if "view_names" in root:
-        names = [entry.text() for entry in root["view_names"].items()]
-    if len(names) != len(rows) or len(set(names)) < len(names):
-        root["view_names"].fail(f"{len(rows)} different names")
+        names = root["view_names"].names(len(rows))
     return {name: Pose(from_vector(row[:3]), row[3:]) for name, row in zip(names, rows, strict=True)}
 
 
@@ -172,14 +170,6 @@ def _opencv(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
     return {"": storage_text(tree, ending)}
 
 
-def _json(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
-    return {"": json_text(entries(cameras))}
-
-
-def _npz(cameras: CameraSet, ending: str) -> Mapping[str, str | bytes]:
-    return {"": npz_bytes(entries(cameras))}
-
-
 def json_text(tree: Mapping[str, Any]) -> str:
     """The dictionary as JSON, an entry a line; numbers that are not known are null."""
     lines = ",\n".join(f"  {json.dumps(key)}: {_json_value(value)}" for key, value in tree.items())
@@ -207,5 +197,5 @@ def npz_bytes(tree: Mapping[str, Any]) -> bytes:
 
 _ALL = ("none", "plumb_bob", "rational", "thin_prism", "tilted", "fisheye", "omnidir")
 OPENCV = Format("OpenCV", _ALL, False, True, 2, False, False, _opencv)
-JSON = Format("JSON", _ALL, True, True, 2, False, False, _json)
-NPZ = Format("NumPy", _ALL, True, True, 2, False, False, _npz)
+JSON = Format("JSON", _ALL, True, True, 2, False, False, lambda set_, _: {"": json_text(entries(set_))})
+NPZ = Format("NumPy", _ALL, True, True, 2, False, False, lambda set_, _: {"": npz_bytes(entries(set_))})

@@ -69,7 +69,7 @@ def _camera(field: Field, name: str) -> Camera:
             f"{name}: the camera model {model[:40]!r} is not known; calibrate it as pinhole-equi, "
             "pinhole-radtan, omni-radtan, ds-none or eucm-none, or with neurocal from the points"
         )
-    lens = field["distortion_model"].text() if "distortion_model" in field else "none"
+    lens = field.get("distortion_model", "none").text()
     if (model, lens) not in _MODELS:
         raise InputError(
             f"{name}: the distortion model {lens[:40]!r} is not known with the camera model {model}; "

@@ -36,18 +36,23 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
     if "neurocal" not in root:
         if not whole:
             raise FormatError("is a stereo rig; give the file of one camera", root.source)
-        rig = rig_from_field(root)
-        poses = {name: view.pose for name, view in rig.left.views.items()}
-        cameras = rig.left.camera, rig.right.camera
-        return CameraSet(cameras, (rig.pose,), poses, _unit(rig.unit), rig, "neurocal")
+        return camera_set(rig_from_field(root))
     if not whole:
         intrinsics, (model, k) = intrinsics_from_field(root)[0], distortion_from_field(root)
-        name = root["camera_name"].text() if "camera_name" in root else "camera"
+        name = root.get("camera_name", "camera").text()
         camera = Camera(intrinsics, Distortion(model, k), image_size(root), name)
         return CameraSet((camera,), program="neurocal")
-    calibration = calibration_from_field(root)
-    poses = {name: view.pose for name, view in calibration.views.items()}
-    return CameraSet((calibration.camera,), (), poses, _unit(calibration.unit), calibration, "neurocal")
+    return camera_set(calibration_from_field(root))
+
+
+def camera_set(result: Calibration | Rig) -> CameraSet:
+    """What other programs can have of a calibration or a rig, and the whole of it for our own files."""
+    left = result if isinstance(result, Calibration) else result.left
+    poses = {name: view.pose for name, view in left.views.items()}
+    unit = None if result.unit == _UNKNOWN else result.unit
+    if isinstance(result, Calibration):
+        return CameraSet((result.camera,), (), poses, unit, result, "neurocal")
+    return CameraSet((left.camera, result.right.camera), (result.pose,), poses, unit, result, "neurocal")
 
 
 def as_rig(cameras: CameraSet) -> Rig:
@@ -98,10 +103,6 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         return {"": format_rig(as_rig(cameras))}
     origin = cameras.origin
     return {"": format_calibration(origin if isinstance(origin, Calibration) else _calibration(cameras, 0))}
-
-
-def _unit(unit: str) -> str | None:
-    return None if unit == _UNKNOWN else unit
 
 
 FORMAT = Format("neurocal", tuple(MODELS), True, True, 2, False, False, _text)

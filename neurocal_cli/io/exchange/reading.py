@@ -13,7 +13,7 @@ from neurocal_cli.io.exchange import colmap, dictionary, kalibr, matlab, mrcal, 
 from neurocal_cli.io.exchange.camera_set import CameraSet
 from neurocal_cli.io.exchange.rotations import after, inverse
 from neurocal_cli.io.file_storage import parse_tree
-from neurocal_cli.io.files import decode, read_bytes
+from neurocal_cli.io.files import decode, read_bytes, value_failures
 from neurocal_cli.io.tree_fields import Field
 
 # By what a binary file begins with.
@@ -42,50 +42,43 @@ def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
         A file that cannot be read, that is of no known kind, or that holds what no camera of ours is.
     """
     names = [str(path) for path in paths]
-    if len(names) == 1:
-        return _read(names[0], whole)
     if len(names) > 2:
         raise InputError(f"there are {len(names)} files; give one, or the two of one rig")
-    trees = [_tree(name) for name in names]
-    if all(tree is not None and dictionary.is_part(tree) for tree in trees):
-        first, second = (tree for tree in trees if tree is not None)
+    opened = [_opened(name) for name in names]
+    trees = [one for one in opened if isinstance(one, Field)]
+    if len(trees) == 2 and "-" not in names and all(map(dictionary.is_part, trees)):
+        first, second = trees
         merged = Field({**first.value, **second.value}, f"{first.source}, {second.source}")
-        return _named(dictionary.from_tree, merged)
-    left, right = (_read(name) for name in names)
-    return _joined(left, right, names)
+        with value_failures(merged.source):
+            return dictionary.from_tree(merged)
+    cameras = [_cameras(one, whole or len(names) > 1) for one in opened]
+    return cameras[0] if len(cameras) == 1 else _joined(cameras[0], cameras[1], names)
 
 
-def _read(name: str, whole: bool = True) -> CameraSet:
+def _opened(name: str) -> CameraSet | Field:
+    """The cameras of a file, or the tree of a file that is one."""
     if colmap.is_folder(name):
         return colmap.read_folder(name)
     data, source = read_bytes(name)
-    for mark, read in _BINARY:
-        if data.startswith(mark):
-            return _named(lambda root, read=read: read(data, root.source), Field(None, source))  # type: ignore[misc]
     if data.startswith(b"\x89HDF"):
         raise FormatError("is a MATLAB file of version 7.3; save it with -v7", source)
-    return _parsed(decode(data, source, "a camera file"), source, whole)
+    with value_failures(source):
+        for mark, read in _BINARY:
+            if data.startswith(mark):
+                return read(data, source)
+        text = decode(data, source, "a camera file")
+        if _COLMAP(text):
+            return colmap.parse(text, source)
+        if mrcal.is_text(text):
+            return mrcal.parse(text, source)
+        return parse_tree(text, source)
 
 
-def _parsed(text: str, source: str, whole: bool) -> CameraSet:
-    if _COLMAP(text):
-        return _named(lambda root: colmap.parse(text, root.source), Field(None, source))
-    if mrcal.is_text(text):
-        return _named(lambda root: mrcal.parse(text, root.source), Field(None, source))
-    return _named(lambda root: _from_tree(root, whole), parse_tree(text, source))
-
-
-def _tree(name: str) -> Field | None:
-    """The tree of a file that is one, None for others."""
-    if name == "-" or colmap.is_folder(name):
-        return None
-    data, source = read_bytes(name)
-    if b"\0" in data[:200]:
-        return None
-    text = decode(data, source, "a camera file")
-    if _COLMAP(text) or mrcal.is_text(text):
-        return None
-    return parse_tree(text, source)
+def _cameras(opened: CameraSet | Field, whole: bool) -> CameraSet:
+    if isinstance(opened, CameraSet):
+        return opened
+    with value_failures(opened.source):
+        return _from_tree(opened, whole)
 
 
 def _from_tree(root: Field, whole: bool) -> CameraSet:
@@ -100,16 +93,6 @@ def _from_tree(root: Field, whole: bool) -> CameraSet:
     if ros.is_tree(root):
         return ros.from_tree(root)
     return dictionary.from_tree(root)
-
-
-def _named(read: Callable[[Field], CameraSet], root: Field) -> CameraSet:
-    """Put the file's name before what is wrong with it."""
-    try:
-        return read(root)
-    except FormatError:
-        raise
-    except InputError as error:
-        raise FormatError(str(error), root.source) from error
 
 
 def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSet:

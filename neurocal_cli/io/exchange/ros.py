@@ -10,11 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.camera.camera import Camera
 from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.errors import InputError
-from neurocal_cli.geometry import Array
-from neurocal_cli.io.camera_info import camera_info_lines
+from neurocal_cli.io.camera_info import format_camera_info
 from neurocal_cli.io.camera_tree import camera_from_tree, matrix_data
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 from neurocal_cli.io.exchange.neurocal import as_rig
@@ -60,23 +58,15 @@ def joined(left: CameraSet, right: CameraSet) -> CameraSet:
 
 def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
     if len(cameras.cameras) == 1:
-        return {"": _info(cameras.cameras[0], None)}
+        return {"": format_camera_info(cameras.cameras[0])}
     rectified = rectify(as_rig(replace(cameras, origin=None)))
     if rectified is None:
         raise InputError("ROS's files need images of one known size; give --image-size")
     pairs = (rectified.R1, rectified.P1), (rectified.R2, rectified.P2)
     return {
-        f"{side}.yaml": _info(camera, pair)
+        f"{side}.yaml": format_camera_info(camera, pair)
         for side, camera, pair in zip(("left", "right"), cameras.cameras, pairs, strict=True)
     }
-
-
-def _info(camera: Camera, rectified: tuple[Array, Array] | None) -> str:
-    lens = camera.distortion
-    lines = camera_info_lines(
-        camera.name, camera.image_size, camera.A, lens.model, lens.coefficients, rectified
-    )
-    return "\n".join([*lines, ""])
 
 
 FORMAT = Format("ROS", ("none", "plumb_bob", "rational", "fisheye"), False, False, 2, True, True, _text)
