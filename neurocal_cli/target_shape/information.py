@@ -122,6 +122,11 @@ class Information:
             cost=self.cost + float((bends * cost).sum()),
         )
 
+    def pose_by(self, offsets: Array) -> Array:
+        """(P, p) what offsets (n, 3) add to the poses' right side."""
+        P, p = self.pose.shape[:2]
+        return (self.pose_point.reshape(P * p, offsets.size) @ offsets.ravel()).reshape(P, p)
+
     def straight(self) -> Information:
         """Without bends."""
         return replace(
@@ -136,12 +141,17 @@ class Information:
     def turned(self, axes: Array) -> Information:
         """With each point's offset along its own axes, the columns of (n, 3, 3)."""
         transposed = np.swapaxes(axes, 1, 2)
+        alike = bool((axes == axes[:1]).all())  # one plane: a single product
         return replace(
             self,
             point=transposed @ self.point @ axes,
             point_camera=transposed @ self.point_camera,
             point_right=(transposed @ self.point_right[..., None])[..., 0],
-            pose_point=np.einsum("pqni,nij->pqnj", self.pose_point, axes),
+            pose_point=(
+                (self.pose_point.reshape(-1, 3) @ axes[0]).reshape(self.pose_point.shape)
+                if alike
+                else np.einsum("pqni,nij->pqnj", self.pose_point, axes)
+            ),
         )
 
     def around_given(self, offsets: Array) -> Information:
@@ -150,7 +160,7 @@ class Information:
         return replace(
             self,
             camera_right=self.camera_right + np.einsum("nif,ni->f", self.point_camera, offsets),
-            pose_right=self.pose_right + np.einsum("pqni,ni->pq", self.pose_point, offsets),
+            pose_right=self.pose_right + self.pose_by(offsets),
             point_right=self.point_right + by_point,
             cost=self.cost + float((offsets * (2 * self.point_right + by_point)).sum()),
         )
@@ -266,31 +276,46 @@ def point_terms(
     whole = width if shapes is None else width + N_SHAPES
     of_pose = pose_columns(whole, shapes is not None)
     p = len(of_pose)
-    used = np.concatenate([columns, of_pose, [whole - 1]])
+    kept = np.append(columns, whole - 1)
+    alike = _is_alike(label, V)
     by_batch = np.empty((len(batches.view), whole, whole))
-    summed, cross = np.zeros((n_points, 3, f + p + 4)), np.zeros((V * n_points, p, 3))
+    summed, cross = np.zeros((n_points, 3, f + 4)), np.zeros((V, p, n_points, 3))
     buffer = batches.memory(width)
     for chunk in batches.chunks():
-        view = batches.view[chunk]
+        view, seen = batches.view[chunk], label[chunk]
         part = buffer[: len(view)]
         derivatives(batches, chunk, state, part[:, :-1])
         by_point = by_world(part, state, scale, view)
         if shapes is not None:
-            part = with_bends(part, by_point, shapes[label[chunk]])
+            part = with_bends(part, by_point, shapes[seen])
         products(part, by_batch[chunk])
-        rows = np.concatenate([by_point, part[:, used]], axis=1)
-        real = label[chunk] >= 0
+        rows = np.concatenate([by_point, part[:, kept]], axis=1)
+        u, v = (part[:, of_pose][:, :, None, axis] * by_point[:, None, :, axis] for axis in (0, 1))
+        crossed = np.swapaxes(u + v, 2, 3)  # (T, p, n, 3)
+        if alike:
+            own = by_point.transpose(3, 1, 0, 2).reshape(seen.shape[1], 3, -1)
+            summed[seen[0]] += own @ rows.transpose(3, 0, 2, 1).reshape(seen.shape[1], -1, f + 4)
+            cross[view[0] : view[-1] + 1, :, seen[0]] = crossed
+            continue
+        real = seen >= 0
         every = np.moveaxis(by_point, 3, 1) @ np.moveaxis(rows, 3, 1).swapaxes(2, 3)
-        point, flat = every[real], label[chunk][real]  # (.., 3, f + p + 4), (..,)
-        summed += _summed_by(flat, point.reshape(len(flat), -1), n_points).reshape(summed.shape)
-        place = np.broadcast_to(view[:, None] * n_points, real.shape)[real] + flat
-        np.add.at(cross, place, np.swapaxes(point[:, :, 3 + f : -1], 1, 2))
+        flat = seen[real]
+        summed += _summed_by(flat, every[real].reshape(len(flat), -1), n_points).reshape(summed.shape)
+        places = np.broadcast_to(view[:, None], real.shape)[real], flat
+        np.add.at(np.swapaxes(cross, 1, 2), places, np.swapaxes(crossed, 1, 2)[real])
     return PointTerms(
-        batches.sum_by_view(by_batch),
-        summed[:, :, :3],
-        summed[:, :, 3 : 3 + f],
-        summed[:, :, -1],
-        np.swapaxes(cross.reshape(V, n_points, p, 3), 1, 2),
+        batches.sum_by_view(by_batch), summed[:, :, :3], summed[:, :, 3:-1], summed[:, :, -1], cross
+    )
+
+
+def _is_alike(label: NDArray[np.intp], n_views: int) -> bool:
+    """Whether every view is one batch that shows the same points in the same order, each once."""
+    first = label[0]
+    return (
+        len(label) == n_views
+        and bool((label == first).all())
+        and first[0] >= 0
+        and len(np.unique(first)) == len(first)
     )
 
 

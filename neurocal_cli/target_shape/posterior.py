@@ -102,15 +102,14 @@ def evidence_of_given(info: Information) -> float:
 def camera_step_of(info: Information) -> Array:
     """(f,) steps of the cameras, the points being where they are given."""
     S, g, *_ = _poses_eliminated(info)
+    return camera_step(S, g)
+
+
+def camera_step(S: Array, g: Array) -> Array:
+    """Steps of the cameras for their matrix (f, f) and right sides (f,) or (f, k)."""
     scaled, scale = unit_diagonal(S)
-    return np.asarray(scale * (np.linalg.pinv(scaled, hermitian=True) @ (scale * g)))
-
-
-def cost_at(info: Information, offsets: Array) -> float:
-    """Squared error with these offsets (n, 3), at the best cameras and poses for them."""
-    info = info.around_given(-offsets)
-    _, g, cost, _ = _poses_eliminated(info)
-    return cost - float(g @ camera_step_of(info))
+    inverse = np.linalg.pinv(scaled, hermitian=True) * scale[:, None] * scale
+    return np.asarray(inverse @ g)
 
 
 def _poses_eliminated(info: Information) -> tuple[Array, Array, float, float]:
@@ -200,6 +199,19 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
     return replace(found, variance=variance, std=found.std * np.sqrt(variance / found.variance))
 
 
+def offsets_of(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Array:
+    """(n, 3) the offsets alone, as of `known_sizes`.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Points that do not determine the cameras.
+    """
+    parts = _Parts(info, prior, flat=False)
+    noise = np.sqrt(variance)
+    return parts.offsets({name: size / noise for name, size in sizes.items()})
+
+
 def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[float, float]]:
     """Minimum and determinant for surveyed points by the ratio of their factor to the noise's std.
 
@@ -255,14 +267,23 @@ class _Parts:
         return dict(sizes) | {name: self.least for name in _OUT_OF_PLANE if self.flat and name in sizes}
 
     def at(self, ratios: dict[str, float]) -> _Solution:
-        smooth = np.empty(self.system.m)
-        for name, places in self.prior.groups.items():
-            smooth[places] = (self.prior.size / ratios[name]) ** 2
-        single = self.of_points(ratios)
+        smooth, single = self.of_smooth(ratios), self.of_points(ratios)
         solved = self.system.solve(smooth, single)
         logprior = float(np.log(smooth).sum()) + float(np.log(single).sum()) + self.log_precision
         evidence = _log_evidence(self.spare, solved.cost, solved.logdet - logprior)
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
+
+    def offsets(self, ratios: dict[str, float]) -> Array:
+        """(n, 3) for these sizes."""
+        smooth, single = self.system.offsets(self.of_smooth(ratios), self.of_points(ratios))
+        return np.asarray(self.prior.basis @ smooth + single)
+
+    def of_smooth(self, ratios: Mapping[str, float]) -> Array:
+        """(m,) precisions of the coefficients, in units of the noise's."""
+        smooth = np.empty(self.system.m)
+        for name, places in self.prior.groups.items():
+            smooth[places] = (self.prior.size / ratios[name]) ** 2
+        return smooth
 
     def of_points(self, ratios: Mapping[str, float]) -> Array:
         """(n, 3) precisions of the points by themselves, in units of the noise's."""

@@ -16,6 +16,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
+from neurocal_cli.target_shape.without_poses import WithoutPoses
 
 _SMALL = 48  # rows of a triangular matrix from which on its halves are inverted by themselves
 _RIDGE = 1e-10  # added to a unit diagonal where rounding has made a matrix indefinite
@@ -35,46 +36,43 @@ class System:
         self.info, self.prior = info, prior
         self.n, (self.P, self.p) = len(info.point), info.pose.shape[:2]
         self.f, self.m = len(info.camera), prior.basis.shape[2]
-        basis = prior.basis
-        by_basis = info.point @ basis  # (n, 3, m)
-        across = np.einsum("nif,nim->fm", info.point_camera, basis)
-        inner = np.einsum("nim,nik->mk", basis, by_basis)
-        self.shared = np.block([[info.camera, across], [across.T, inner]])
-        self.right = np.concatenate([info.camera_right, np.einsum("nim,ni->m", basis, info.point_right)])
-        self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
-        pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ basis.reshape(3 * self.n, self.m)
-        self.pose_shared = np.concatenate(
-            [info.pose_camera, pose_basis.reshape(self.P, self.p, self.m)], axis=2
-        )
         self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
         self.points_first = 3 * self.n >= self.p * self.P
-        if not self.points_first:
-            self._eliminate_poses()
+        (self._prepare if self.points_first else self._eliminate_poses)()
 
     @property
     def s(self) -> int:
         """Number of the cameras' parameters and the smooth coefficients."""
         return self.f + self.m
 
+    def _prepare(self) -> None:
+        """What points are eliminated from."""
+        info, basis = self.info, self.prior.basis
+        by_basis = info.point @ basis  # (n, 3, m)
+        across = np.einsum("nif,nim->fm", info.point_camera, basis)
+        flat = basis.reshape(3 * self.n, self.m)
+        inner = flat.T @ by_basis.reshape(3 * self.n, self.m)
+        self.shared = np.block([[info.camera, across], [across.T, inner]])
+        self.right = np.concatenate([info.camera_right, info.point_right.ravel() @ flat])
+        self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
+        pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ flat
+        self.pose_shared = np.concatenate(
+            [info.pose_camera, pose_basis.reshape(self.P, self.p, self.m)], axis=2
+        )
+
     def _eliminate_poses(self) -> None:
-        info, s = self.info, self.s
-        root = np.linalg.inv(np.linalg.cholesky(info.pose))
-        columns = [self.pose_shared, info.pose_point.reshape(self.P, self.p, -1), info.pose_right[..., None]]
-        rows = root @ np.concatenate(columns, axis=2)
-        flat = rows.reshape(self.p * self.P, -1)
-        dim = s + 3 * self.n
-        M = np.zeros((dim + 1, dim + 1))
-        M[:s, :s] = self.shared
-        M[:s, s:dim] = self.point_shared.reshape(3 * self.n, s).T
-        M[s:dim, :s] = M[:s, s:dim].T
-        for i in range(3):
-            for j in range(3):
-                at = s + 3 * np.arange(self.n)
-                M[at + i, at + j] = info.point[:, i, j]
-        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.point_right.reshape(-1), info.cost
-        M[-1, :dim] = M[:dim, -1]
-        self.dense = M - flat.T @ flat
-        self.logdet_poses = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        """The bordered matrix of cameras, smooth parts and points, from that without the parts."""
+        without = WithoutPoses(self.info)
+        M, f, s, m = without.matrix(), self.f, self.s, self.m
+        basis = self.prior.basis.reshape(3 * self.n, m)
+        by_basis = M[:, f:-1] @ basis
+        dense = np.empty((len(M) + m,) * 2)
+        old = np.r_[:f, s : len(dense)]
+        dense[np.ix_(old, old)] = M
+        dense[old, f:s] = by_basis
+        dense[f:s, old] = by_basis.T
+        dense[f:s, f:s] = basis.T @ by_basis[f:-1]
+        self.dense, self.logdet_poses = dense, without.logdet
 
     def solve(self, smooth: Array, single: Array) -> Solved:
         """At given precisions (m,) of the smooth parts and (n, 3) of each point by itself."""
@@ -97,6 +95,17 @@ class System:
         return float(M[-1, -1] - part @ part), logdet + 2 * float(
             np.log(np.diagonal(factor)).sum() - np.log(scale).sum()
         )
+
+    def offsets(self, smooth: Array, single: Array) -> tuple[Array, Array]:
+        """Coefficients (m,) of the smooth parts and (n, 3) of each point by itself."""
+        if not self.points_first:
+            M = self._without_poses(smooth, single)
+            x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
+            return x[self.f : self.s], x[self.s :].reshape(self.n, 3)
+        M, root, rows = self._without_points(smooth, single)
+        x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
+        own = rows[:, :, -1] - rows[:, :, :-1] @ x
+        return x[self.f : self.s], (np.swapaxes(root, 1, 2) @ own[..., None])[..., 0]
 
     def _without_poses(self, smooth: Array, single: Array) -> Array:
         """The bordered matrix of cameras, smooth parts and points."""
@@ -139,7 +148,7 @@ class System:
             return None
         own = np.linalg.inv(self.info.pose)
         by_point = self.info.pose_point.reshape(self.P, self.p, -1)
-        gain = own @ np.concatenate([self.pose_shared, by_point], axis=2)
+        gain = own @ np.concatenate([self.info.pose_camera, by_point], axis=2)
         return np.asarray(own + gain @ inverse @ np.swapaxes(gain, 1, 2))
 
     def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
