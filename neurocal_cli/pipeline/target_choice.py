@@ -40,6 +40,7 @@ _TOLD_APART = 5.0  # standard deviations, as for the verdict
 # Of the variance by which views contradict each other, bends explain nine tenths, or leave but a little. With
 # eight tenths, a half of photographs of paper boards predicts the other half 3 % worse.
 _SHARE, _NOISE = 0.9, 1.1
+_SETTLED = 0.01  # standard deviations by which a camera may move and still is the same
 
 
 def with_target(
@@ -110,7 +111,10 @@ def _searched(
             break
         lens = new.distortion.model
         known = found.target
-        found = _found(again[0], choice, known) if _can_tell(again[0], choice, known) else None
+        if not _can_tell(again[0], choice, known):
+            break
+        if not _is_where_it_was(found, again[0]):
+            found = _found(again[0], choice, known)
         if found is None:
             break
         (new, adjusted), *_ = found.fits
@@ -221,6 +225,20 @@ def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
         return False
     # Errors that copies of a view share look like the target's.
     return choice != "auto" or not repeated.worth < _WORTH
+
+
+def _is_where_it_was(found: Found, again: Solution) -> bool:
+    """Whether the camera that was fitted to a target again is the one that the target was found with."""
+    (problem, adjusted), new = found.fits[0], again.problem
+    if problem.views.names != new.views.names or problem.distortion.model != new.distortion.model:
+        return False
+    same = np.array_equal(problem.points.pixels, new.points.pixels)
+    cost, gained = adjusted.cost.sum(), abs(adjusted.cost.sum() - again.adjusted.cost.sum())
+    return (
+        same
+        and np.array_equal(problem.free_camera, new.free_camera)
+        and bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
+    )
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:

@@ -287,7 +287,7 @@ def point_terms(
         derivatives(batches, chunk, state, part[:, :-1])
         by_point = by_world(part, state, scale, view)
         if shapes is not None:
-            part = with_bends(part, by_point, shapes[seen])
+            part = with_bends(part, by_point, shapes[seen[:1] if alike else seen])
         products(part, by_batch[chunk])
         rows = np.concatenate([by_point, part[:, kept]], axis=1)
         u, v = (part[:, of_pose][:, :, None, axis] * by_point[:, None, :, axis] for axis in (0, 1))
@@ -334,10 +334,11 @@ def with_bends(part: Array, by_point: Array, shapes: Array) -> Array:
         A part of `PointBatches.memory`.
     by_point : (T, 3, 2, n) array
         From `by_world`.
-    shapes : (T, n, 3, 3) array
+    shapes : (T, n, 3, 3) or (1, n, 3, 3) array
         Offsets of the points for a coefficient of 1.
     """
-    by_bend = np.einsum("tipn,tnik->tkpn", by_point, shapes)
+    along = np.ascontiguousarray(np.moveaxis(shapes, 1, 3))  # (T, 3, 3, n)
+    by_bend = sum(by_point[:, None, i] * along[:, i, :, None] for i in range(3))
     return np.concatenate([part[:, :-2], by_bend, part[:, -2:]], axis=1)
 
 

@@ -96,7 +96,7 @@ def evidence_of_given(info: Information) -> float:
     S, g, cost, logdet = _poses_eliminated(info)
     cost -= float(g @ np.linalg.solve(S, g)) if len(g) else 0.0
     logdet += float(np.linalg.slogdet(S)[1]) if len(g) else 0.0
-    return _log_evidence(info.spare, cost, logdet - info.log_precision)
+    return log_evidence(info.spare, cost, logdet - info.log_precision)
 
 
 def camera_step_of(info: Information) -> Array:
@@ -125,14 +125,18 @@ def _poses_eliminated(info: Information) -> tuple[Array, Array, float, float]:
     return S, g, info.cost - float(flat[:, -1] @ flat[:, -1]), logdet
 
 
-def _log_evidence(spare: float, cost: float, logdet: float) -> float:
+def log_evidence(spare: float, cost: float, logdet: float) -> float:
     """Of a quadratic with this minimum and determinant; a priori the noise has a variance as 1 / sigma^2."""
     least = max(cost, _NO_COST)
     return math.lgamma(0.5 * spare) - 0.5 * spare * math.log(math.pi * least) - 0.5 * logdet
 
 
 def posterior(
-    info: Information, prior: Prior, sizes: Mapping[str, float] | None = None, flat: bool = False
+    info: Information,
+    prior: Prior,
+    sizes: Mapping[str, float] | None = None,
+    flat: bool = False,
+    variance: float | None = None,
 ) -> Posterior:
     """Find the sizes of the parts, and the offsets.
 
@@ -145,6 +149,8 @@ def posterior(
         To begin with.
     flat : bool
         Whether nothing leaves the plane.
+    variance : float, optional [px^2]
+        Of the noise, to begin with: beside sizes, errors for the given target are no noise.
 
     Raises
     ------
@@ -152,7 +158,7 @@ def posterior(
         Points that do not determine the cameras.
     """
     parts = _Parts(info, prior, flat)
-    noise = np.sqrt(info.cost / parts.spare)
+    noise = np.sqrt(info.cost / parts.spare if variance is None else variance)
     start = parts.start() if sizes is None else parts.allowed(sizes)
     now = parts.climbed(parts.at({name: size / noise for name, size in start.items()}))
     if "stretch" in now.ratios:
@@ -177,7 +183,7 @@ def given_posterior(info: Information, prior: Prior) -> Posterior:
         std=np.zeros((n, 3)),
         sizes=dict.fromkeys((*prior.groups, *_SINGLE), _NOTHING * prior.size),
         determined=0.0,
-        evidence=_log_evidence(info.spare, cost, logdet),
+        evidence=log_evidence(info.spare, cost, logdet),
     )
 
 
@@ -270,7 +276,7 @@ class _Parts:
         smooth, single = self.of_smooth(ratios), self.of_points(ratios)
         solved = self.system.solve(smooth, single)
         logprior = float(np.log(smooth).sum()) + float(np.log(single).sum()) + self.log_precision
-        evidence = _log_evidence(self.spare, solved.cost, solved.logdet - logprior)
+        evidence = log_evidence(self.spare, solved.cost, solved.logdet - logprior)
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
 
     def offsets(self, ratios: dict[str, float]) -> Array:

@@ -52,13 +52,31 @@ class System:
         across = np.einsum("nif,nim->fm", info.point_camera, basis)
         flat = basis.reshape(3 * self.n, self.m)
         inner = flat.T @ by_basis.reshape(3 * self.n, self.m)
-        self.shared = np.block([[info.camera, across], [across.T, inner]])
-        self.right = np.concatenate([info.camera_right, info.point_right.ravel() @ flat])
-        self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
+        shared = np.block([[info.camera, across], [across.T, inner]])
+        right = np.concatenate([info.camera_right, info.point_right.ravel() @ flat])
         pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ flat
-        self.pose_shared = np.concatenate(
-            [info.pose_camera, pose_basis.reshape(self.P, self.p, self.m)], axis=2
-        )
+        pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, self.p, self.m)], axis=2)
+        self.bordered = self._with_points(shared, right, pose_shared)
+        # (n, 3, s + P p + 1): what each point meets
+        poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
+        by_shared = [info.point_camera, by_basis]
+        self.by_point = np.concatenate([*by_shared, poses, info.point_right[..., None]], axis=2)
+
+    def _with_points(self, shared: Array, right: Array, pose_shared: Array) -> Array:
+        """The bordered matrix of cameras, smooth parts and poses, before points are eliminated."""
+        info, s, P, p = self.info, self.s, self.P, self.p
+        dim = s + p * P
+        M = np.zeros((dim + 1, dim + 1))
+        M[:s, :s] = shared
+        M[:s, s:dim] = pose_shared.reshape(p * P, s).T
+        M[s:dim, :s] = M[:s, s:dim].T
+        at = s + p * np.arange(P)
+        for i in range(p):
+            for j in range(p):
+                M[at + i, at + j] = info.pose[:, i, j]
+        M[:s, -1], M[s:dim, -1], M[-1, -1] = right, info.pose_right.reshape(-1), info.cost
+        M[-1, :dim] = M[:dim, -1]
+        return M
 
     def _eliminate_poses(self) -> None:
         """The bordered matrix of cameras, smooth parts and points, from that without the parts."""
@@ -153,25 +171,13 @@ class System:
 
     def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
         """The bordered matrix of cameras, smooth parts and poses; roots and rows of the points."""
-        info, s, f, n, P, p = self.info, self.s, self.f, self.n, self.P, self.p
-        root = np.linalg.inv(np.linalg.cholesky(info.point + single[:, :, None] * np.eye(3)))  # (n, 3, 3)
-        poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, p * P, 3).swapaxes(1, 2)
-        rows = root @ np.concatenate([self.point_shared, poses, info.point_right[..., None]], axis=2)
-        flat = rows.reshape(3 * n, -1)
-        dim = s + p * P
-        M = np.zeros((dim + 1, dim + 1))
-        M[:s, :s] = self.shared
-        at = np.arange(f, s)
+        own = self.info.point + single[:, :, None] * np.eye(3)
+        root = np.linalg.inv(np.linalg.cholesky(own))  # (n, 3, 3)
+        rows = root @ self.by_point
+        flat = rows.reshape(3 * self.n, -1)
+        M = self.bordered - flat.T @ flat
+        at = np.arange(self.f, self.s)
         M[at, at] += smooth
-        M[:s, s:dim] = self.pose_shared.reshape(p * P, s).T
-        M[s:dim, :s] = M[:s, s:dim].T
-        at = s + p * np.arange(P)
-        for i in range(p):
-            for j in range(p):
-                M[at + i, at + j] = info.pose[:, i, j]
-        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.pose_right.reshape(-1), info.cost
-        M[-1, :dim] = M[:dim, -1]
-        M -= flat.T @ flat
         return M, root, rows
 
     def _points_first(self, smooth: Array, single: Array) -> Solved:
