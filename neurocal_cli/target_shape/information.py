@@ -277,7 +277,8 @@ def point_terms(
     of_pose = pose_columns(whole, shapes is not None)
     p = len(of_pose)
     kept = np.append(columns, whole - 1)
-    alike = _is_alike(label, V)
+    once = len(label) == V and _is_once(label)  # each view is one batch, in which no point is twice
+    alike = once and label[0, 0] >= 0 and bool((label == label[0]).all())
     by_batch = np.empty((len(batches.view), whole, whole))
     summed, cross = np.zeros((n_points, 3, f + 4)), np.zeros((V, p, n_points, 3))
     buffer = batches.memory(width)
@@ -290,33 +291,71 @@ def point_terms(
             part = with_bends(part, by_point, shapes[seen[:1] if alike else seen])
         products(part, by_batch[chunk])
         rows = np.concatenate([by_point, part[:, kept]], axis=1)
-        u, v = (part[:, of_pose][:, :, None, axis] * by_point[:, None, :, axis] for axis in (0, 1))
-        crossed = np.swapaxes(u + v, 2, 3)  # (T, p, n, 3)
+        crossed = np.swapaxes(_of_each(part[:, of_pose], by_point), 2, 3)  # (T, p, n, 3)
         if alike:
             own = by_point.transpose(3, 1, 0, 2).reshape(seen.shape[1], 3, -1)
             summed[seen[0]] += own @ rows.transpose(3, 0, 2, 1).reshape(seen.shape[1], -1, f + 4)
             cross[view[0] : view[-1] + 1, :, seen[0]] = crossed
             continue
         real = seen >= 0
-        every = np.moveaxis(by_point, 3, 1) @ np.moveaxis(rows, 3, 1).swapaxes(2, 3)
-        flat = seen[real]
-        summed += _summed_by(flat, every[real].reshape(len(flat), -1), n_points).reshape(summed.shape)
+        every, flat = np.moveaxis(_of_each(by_point, rows), 3, 1)[real], seen[real]
+        summed += _summed_by(flat, every.reshape(len(flat), -1), n_points).reshape(summed.shape)
         places = np.broadcast_to(view[:, None], real.shape)[real], flat
-        np.add.at(np.swapaxes(cross, 1, 2), places, np.swapaxes(crossed, 1, 2)[real])
+        each = np.swapaxes(crossed, 1, 2)[real]
+        if once:
+            np.swapaxes(cross, 1, 2)[places] = each
+        else:
+            np.add.at(np.swapaxes(cross, 1, 2), places, each)
     return PointTerms(
         batches.sum_by_view(by_batch), summed[:, :, :3], summed[:, :, 3:-1], summed[:, :, -1], cross
     )
 
 
-def _is_alike(label: NDArray[np.intp], n_views: int) -> bool:
-    """Whether every view is one batch that shows the same points in the same order, each once."""
-    first = label[0]
-    return (
-        len(label) == n_views
-        and bool((label == first).all())
-        and first[0] >= 0
-        and len(np.unique(first)) == len(first)
-    )
+def _is_once(label: NDArray[np.intp]) -> bool:
+    """Whether no batch has a point twice."""
+    ordered = np.sort(label, axis=1)
+    return not ((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any()
+
+
+def _of_each(a: Array, b: Array) -> Array:
+    """(T, i, j, n) products of rows (T, i, 2, n) and (T, j, 2, n) of each point, summed over u and v."""
+    product = a[:, :, None, 0] * b[:, None, :, 0]
+    product += a[:, :, None, 1] * b[:, None, :, 1]
+    return np.asarray(product)
+
+
+def without_points(sight: Sight) -> Array:
+    """(V, w, w) products of what one camera saw, by views [px]; columns as of `PointTerms.normal`."""
+    views, state, batches = sight.views, sight.state, sight.views.batches
+    width = 12 + len(state.k)
+    whole = width if sight.shapes is None else width + N_SHAPES
+    label = labelled(views, sight.label)
+    by_batch = np.empty((len(batches.view), whole, whole))
+    buffer = batches.memory(width)
+    for chunk in batches.chunks():
+        view = batches.view[chunk]
+        part = buffer[: len(view)]
+        derivatives(batches, chunk, state, part[:, :-1])
+        if sight.shapes is not None:
+            part = with_bends(part, by_world(part, state, views.scale, view), sight.shapes[label[chunk]])
+        products(part, by_batch[chunk])
+    return views.pixel_scale**2 * batches.sum_by_view(by_batch)
+
+
+def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Information:
+    """Of some views (V,) of one camera, from `without_points`; no point of the target is off."""
+    N = normal[which]
+    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
+    of_pose, P = pose_columns(N.shape[1], sight.shapes is not None), len(N)
+    p, f = len(of_pose), len(columns)
+    camera = N.sum(axis=0)
+    found = Information(
+        camera[columns[:, None], columns], camera[columns, -1],
+        N[:, of_pose[:, None], of_pose], N[:, of_pose[:, None], columns], N[:, of_pose, -1],
+        np.zeros((0, 3, 3)), np.zeros((0, 3, f)), np.zeros((0, 3)), np.zeros((P, p, 0, 3)),
+        float(camera[-1, -1]), float(sight.views.equations[which].sum()),
+    )  # fmt: skip
+    return found if sight.bends is None else found.around_straight(sight.bends[which])
 
 
 def pose_columns(width: int, bends: bool) -> NDArray[np.intp]:
