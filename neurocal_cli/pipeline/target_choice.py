@@ -40,6 +40,7 @@ _TOLD_APART = 5.0  # standard deviations, as for the verdict
 # Of the variance by which views contradict each other, bends explain nine tenths, or leave but a little. With
 # eight tenths, a half of photographs of paper boards predicts the other half 3 % worse.
 _SHARE, _NOISE = 0.9, 1.1
+_OWN_STEPS = 40  # as for `view_groups`
 _SETTLED = 0.01  # standard deviations by which a camera may move and still is the same
 
 
@@ -71,16 +72,20 @@ def with_target(
     target, views = known[0].target, known[1].views
     unexplained = target is None or target.bends is not None
     if unexplained and views and all(map(may_be_bent, views.values())):
-        return _taking_views_back(problem, known, options, choice)
+        return _taking_views_back(problem, solution.of_all, known, options, choice)
     return known
 
 
 def _taking_views_back(
-    problem: Problem, known: tuple[Solution, Rejected], options: Options, choice: str
+    problem: Problem,
+    of_all: Solution | None,
+    known: tuple[Solution, Rejected],
+    options: Options,
+    choice: str,
 ) -> tuple[Solution, Rejected]:
     """With a target that explains all views, where some contradict only the given one."""
     try:
-        found = _searched(problem, fit(problem, options), known[1], options, choice)
+        found = _searched(problem, of_all or fit(problem, options), known[1], options, choice)
     except DegenerateGeometryError:
         return known
     explained = found[0].target is not None and not found[1].views
@@ -196,6 +201,10 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
     if bent > _NOISE * least and given - bent < _SHARE * (given - least):
         return common
+    # What a camera for each view leaves, two cameras do not go below.
+    least_of_groups = float(free_networks(before[0].views, before[1].state, _OWN_STEPS).sum())
+    if float(after[1].cost.sum()) < least_of_groups:
+        return found
     groups = _groups(*before)
     explained = 1.0 - float(after[1].cost.sum() / before[1].cost.sum())
     return found if groups is None or groups.explained < explained else common
