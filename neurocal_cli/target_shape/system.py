@@ -138,12 +138,14 @@ class System:
         s, f = self.s, self.f
         dim = s + 3 * self.n
         M = self._without_poses(smooth, single)
-        inverse, logdet = _inverse(M[:dim, :dim])
-        x = inverse @ M[:dim, -1]
-        cost = float(M[-1, -1] - M[:dim, -1] @ x)
-        var_single = np.diagonal(inverse)[s:].reshape(self.n, 3)
+        root, logdet = _root_of_inverse(M[:dim, :dim])
+        half = root @ M[:dim, -1]
+        x, variance = half @ root, np.einsum("ij,ij->j", root, root)
+        cost = float(M[-1, -1] - half @ half)
+        var_single = variance[s:].reshape(self.n, 3)
 
         def rest() -> Rest:
+            inverse = root.T @ root
             cross = inverse[f:s, s:].reshape(self.m, self.n, 3)
             along_gauge = (inverse[s:, s:] @ self.gauge).reshape(self.n, 3, -1)
             return Rest(
@@ -154,7 +156,7 @@ class System:
 
         return Solved(
             x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
-            np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], rest,
+            variance[f:s], var_single, root[:, :f].T @ root[:, :f], rest,
         )  # fmt: skip
 
     def _poses(self, inverse: Array) -> Array | None:
@@ -183,24 +185,26 @@ class System:
     def _points_first(self, smooth: Array, single: Array) -> Solved:
         s, f, n, P, p = self.s, self.f, self.n, self.P, self.p
         dim = s + p * P
-        M, root, rows = self._without_points(smooth, single)
-        inverse, logdet = _inverse(M[:dim, :dim])
-        x = inverse @ M[:dim, -1]
-        cost = float(M[-1, -1] - M[:dim, -1] @ x)
+        M, own_root, rows = self._without_points(smooth, single)
+        root, logdet = _root_of_inverse(M[:dim, :dim])
+        half = root @ M[:dim, -1]
+        x, variance = half @ root, np.einsum("ij,ij->j", root, root)
+        cost = float(M[-1, -1] - half @ half)
         # The points' own: how they follow all the others.
-        back = np.swapaxes(root, 1, 2)
+        back = np.swapaxes(own_root, 1, 2)
         e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
-        follow = back @ rows[:, :, :-1]  # (n, 3, dim)
-        spread = follow.reshape(3 * n, dim) @ inverse  # (3 n, dim)
-        var_single = np.diagonal(back @ root, axis1=1, axis2=2) + (
-            (spread * follow.reshape(3 * n, dim)).sum(axis=1).reshape(n, 3)
+        follow = (back @ rows[:, :, :-1]).reshape(3 * n, dim)
+        by_root = follow @ root.T
+        var_single = np.diagonal(back @ own_root, axis1=1, axis2=2) + (
+            np.einsum("ij,ij->i", by_root, by_root).reshape(n, 3)
         )
-        logdet -= 2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        logdet -= 2 * float(np.log(np.diagonal(own_root, axis1=1, axis2=2)).sum())
 
         def rest() -> Rest:
+            inverse, spread = root.T @ root, by_root @ root
             cross = -spread.T.reshape(dim, n, 3)
-            own = ((back @ root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
-            along_gauge = own + spread @ (follow.reshape(3 * n, dim).T @ self.gauge)
+            own = ((back @ own_root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
+            along_gauge = own + spread @ (follow.T @ self.gauge)
             return Rest(
                 self._with_offsets(inverse[:f, f:s], cross[:f]),
                 self._variance(inverse[f:s, f:s], cross[f:s], var_single, along_gauge.reshape(n, 3, -1)),
@@ -208,7 +212,7 @@ class System:
             )
 
         return Solved(
-            x[:f], x[f:s], e, cost, logdet, np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], rest
+            x[:f], x[f:s], e, cost, logdet, variance[f:s], var_single, root[:, :f].T @ root[:, :f], rest
         )
 
     def _with_offsets(self, smooth: Array, single: Array) -> Array:
@@ -281,15 +285,18 @@ class Solved:
     rest: Callable[[], Rest]
 
 
-def _inverse(M: Array) -> tuple[Array, float]:
+def _root_of_inverse(M: Array) -> tuple[Array, float]:
+    """A factor whose product R^T R is the inverse, and the logarithm of the determinant."""
     scale = 1.0 / np.sqrt(np.diagonal(M))
-    scaled = M * scale[:, None] * scale
+    scaled = M * scale[:, None]
+    scaled *= scale
     try:
         root = _inverse_of_triangular(np.linalg.cholesky(scaled))
     except np.linalg.LinAlgError:  # coefficients that only tell together, as xi and alpha do
         root = _inverse_of_triangular(np.linalg.cholesky(scaled + _RIDGE * np.eye(len(M))))
     logdet = -2 * float(np.log(np.diagonal(root)).sum() + np.log(scale).sum())
-    return (root.T @ root) * scale[:, None] * scale, logdet
+    root *= scale
+    return root, logdet
 
 
 def _inverse_of_triangular(L: NDArray[np.floating]) -> Array:
