@@ -198,7 +198,9 @@ class Search:
                 return None
             noise = found.variance
             std = np.sqrt(noise * np.diagonal(found.camera))
-            settled = bool((np.abs(found.camera_step) < _SETTLED * std).all())
+            # Without sizes to begin with, the first ones are rough.
+            known = self.still or self.sizes is not None
+            settled = known and bool((np.abs(found.camera_step) < _SETTLED * std).all())
             if not self._move(found, info):
                 return None
             if settled:
