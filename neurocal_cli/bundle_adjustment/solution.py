@@ -98,6 +98,8 @@ class Solution:
         Whether the target was chosen as given, where it could have been found.
     ambiguity : Ambiguity, optional
         Other cameras that explain the points as well.
+    of_all : Solution, optional
+        The fit of all points, where some of them were set aside afterwards.
     """
 
     problem: Problem
@@ -113,6 +115,7 @@ class Solution:
     target: Target | None = None
     target_kept: bool = False
     ambiguity: Ambiguity | None = None
+    of_all: Solution | None = None
 
     @property
     def state(self) -> CameraState:

@@ -239,13 +239,14 @@ class _Search:
     def judge(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Enter what is near into `kept`; the views that agree on nothing."""
         hopeless = np.zeros(len(self.members), dtype=bool)
+        everything = self.views.targets
         for k, view in enumerate(self.members):
             rows = slice(self.views.first[view], self.views.first[view] + self.views.counts[view])
             local = self.views.local[rows]
             if self.flat:
                 local = (local @ self.views.basis[view])[:, :2]
             o = np.column_stack([local, np.ones(len(local))]) @ self.product[k].T
-            targets = self.views.targets[rows]
+            targets = everything[rows]
             near = self._distance(o, targets) < _FAR * self.scale[k]
             extent = np.sqrt(targets[near].var(axis=0).sum()) if near.any() else 0.0
             hopeless[k] = near.mean() <= _MAJORITY or self.scale[k] > _TIGHT * extent

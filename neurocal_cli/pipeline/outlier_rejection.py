@@ -78,7 +78,7 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
     search.agree(first, failure)
     search.without_outlier_views()
     search.judge_all_points()
-    return search.solution, search.rejected()
+    return replace(search.solution, of_all=first), search.rejected()
 
 
 def judged_again(

@@ -40,6 +40,8 @@ _TOLD_APART = 5.0  # standard deviations, as for the verdict
 # Of the variance by which views contradict each other, bends explain nine tenths, or leave but a little. With
 # eight tenths, a half of photographs of paper boards predicts the other half 3 % worse.
 _SHARE, _NOISE = 0.9, 1.1
+_OWN_STEPS = 40  # as for `view_groups`
+_SETTLED = 0.01  # standard deviations by which a camera may move and still is the same
 
 
 def with_target(
@@ -70,16 +72,20 @@ def with_target(
     target, views = known[0].target, known[1].views
     unexplained = target is None or target.bends is not None
     if unexplained and views and all(map(may_be_bent, views.values())):
-        return _taking_views_back(problem, known, options, choice)
+        return _taking_views_back(problem, solution.of_all, known, options, choice)
     return known
 
 
 def _taking_views_back(
-    problem: Problem, known: tuple[Solution, Rejected], options: Options, choice: str
+    problem: Problem,
+    of_all: Solution | None,
+    known: tuple[Solution, Rejected],
+    options: Options,
+    choice: str,
 ) -> tuple[Solution, Rejected]:
     """With a target that explains all views, where some contradict only the given one."""
     try:
-        found = _searched(problem, fit(problem, options), known[1], options, choice)
+        found = _searched(problem, of_all or fit(problem, options), known[1], options, choice)
     except DegenerateGeometryError:
         return known
     explained = found[0].target is not None and not found[1].views
@@ -110,7 +116,10 @@ def _searched(
             break
         lens = new.distortion.model
         known = found.target
-        found = _found(again[0], choice, known) if _can_tell(again[0], choice, known) else None
+        if not _can_tell(again[0], choice, known):
+            break
+        if not _is_where_it_was(found, again[0]):
+            found = _found(again[0], choice, known)
         if found is None:
             break
         (new, adjusted), *_ = found.fits
@@ -192,6 +201,10 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
     if bent > _NOISE * least and given - bent < _SHARE * (given - least):
         return common
+    # What a camera for each view leaves, two cameras do not go below.
+    least_of_groups = float(free_networks(before[0].views, before[1].state, _OWN_STEPS).sum())
+    if float(after[1].cost.sum()) < least_of_groups:
+        return found
     groups = _groups(*before)
     explained = 1.0 - float(after[1].cost.sum() / before[1].cost.sum())
     return found if groups is None or groups.explained < explained else common
@@ -221,6 +234,20 @@ def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
         return False
     # Errors that copies of a view share look like the target's.
     return choice != "auto" or not repeated.worth < _WORTH
+
+
+def _is_where_it_was(found: Found, again: Solution) -> bool:
+    """Whether the camera that was fitted to a target again is the one that the target was found with."""
+    (problem, adjusted), new = found.fits[0], again.problem
+    if problem.views.names != new.views.names or problem.distortion.model != new.distortion.model:
+        return False
+    same = np.array_equal(problem.points.pixels, new.points.pixels)
+    cost, gained = adjusted.cost.sum(), abs(adjusted.cost.sum() - again.adjusted.cost.sum())
+    return (
+        same
+        and np.array_equal(problem.free_camera, new.free_camera)
+        and bool(gained * problem.views.n_equations < _SETTLED**2 * cost)
+    )
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:

@@ -6,11 +6,13 @@ views. The evidence of the pixels with cameras, poses and bends integrated out t
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information
-from neurocal_cli.target_shape.posterior import evidence_of_given
+from neurocal_cli.target_shape.posterior import log_evidence
 
 _LEAST, _MOST = 1e-6, 1.0  # of the target's size, as if all errors were noise
 _GRID, _FINER = 12, (0.6, 0.3, 0.1)  # places, and the widths of the parabolas that follow; of logarithms
@@ -28,10 +30,10 @@ def most_probable_precision(info: Information, size: float, roughly: bool = Fals
     roughly : bool
         Whether a factor of 3 either way is near enough.
     """
-    noise = info.straight().cost / info.spare
+    noise, of_precision = info.straight().cost / info.spare, evidence_by_precision(info)
 
     def evidence(log_size: float) -> float:
-        return evidence_of_given(info.held(noise * np.exp(-2 * log_size)))
+        return of_precision(noise * np.exp(-2 * log_size))
 
     grid = np.linspace(np.log(_LEAST * size), np.log(_MOST * size), _GRID)
     values = [evidence(x) for x in grid]
@@ -44,6 +46,35 @@ def most_probable_precision(info: Information, size: float, roughly: bool = Fals
         x += float(np.clip(step, -width, width))
         highest = evidence(x)
     return float(noise * np.exp(-2 * x))
+
+
+def evidence_by_precision(info: Information) -> Callable[[float], float]:
+    """Logarithm of the evidence of the target as it is given, for bends that have a precision a priori.
+
+    Each view's bends are three independent ones, once its pose is eliminated.
+    """
+    Q, X, B = info.pose[:, :6, :6], info.pose[:, :6, 6:], info.pose[:, 6:, 6:]
+    root = np.linalg.inv(np.linalg.cholesky(Q))
+    by_camera = np.concatenate([info.pose_camera, info.pose_right[..., None]], axis=2)
+    rows, of_bends = root @ by_camera[:, :6], root @ X
+    back = np.swapaxes(of_bends, 1, 2)
+    values, vectors = np.linalg.eigh(B - back @ of_bends)
+    values = np.maximum(values, 0.0).ravel()
+    along = np.swapaxes(vectors, 1, 2) @ (by_camera[:, 6:] - back @ rows)
+    f, flat, along = len(info.camera), rows.reshape(-1, rows.shape[2]), along.reshape(-1, rows.shape[2])
+    M = np.empty((f + 1, f + 1))
+    M[:f, :f], M[f, :f], M[:f, f], M[f, f] = info.camera, info.camera_right, info.camera_right, info.cost
+    M -= flat.T @ flat
+    logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+
+    def evidence(precision: float) -> float:
+        left = values + precision
+        N = M - (along.T / left) @ along
+        cost = float(N[f, f] - N[f, :f] @ np.linalg.solve(N[:f, :f], N[:f, f]))
+        by_bends = float(np.log(left / precision).sum() + np.linalg.slogdet(N[:f, :f])[1])
+        return log_evidence(info.spare, cost, logdet + by_bends)
+
+    return evidence
 
 
 def bends_of(info: Information, camera_step: Array, offsets: Array) -> Array:

@@ -8,11 +8,10 @@ be bent far more than the others, because one odd view is no board that bends; n
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import solve_scaled
-from neurocal_cli.target_shape.information import Information, Sight, information_of, joined
+from neurocal_cli.target_shape.information import Information, Sight, of_views, without_points
 from neurocal_cli.target_shape.posterior import camera_step_of
 
 _FOLDS = 5
@@ -33,21 +32,16 @@ def bends_hold(sight: Sight, bends: Array, precision: float) -> bool:
     """
     if not _alike(bends):
         return False
-    shapes, views = sight.shapes, sight.views.index
-    assert shapes is not None
+    views = sight.views.index
     rank = np.arange(len(views)) - sight.views.first[views]
     ratio = 0.0  # its logarithm, because a fold that needs a camera of few views would outweigh the others
     n_folds = min(sight.views.n_views, _FOLDS)
-
-    def information(kept: NDArray[np.bool_]) -> Information:
-        return information_of([sight.of_points(kept)], len(shapes))
-
-    folds = [views % n_folds == fold for fold in range(n_folds)]
-    parts = [information(out) for out in folds]
-    for fold, out in enumerate(folds):
-        rest = joined(parts[:fold] + parts[fold + 1 :])
-        halves = [information(out & (rank % 2 == half)) for half in (0, 1)]
-        ratio += np.log(_lost(rest, halves, precision) / _lost(rest, halves, None))
+    halves = [without_points(sight.of_points(rank % 2 == half)) for half in (0, 1)]
+    whole = halves[0] + halves[1]
+    for fold in range(n_folds):
+        out = np.arange(sight.views.n_views) % n_folds == fold
+        rest, own = of_views(sight, whole, ~out), [of_views(sight, half, out) for half in halves]
+        ratio += np.log(_lost(rest, own, precision) / _lost(rest, own, None))
     return bool(ratio < 0)
 
 

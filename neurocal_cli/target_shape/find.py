@@ -183,18 +183,24 @@ class Search:
 
     def run(self, least_gain: float) -> Found | None:
         """Linearise, solve and move; None where the target gains too little, or is no print of the given."""
+        noise: float | None = None
         for step in range(_STEPS):
-            info = self._around_given(self.information())
+            here = self.information()
+            noise = here.cost / here.spare if noise is None and self.sizes is not None else noise
+            info = self._around_given(here)
             if not (info.spare > _FEWEST_SPARE and info.cost > info.spare * _EXACT**2):
                 return None
             if self.still:
                 found = given_posterior(info, self.prior)
             else:
-                found = posterior(info, self.prior, self.sizes, self.flat)
+                found = posterior(info, self.prior, self.sizes, self.flat, noise)
             if step == 0 and found.evidence - self._without(info) < _EARLY * least_gain:
                 return None
-            std = np.sqrt(found.variance * np.diagonal(found.camera))
-            settled = bool((np.abs(found.camera_step) < _SETTLED * std).all())
+            noise = found.variance
+            std = np.sqrt(noise * np.diagonal(found.camera))
+            # Without sizes to begin with, the first ones are rough.
+            known = self.still or self.sizes is not None
+            settled = known and bool((np.abs(found.camera_step) < _SETTLED * std).all())
             if not self._move(found, info):
                 return None
             if settled:

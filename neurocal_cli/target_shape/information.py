@@ -122,6 +122,11 @@ class Information:
             cost=self.cost + float((bends * cost).sum()),
         )
 
+    def pose_by(self, offsets: Array) -> Array:
+        """(P, p) what offsets (n, 3) add to the poses' right side."""
+        P, p = self.pose.shape[:2]
+        return (self.pose_point.reshape(P * p, offsets.size) @ offsets.ravel()).reshape(P, p)
+
     def straight(self) -> Information:
         """Without bends."""
         return replace(
@@ -136,12 +141,17 @@ class Information:
     def turned(self, axes: Array) -> Information:
         """With each point's offset along its own axes, the columns of (n, 3, 3)."""
         transposed = np.swapaxes(axes, 1, 2)
+        alike = bool((axes == axes[:1]).all())  # one plane: a single product
         return replace(
             self,
             point=transposed @ self.point @ axes,
             point_camera=transposed @ self.point_camera,
             point_right=(transposed @ self.point_right[..., None])[..., 0],
-            pose_point=np.einsum("pqni,nij->pqnj", self.pose_point, axes),
+            pose_point=(
+                (self.pose_point.reshape(-1, 3) @ axes[0]).reshape(self.pose_point.shape)
+                if alike
+                else np.einsum("pqni,nij->pqnj", self.pose_point, axes)
+            ),
         )
 
     def around_given(self, offsets: Array) -> Information:
@@ -150,7 +160,7 @@ class Information:
         return replace(
             self,
             camera_right=self.camera_right + np.einsum("nif,ni->f", self.point_camera, offsets),
-            pose_right=self.pose_right + np.einsum("pqni,ni->pq", self.pose_point, offsets),
+            pose_right=self.pose_right + self.pose_by(offsets),
             point_right=self.point_right + by_point,
             cost=self.cost + float((offsets * (2 * self.point_right + by_point)).sum()),
         )
@@ -266,32 +276,86 @@ def point_terms(
     whole = width if shapes is None else width + N_SHAPES
     of_pose = pose_columns(whole, shapes is not None)
     p = len(of_pose)
-    used = np.concatenate([columns, of_pose, [whole - 1]])
+    kept = np.append(columns, whole - 1)
+    once = len(label) == V and _is_once(label)  # each view is one batch, in which no point is twice
+    alike = once and label[0, 0] >= 0 and bool((label == label[0]).all())
     by_batch = np.empty((len(batches.view), whole, whole))
-    summed, cross = np.zeros((n_points, 3, f + p + 4)), np.zeros((V * n_points, p, 3))
+    summed, cross = np.zeros((n_points, 3, f + 4)), np.zeros((V, p, n_points, 3))
+    buffer = batches.memory(width)
+    for chunk in batches.chunks():
+        view, seen = batches.view[chunk], label[chunk]
+        part = buffer[: len(view)]
+        derivatives(batches, chunk, state, part[:, :-1])
+        by_point = by_world(part, state, scale, view)
+        if shapes is not None:
+            part = with_bends(part, by_point, shapes[seen[:1] if alike else seen])
+        products(part, by_batch[chunk])
+        rows = np.concatenate([by_point, part[:, kept]], axis=1)
+        crossed = np.swapaxes(_of_each(part[:, of_pose], by_point), 2, 3)  # (T, p, n, 3)
+        if alike:
+            own = by_point.transpose(3, 1, 0, 2).reshape(seen.shape[1], 3, -1)
+            summed[seen[0]] += own @ rows.transpose(3, 0, 2, 1).reshape(seen.shape[1], -1, f + 4)
+            cross[view[0] : view[-1] + 1, :, seen[0]] = crossed
+            continue
+        real = seen >= 0
+        every, flat = np.moveaxis(_of_each(by_point, rows), 3, 1)[real], seen[real]
+        summed += _summed_by(flat, every.reshape(len(flat), -1), n_points).reshape(summed.shape)
+        places = np.broadcast_to(view[:, None], real.shape)[real], flat
+        each = np.swapaxes(crossed, 1, 2)[real]
+        if once:
+            np.swapaxes(cross, 1, 2)[places] = each
+        else:
+            np.add.at(np.swapaxes(cross, 1, 2), places, each)
+    return PointTerms(
+        batches.sum_by_view(by_batch), summed[:, :, :3], summed[:, :, 3:-1], summed[:, :, -1], cross
+    )
+
+
+def _is_once(label: NDArray[np.intp]) -> bool:
+    """Whether no batch has a point twice."""
+    ordered = np.sort(label, axis=1)
+    return not ((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any()
+
+
+def _of_each(a: Array, b: Array) -> Array:
+    """(T, i, j, n) products of rows (T, i, 2, n) and (T, j, 2, n) of each point, summed over u and v."""
+    product = a[:, :, None, 0] * b[:, None, :, 0]
+    product += a[:, :, None, 1] * b[:, None, :, 1]
+    return np.asarray(product)
+
+
+def without_points(sight: Sight) -> Array:
+    """(V, w, w) products of what one camera saw, by views [px]; columns as of `PointTerms.normal`."""
+    views, state, batches = sight.views, sight.state, sight.views.batches
+    width = 12 + len(state.k)
+    whole = width if sight.shapes is None else width + N_SHAPES
+    label = labelled(views, sight.label)
+    by_batch = np.empty((len(batches.view), whole, whole))
     buffer = batches.memory(width)
     for chunk in batches.chunks():
         view = batches.view[chunk]
         part = buffer[: len(view)]
         derivatives(batches, chunk, state, part[:, :-1])
-        by_point = by_world(part, state, scale, view)
-        if shapes is not None:
-            part = with_bends(part, by_point, shapes[label[chunk]])
+        if sight.shapes is not None:
+            part = with_bends(part, by_world(part, state, views.scale, view), sight.shapes[label[chunk]])
         products(part, by_batch[chunk])
-        rows = np.concatenate([by_point, part[:, used]], axis=1)
-        real = label[chunk] >= 0
-        every = np.moveaxis(by_point, 3, 1) @ np.moveaxis(rows, 3, 1).swapaxes(2, 3)
-        point, flat = every[real], label[chunk][real]  # (.., 3, f + p + 4), (..,)
-        summed += _summed_by(flat, point.reshape(len(flat), -1), n_points).reshape(summed.shape)
-        place = np.broadcast_to(view[:, None] * n_points, real.shape)[real] + flat
-        np.add.at(cross, place, np.swapaxes(point[:, :, 3 + f : -1], 1, 2))
-    return PointTerms(
-        batches.sum_by_view(by_batch),
-        summed[:, :, :3],
-        summed[:, :, 3 : 3 + f],
-        summed[:, :, -1],
-        np.swapaxes(cross.reshape(V, n_points, p, 3), 1, 2),
-    )
+    return views.pixel_scale**2 * batches.sum_by_view(by_batch)
+
+
+def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Information:
+    """Of some views (V,) of one camera, from `without_points`; no point of the target is off."""
+    N = normal[which]
+    columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
+    of_pose, P = pose_columns(N.shape[1], sight.shapes is not None), len(N)
+    p, f = len(of_pose), len(columns)
+    camera = N.sum(axis=0)
+    found = Information(
+        camera[columns[:, None], columns], camera[columns, -1],
+        N[:, of_pose[:, None], of_pose], N[:, of_pose[:, None], columns], N[:, of_pose, -1],
+        np.zeros((0, 3, 3)), np.zeros((0, 3, f)), np.zeros((0, 3)), np.zeros((P, p, 0, 3)),
+        float(camera[-1, -1]), float(sight.views.equations[which].sum()),
+    )  # fmt: skip
+    return found if sight.bends is None else found.around_straight(sight.bends[which])
 
 
 def pose_columns(width: int, bends: bool) -> NDArray[np.intp]:
@@ -309,10 +373,11 @@ def with_bends(part: Array, by_point: Array, shapes: Array) -> Array:
         A part of `PointBatches.memory`.
     by_point : (T, 3, 2, n) array
         From `by_world`.
-    shapes : (T, n, 3, 3) array
+    shapes : (T, n, 3, 3) or (1, n, 3, 3) array
         Offsets of the points for a coefficient of 1.
     """
-    by_bend = np.einsum("tipn,tnik->tkpn", by_point, shapes)
+    along = np.ascontiguousarray(np.moveaxis(shapes, 1, 3))  # (T, 3, 3, n)
+    by_bend = sum(by_point[:, None, i] * along[:, i, :, None] for i in range(3))
     return np.concatenate([part[:, :-2], by_bend, part[:, -2:]], axis=1)
 
 

@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information, Sight, information_of, joined
-from neurocal_cli.target_shape.posterior import cost_at, known_sizes
+from neurocal_cli.target_shape.posterior import camera_step, offsets_of, prior_covariance
 from neurocal_cli.target_shape.prior import Prior
+from neurocal_cli.target_shape.without_poses import WithoutPoses
 
 _FEWEST = 4  # views, so that the others determine a camera
 _FOLDS = 5
@@ -61,19 +62,56 @@ def holds_for_views_left_out(
     parts = [information(np.array([fold])) for fold in range(n_folds)]
     # A camera with fewer views than there are folds is missing in some.
     by_parts = len({len(part.camera) for part in parts}) == 1
+    folds = np.arange(n_folds)
+    try:
+        if by_parts:
+            told = _told(parts, prior, sizes, variance)
+        else:
+            others = [information(folds[folds != fold]) for fold in range(n_folds)]
+            told = [offsets_of(some, prior, sizes, variance) for some in others]
+    except np.linalg.LinAlgError:
+        return True
+    tried = np.stack([np.zeros_like(offsets), *told])
+    if by_parts:
+        terms = [WithoutPoses(part).at(tried) for part in parts]
 
-    def of(folds: list[int]) -> Information:
-        return joined([parts[fold] for fold in folds]) if by_parts else information(np.array(folds))
+    def costs(which: NDArray[np.intp]) -> Array:
+        """At the best cameras and poses, without offsets and with those that each fold was not asked for."""
+        if not by_parts:
+            return _least(WithoutPoses(information(which)).at(tried))
+        some = [terms[fold] for fold in which]
+        return _least((sum(S for S, *_ in some), sum(g for _, g, _ in some), sum(c for *_, c in some)))
 
-    everything = list(range(n_folds))
-    whole, nothing = of(everything), np.zeros_like(offsets)
-    alone, together = 0.0, -n_folds * cost_at(whole, nothing)
-    for fold, out in enumerate(parts):
-        others = of(everything[:fold] + everything[fold + 1 :])
-        try:
-            told = known_sizes(others, prior, sizes, variance).offsets
-        except np.linalg.LinAlgError:
-            return True
-        alone += cost_at(out, told) - cost_at(out, nothing)
-        together += cost_at(whole, told) - cost_at(others, told) + cost_at(others, nothing)
-    return alone < 0 or together < 0
+    whole = costs(folds)
+    alone, together = 0.0, -n_folds * whole[0]
+    for fold in range(n_folds):
+        out, rest = costs(folds[folds == fold]), costs(folds[folds != fold])
+        alone += out[1 + fold] - out[0]
+        together += whole[1 + fold] - rest[1 + fold] + rest[0]
+    return bool(alone < 0 or together < 0)
+
+
+def _told(
+    parts: Sequence[Information], prior: Prior, sizes: Mapping[str, float], variance: float
+) -> list[Array]:
+    """Offsets that all parts but one tell, for each one that is left out."""
+    if 3 * len(prior.axes) > sum(part.pose_right.size for part in parts):
+        others = [joined([part for part in parts if part is not out]) for out in parts]
+        return [offsets_of(some, prior, sizes, variance) for some in others]
+    matrices = [WithoutPoses(part).matrix() for part in parts]
+    f = len(parts[0].camera)
+    precision = np.zeros_like(matrices[0][:-1, :-1])
+    precision[f:, f:] = variance * np.linalg.inv(prior_covariance(prior, sizes))
+    whole = sum(matrices)
+    told = []
+    for out in matrices:
+        M = whole - out
+        x = np.linalg.solve(M[:-1, :-1] + precision, M[:-1, -1])
+        told.append(np.asarray(x[f:].reshape(-1, 3)))
+    return told
+
+
+def _least(terms: tuple[Array, Array, Array]) -> Array:
+    """Costs (k,) at the best cameras."""
+    S, g, cost = terms
+    return np.asarray(cost - (g * camera_step(S, g)).sum(axis=0))

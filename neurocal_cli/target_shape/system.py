@@ -16,6 +16,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
+from neurocal_cli.target_shape.without_poses import WithoutPoses
 
 _SMALL = 48  # rows of a triangular matrix from which on its halves are inverted by themselves
 _RIDGE = 1e-10  # added to a unit diagonal where rounding has made a matrix indefinite
@@ -35,46 +36,61 @@ class System:
         self.info, self.prior = info, prior
         self.n, (self.P, self.p) = len(info.point), info.pose.shape[:2]
         self.f, self.m = len(info.camera), prior.basis.shape[2]
-        basis = prior.basis
-        by_basis = info.point @ basis  # (n, 3, m)
-        across = np.einsum("nif,nim->fm", info.point_camera, basis)
-        inner = np.einsum("nim,nik->mk", basis, by_basis)
-        self.shared = np.block([[info.camera, across], [across.T, inner]])
-        self.right = np.concatenate([info.camera_right, np.einsum("nim,ni->m", basis, info.point_right)])
-        self.point_shared = np.concatenate([info.point_camera, by_basis], axis=2)  # (n, 3, s)
-        pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ basis.reshape(3 * self.n, self.m)
-        self.pose_shared = np.concatenate(
-            [info.pose_camera, pose_basis.reshape(self.P, self.p, self.m)], axis=2
-        )
         self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
         self.points_first = 3 * self.n >= self.p * self.P
-        if not self.points_first:
-            self._eliminate_poses()
+        (self._prepare if self.points_first else self._eliminate_poses)()
 
     @property
     def s(self) -> int:
         """Number of the cameras' parameters and the smooth coefficients."""
         return self.f + self.m
 
-    def _eliminate_poses(self) -> None:
-        info, s = self.info, self.s
-        root = np.linalg.inv(np.linalg.cholesky(info.pose))
-        columns = [self.pose_shared, info.pose_point.reshape(self.P, self.p, -1), info.pose_right[..., None]]
-        rows = root @ np.concatenate(columns, axis=2)
-        flat = rows.reshape(self.p * self.P, -1)
-        dim = s + 3 * self.n
+    def _prepare(self) -> None:
+        """What points are eliminated from."""
+        info, basis = self.info, self.prior.basis
+        by_basis = info.point @ basis  # (n, 3, m)
+        across = np.einsum("nif,nim->fm", info.point_camera, basis)
+        flat = basis.reshape(3 * self.n, self.m)
+        inner = flat.T @ by_basis.reshape(3 * self.n, self.m)
+        shared = np.block([[info.camera, across], [across.T, inner]])
+        right = np.concatenate([info.camera_right, info.point_right.ravel() @ flat])
+        pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ flat
+        pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, self.p, self.m)], axis=2)
+        self.bordered = self._with_points(shared, right, pose_shared)
+        # (n, 3, s + P p + 1): what each point meets
+        poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
+        by_shared = [info.point_camera, by_basis]
+        self.by_point = np.concatenate([*by_shared, poses, info.point_right[..., None]], axis=2)
+
+    def _with_points(self, shared: Array, right: Array, pose_shared: Array) -> Array:
+        """The bordered matrix of cameras, smooth parts and poses, before points are eliminated."""
+        info, s, P, p = self.info, self.s, self.P, self.p
+        dim = s + p * P
         M = np.zeros((dim + 1, dim + 1))
-        M[:s, :s] = self.shared
-        M[:s, s:dim] = self.point_shared.reshape(3 * self.n, s).T
+        M[:s, :s] = shared
+        M[:s, s:dim] = pose_shared.reshape(p * P, s).T
         M[s:dim, :s] = M[:s, s:dim].T
-        for i in range(3):
-            for j in range(3):
-                at = s + 3 * np.arange(self.n)
-                M[at + i, at + j] = info.point[:, i, j]
-        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.point_right.reshape(-1), info.cost
+        at = s + p * np.arange(P)
+        for i in range(p):
+            for j in range(p):
+                M[at + i, at + j] = info.pose[:, i, j]
+        M[:s, -1], M[s:dim, -1], M[-1, -1] = right, info.pose_right.reshape(-1), info.cost
         M[-1, :dim] = M[:dim, -1]
-        self.dense = M - flat.T @ flat
-        self.logdet_poses = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        return M
+
+    def _eliminate_poses(self) -> None:
+        """The bordered matrix of cameras, smooth parts and points, from that without the parts."""
+        without = WithoutPoses(self.info)
+        M, f, s, m = without.matrix(), self.f, self.s, self.m
+        basis = self.prior.basis.reshape(3 * self.n, m)
+        by_basis = M[:, f:-1] @ basis
+        dense = np.empty((len(M) + m,) * 2)
+        old = np.r_[:f, s : len(dense)]
+        dense[np.ix_(old, old)] = M
+        dense[old, f:s] = by_basis
+        dense[f:s, old] = by_basis.T
+        dense[f:s, f:s] = basis.T @ by_basis[f:-1]
+        self.dense, self.logdet_poses = dense, without.logdet
 
     def solve(self, smooth: Array, single: Array) -> Solved:
         """At given precisions (m,) of the smooth parts and (n, 3) of each point by itself."""
@@ -98,6 +114,17 @@ class System:
             np.log(np.diagonal(factor)).sum() - np.log(scale).sum()
         )
 
+    def offsets(self, smooth: Array, single: Array) -> tuple[Array, Array]:
+        """Coefficients (m,) of the smooth parts and (n, 3) of each point by itself."""
+        if not self.points_first:
+            M = self._without_poses(smooth, single)
+            x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
+            return x[self.f : self.s], x[self.s :].reshape(self.n, 3)
+        M, root, rows = self._without_points(smooth, single)
+        x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
+        own = rows[:, :, -1] - rows[:, :, :-1] @ x
+        return x[self.f : self.s], (np.swapaxes(root, 1, 2) @ own[..., None])[..., 0]
+
     def _without_poses(self, smooth: Array, single: Array) -> Array:
         """The bordered matrix of cameras, smooth parts and points."""
         s, f = self.s, self.f
@@ -111,12 +138,14 @@ class System:
         s, f = self.s, self.f
         dim = s + 3 * self.n
         M = self._without_poses(smooth, single)
-        inverse, logdet = _inverse(M[:dim, :dim])
-        x = inverse @ M[:dim, -1]
-        cost = float(M[-1, -1] - M[:dim, -1] @ x)
-        var_single = np.diagonal(inverse)[s:].reshape(self.n, 3)
+        root, logdet = _root_of_inverse(M[:dim, :dim])
+        half = root @ M[:dim, -1]
+        x, variance = half @ root, np.einsum("ij,ij->j", root, root)
+        cost = float(M[-1, -1] - half @ half)
+        var_single = variance[s:].reshape(self.n, 3)
 
         def rest() -> Rest:
+            inverse = root.T @ root
             cross = inverse[f:s, s:].reshape(self.m, self.n, 3)
             along_gauge = (inverse[s:, s:] @ self.gauge).reshape(self.n, 3, -1)
             return Rest(
@@ -127,7 +156,7 @@ class System:
 
         return Solved(
             x[:f], x[f:s], x[s:].reshape(self.n, 3), cost, logdet + self.logdet_poses,
-            np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], rest,
+            variance[f:s], var_single, root[:, :f].T @ root[:, :f], rest,
         )  # fmt: skip
 
     def _poses(self, inverse: Array) -> Array | None:
@@ -139,53 +168,43 @@ class System:
             return None
         own = np.linalg.inv(self.info.pose)
         by_point = self.info.pose_point.reshape(self.P, self.p, -1)
-        gain = own @ np.concatenate([self.pose_shared, by_point], axis=2)
+        gain = own @ np.concatenate([self.info.pose_camera, by_point], axis=2)
         return np.asarray(own + gain @ inverse @ np.swapaxes(gain, 1, 2))
 
     def _without_points(self, smooth: Array, single: Array) -> tuple[Array, Array, Array]:
         """The bordered matrix of cameras, smooth parts and poses; roots and rows of the points."""
-        info, s, f, n, P, p = self.info, self.s, self.f, self.n, self.P, self.p
-        root = np.linalg.inv(np.linalg.cholesky(info.point + single[:, :, None] * np.eye(3)))  # (n, 3, 3)
-        poses = np.moveaxis(info.pose_point, 2, 0).reshape(n, p * P, 3).swapaxes(1, 2)
-        rows = root @ np.concatenate([self.point_shared, poses, info.point_right[..., None]], axis=2)
-        flat = rows.reshape(3 * n, -1)
-        dim = s + p * P
-        M = np.zeros((dim + 1, dim + 1))
-        M[:s, :s] = self.shared
-        at = np.arange(f, s)
+        own = self.info.point + single[:, :, None] * np.eye(3)
+        root = np.linalg.inv(np.linalg.cholesky(own))  # (n, 3, 3)
+        rows = root @ self.by_point
+        flat = rows.reshape(3 * self.n, -1)
+        M = self.bordered - flat.T @ flat
+        at = np.arange(self.f, self.s)
         M[at, at] += smooth
-        M[:s, s:dim] = self.pose_shared.reshape(p * P, s).T
-        M[s:dim, :s] = M[:s, s:dim].T
-        at = s + p * np.arange(P)
-        for i in range(p):
-            for j in range(p):
-                M[at + i, at + j] = info.pose[:, i, j]
-        M[:s, -1], M[s:dim, -1], M[-1, -1] = self.right, info.pose_right.reshape(-1), info.cost
-        M[-1, :dim] = M[:dim, -1]
-        M -= flat.T @ flat
         return M, root, rows
 
     def _points_first(self, smooth: Array, single: Array) -> Solved:
         s, f, n, P, p = self.s, self.f, self.n, self.P, self.p
         dim = s + p * P
-        M, root, rows = self._without_points(smooth, single)
-        inverse, logdet = _inverse(M[:dim, :dim])
-        x = inverse @ M[:dim, -1]
-        cost = float(M[-1, -1] - M[:dim, -1] @ x)
+        M, own_root, rows = self._without_points(smooth, single)
+        root, logdet = _root_of_inverse(M[:dim, :dim])
+        half = root @ M[:dim, -1]
+        x, variance = half @ root, np.einsum("ij,ij->j", root, root)
+        cost = float(M[-1, -1] - half @ half)
         # The points' own: how they follow all the others.
-        back = np.swapaxes(root, 1, 2)
+        back = np.swapaxes(own_root, 1, 2)
         e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
-        follow = back @ rows[:, :, :-1]  # (n, 3, dim)
-        spread = follow.reshape(3 * n, dim) @ inverse  # (3 n, dim)
-        var_single = np.diagonal(back @ root, axis1=1, axis2=2) + (
-            (spread * follow.reshape(3 * n, dim)).sum(axis=1).reshape(n, 3)
+        follow = (back @ rows[:, :, :-1]).reshape(3 * n, dim)
+        by_root = follow @ root.T
+        var_single = np.diagonal(back @ own_root, axis1=1, axis2=2) + (
+            np.einsum("ij,ij->i", by_root, by_root).reshape(n, 3)
         )
-        logdet -= 2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
+        logdet -= 2 * float(np.log(np.diagonal(own_root, axis1=1, axis2=2)).sum())
 
         def rest() -> Rest:
+            inverse, spread = root.T @ root, by_root @ root
             cross = -spread.T.reshape(dim, n, 3)
-            own = ((back @ root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
-            along_gauge = own + spread @ (follow.reshape(3 * n, dim).T @ self.gauge)
+            own = ((back @ own_root) @ self.gauge.reshape(n, 3, -1)).reshape(3 * n, -1)
+            along_gauge = own + spread @ (follow.T @ self.gauge)
             return Rest(
                 self._with_offsets(inverse[:f, f:s], cross[:f]),
                 self._variance(inverse[f:s, f:s], cross[f:s], var_single, along_gauge.reshape(n, 3, -1)),
@@ -193,7 +212,7 @@ class System:
             )
 
         return Solved(
-            x[:f], x[f:s], e, cost, logdet, np.diagonal(inverse)[f:s], var_single, inverse[:f, :f], rest
+            x[:f], x[f:s], e, cost, logdet, variance[f:s], var_single, root[:, :f].T @ root[:, :f], rest
         )
 
     def _with_offsets(self, smooth: Array, single: Array) -> Array:
@@ -266,15 +285,18 @@ class Solved:
     rest: Callable[[], Rest]
 
 
-def _inverse(M: Array) -> tuple[Array, float]:
+def _root_of_inverse(M: Array) -> tuple[Array, float]:
+    """A factor whose product R^T R is the inverse, and the logarithm of the determinant."""
     scale = 1.0 / np.sqrt(np.diagonal(M))
-    scaled = M * scale[:, None] * scale
+    scaled = M * scale[:, None]
+    scaled *= scale
     try:
         root = _inverse_of_triangular(np.linalg.cholesky(scaled))
     except np.linalg.LinAlgError:  # coefficients that only tell together, as xi and alpha do
         root = _inverse_of_triangular(np.linalg.cholesky(scaled + _RIDGE * np.eye(len(M))))
     logdet = -2 * float(np.log(np.diagonal(root)).sum() + np.log(scale).sum())
-    return (root.T @ root) * scale[:, None] * scale, logdet
+    root *= scale
+    return root, logdet
 
 
 def _inverse_of_triangular(L: NDArray[np.floating]) -> Array:
