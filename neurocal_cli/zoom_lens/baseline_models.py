@@ -129,12 +129,12 @@ class _Polynomials:
         """(n, L) local parameters."""
         return outputs_to_local(self.scale, monomials(x, self.powers) @ self.coefficients)[0]
 
-    def local_with_jacobians(self, x: Array) -> tuple[Array, list[Array]]:
+    def local_with_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Local parameters, and their derivatives by all coefficients (n, L, K L)."""
         Phi = monomials(x, self.powers)
         local, by_output = outputs_to_local(self.scale, Phi @ self.coefficients)
         J = Phi[:, None, :, None] * by_output[:, :, None]
-        return local, [J.reshape(*local.shape, -1)]
+        return local, J.reshape(*local.shape, -1)
 
 
 def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Baseline:

@@ -126,8 +126,7 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
         first = describe(lens.controls, matched.settings[int(np.argmax(outside))])
         warnings.append(
             f"{int(outside.sum())} of {len(outside)} settings lie outside the calibrated range, the "
-            f"first at {first}: "
-            "the networks extrapolate there"
+            f"first at {first}: the networks extrapolate there"
         )
     return matched, warnings
 

@@ -101,15 +101,16 @@ def fit_lens(
     lens = points.varying()
     check_settings(lens.n_settings, len(lens.controls), lens.points.source)
     still = camera == "still" or (camera == "auto" and bool(np.bincount(lens.view_setting).max() == 1))
-    options = FitOptions(training, still, skew, Budget(topologies=topologies), seed)
-    reject = outliers == "reject"
+    options = FitOptions(
+        training, still, skew, outliers == "reject", Budget(topologies=topologies), seed, report
+    )
     found = None if still else lens_target(lens, target, distortion, skew, seed, report)
     lens = on_target(lens, found)
     if distortion == "auto":
-        start = choose_model(lens, options, reject, report)
+        start = choose_model(lens, options)
     else:
-        start = calibrate_settings(lens, distortion, options, reject, report)
-    start, joints = _train(start, options, reject, report)
+        start = calibrate_settings(lens, distortion, options)
+    start, joints = _train(start, options)
     fitted = assemble(start, joints, options)
     return fitted if found is None else _with_target(fitted, start, found)
 
@@ -122,23 +123,20 @@ def _with_target(fitted: ZoomLens, start: CalibratedSettings, found: Target) -> 
     return replace(fitted, target=found, target_coupling=coupling)
 
 
-def _train(
-    start: CalibratedSettings, options: FitOptions, reject: bool, report: Progress
-) -> tuple[CalibratedSettings, list[Joint]]:
+def _train(start: CalibratedSettings, options: FitOptions) -> tuple[CalibratedSettings, list[Joint]]:
     """Steps 2 and 3, with rejection of settings that contradict all others."""
     while True:
-        joints = train_all(start, options, options.budget, report)
-        if not reject or not may_reject(start.rejected, start.lens):
+        joints = train_all(start, options)
+        if not options.reject or not may_reject(start.rejected, start.lens):
             return start, joints
-        errors = left_out_errors(start, joints[0])
-        suspect = most_suspect(errors.pixels, errors.normalised)
+        suspect = most_suspect(*left_out_errors(start, joints[0]))
         if suspect is None:
             return start, joints
         keep = np.arange(start.lens.n_settings) != suspect
         lens, data, static = without(start.lens, start.static, keep, start.data.model, options)
         tables = common_tables(data, static.local, first_constants(static, lens, options.still))
         rest = CalibratedSettings(lens, data, static, tables, start.rejected)
-        trial = train_all(rest, options, replace(options.budget, starts=6), report)
+        trial = train_all(rest, replace(options, budget=replace(options.budget, starts=6)))
         reason = contradiction(
             provisional(rest, trial, options), start.lens.settings[suspect], start.tables, suspect
         )

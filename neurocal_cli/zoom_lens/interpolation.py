@@ -31,7 +31,7 @@ def spline_matrix(axes: list[Array], x: Array) -> Array:
 
 
 def thin_plate_matrix(nodes: Array, x: Array) -> Array:
-    """Matrix (n, nodes) of thin-plate splines through nodes (nodes, D) anywhere, at x (n, D).
+    """Matrix (n, nodes) of thin-plate splines through nodes (nodes, 2) anywhere, at x (n, 2).
 
     The solution has the smallest norm, as all settings of two controls may be on one line. SciPy's
     `RBFInterpolator` refuses those as singular.
@@ -39,8 +39,6 @@ def thin_plate_matrix(nodes: Array, x: Array) -> Array:
 
     def kernel(a: Array, b: Array) -> Array:
         r2 = ((a[:, None] - b[None]) ** 2).sum(axis=-1)
-        if a.shape[1] == 1:
-            return r2 * np.sqrt(r2)
         return 0.5 * r2 * np.log(np.maximum(r2, 1e-300))
 
     S, D = nodes.shape

@@ -6,25 +6,23 @@ import numpy as np
 
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.zoom_lens.alternating_training import take_turns
-from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions, Progress
+from neurocal_cli.zoom_lens.committee import fit_committee
+from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions
 from neurocal_cli.zoom_lens.joint_training import Joint, train_joint
 
 
-def train_all(
-    start: CalibratedSettings, options: FitOptions, budget: Budget, report: Progress
-) -> list[Joint]:
+def train_all(start: CalibratedSettings, options: FitOptions) -> list[Joint]:
     """Steps 2 and 3. The members come in descending order of their evidence."""
     x, rng = start.controls, np.random.default_rng(options.seed)
     members = fit_committee(
         x,
         start.data.names,
         start.tables.local,
-        start.tables.normal,
+        start.tables.normal.H,
         start.variance,
         rng,
-        budget,
-        lambda share: report("fitting a network to each parameter", share),
+        options.budget,
+        lambda share: options.report("fitting a network to each parameter", share),
     )
     descend = None if options.training == "joint" else take_turns
     # Every network fits the scatter of a lens that does not repeat its positions. A poor network alone fits
@@ -34,7 +32,7 @@ def train_all(
     for k, nets in enumerate(members):
 
         def report_share(share: float, k: int = k) -> None:
-            report("all networks together", (k + share) / len(members))
+            options.report("all networks together", (k + share) / len(members))
 
         arguments = start.data, x, nets, start.tables.constants, start.variance, scatter
         joints.append(train_joint(*arguments, report_share, descend))
