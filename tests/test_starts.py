@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns
 from neurocal_cli.training import Task, Trained
-from neurocal_cli.training.starts import Agreement, FixedWeights, Learnt, learn
+from neurocal_cli.training.starts import Agreement, Learnt, learn
 
 K, N = 3, 8
 
@@ -115,7 +115,7 @@ def test_given_weights_are_the_same_in_every_start_and_not_free() -> None:
     W = np.full((3, 3), np.nan)
     W[:2, 2] = 0.25
     script = Script([[1.0, 2.0, 3.0, 3.0, 3.0, 1.0]])
-    run(script, fixed=FixedWeights(W=W))
+    run(script, W=W)
     for task in script.tasks:
         assert (task.W[:, :2, 2] == 0.25).all()
         assert task.free_W.tolist() == np.isnan(W).tolist()
@@ -127,6 +127,6 @@ def test_given_weights_are_the_same_in_every_start_and_not_free() -> None:
 def test_a_given_pose_is_not_free() -> None:
     V = np.random.default_rng(0).normal(size=(1, 3, 4))
     script = Script([[1.0, 1.0]])
-    run(script, fixed=FixedWeights(V=V))
+    run(script, V=V)
     assert not script.tasks[0].free_V.any()
     assert (script.tasks[0].V == V).all()
