@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -77,19 +78,17 @@ def options_for(
     goes on to `MOST_POINTS`.
     """
     report = progress or (lambda stage, share: None)
+    options = partial(
+        Options, starts=starts, distortion=distortion, preferred=preferred, seed=seed, progress=report
+    )
     if trainer == "lm":
         begin = LMOptions(tolerance=1e-4)
         finish = LMOptions(stiffness=(0.0,), tolerance=1e-2, damping=1e-8)
-        return Options(
+        return options(
             trainer=lambda task: train_lm(task, begin),
             agreement=Agreement(),
             start_points=(16, 40),
             finish=lambda task: train_lm(task, finish),
-            starts=starts,
-            distortion=distortion,
-            preferred=preferred,
-            seed=seed,
-            progress=report,
         )
     from neurocal_cli.training.backprop import BackpropOptions, train_backprop
 
@@ -103,15 +102,10 @@ def options_for(
         gentle = replace(rates, rate_weights=0.4 * rates.rate_weights, beta=10.0, a=a, resting_gamma=True)
         return train_backprop(task, gentle, lambda share: report("training with orthogonality", share))
 
-    return Options(
+    return options(
         trainer=train,
         agreement=Agreement(0.02, 1e-4),
         start_points=(MOST_POINTS, MOST_POINTS),
         finish=None,
-        starts=starts,
         constrained=constrained,
-        distortion=distortion,
-        preferred=preferred,
-        seed=seed,
-        progress=report,
     )

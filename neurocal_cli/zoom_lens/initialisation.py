@@ -109,18 +109,14 @@ def without(
     lens: LensPoints, static: StaticFit, keep: NDArray[np.bool_], model: str, options: FitOptions
 ) -> tuple[LensPoints, PixelData, StaticFit]:
     """The data of the settings to keep (S,). Nothing is calibrated again."""
-    views = keep[lens.view_setting]
-    rest = lens.select(keep)
+    rest, views = lens.select(keep), keep[lens.view_setting]
     check_settings(rest.n_settings, len(rest.controls), lens.points.source)
-    number = {name: k for k, name in enumerate(lens.points.view_names)}
-    order = [number[name] for name in rest.points.view_names]
-    assert views[order].all()
     part = replace(
         static,
         local=static.local[keep],
         theta=static.theta[keep],
-        R=static.R[order],
-        t=static.t[order],
+        R=static.R[views],
+        t=static.t[views],
         good=static.good[keep],
     )
     return rest, PixelData.of(rest, options.still, model, options.free_theta), part
