@@ -85,7 +85,7 @@ def test_starts_end_at_the_limit_and_the_record_says_how_many_agreed() -> None:
 def test_points_on_both_sides_of_the_camera_lose_to_any_that_are_not() -> None:
     learnt = run(Script([[0.1, 0.1, 4.0, 4.0, 9.0, 9.0]], behind=((0, 0), (0, 1))))
     assert learnt.starts.tolist() == [6]
-    assert learnt.in_front.tolist() == [True]
+    assert learnt.V[0, 0, 0] == 2  # the first with all points on one side
     assert learnt.rms[0] == pytest.approx(np.sqrt(2 * 4 / N))
 
 

@@ -323,7 +323,10 @@ def test_alternating_ends_where_joint_training_ends() -> None:
     H = tables.normal.H
     nets, *_ = fit_committee(x, data.names, tables.local, H, 0.0225, rng, budget, lambda share: None)
     arguments = (data, x, nets, tables.constants, 0.0225, np.zeros(5))
-    together, turns = train_joint(*arguments), train_joint(*arguments, descend=take_turns)
+    together, turns = (
+        train_joint(JointLearner(*arguments), descend, lambda share: None)
+        for descend in (JointLearner.descend, take_turns)
+    )
     probe = np.random.default_rng(9).uniform(-1, 1, (20, 2))
     ends = [joint.nets.local(probe) for joint in (together, turns)]
     # The two differ by far less than they move: alpha by less than a hundredth of a percent.

@@ -25,7 +25,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.methods import calibrate
-from neurocal_cli.network import Patterns, output, random_weights
+from neurocal_cli.network import output, random_weights
 from neurocal_cli.points import Correspondences
 from neurocal_cli.processes import work_through
 from neurocal_cli.training import Task
@@ -182,12 +182,8 @@ def _one_start(seed: int, number: int, rates: tuple[float, float]) -> tuple[floa
     depth = output(trained.W, trained.V, patterns.inputs)[0, :, 2]
     good = (
         trained.settled[0]
-        and patterns.rms(trained.loss)[0] <= _SAME * _best(patterns, rng)
+        and patterns.rms(trained.loss)[0]
+        <= _SAME * learn(patterns, options_for("lm", 20, 0).trainer, rng, 20).rms[0]
         and depth.min() * depth.max() > 0
     )
     return float(good), float(trained.iterations[0])
-
-
-def _best(patterns: Patterns, rng: np.random.Generator) -> float:
-    """Lowest error (5)."""
-    return float(learn(patterns, options_for("lm", 20, 0).trainer, rng, 20).rms[0])

@@ -45,8 +45,6 @@ class Learnt:
         Number of starts, and number of those that ended at the best loss.
     iterations : int
         Of all the starts together.
-    in_front : (K,) bool array
-        Whether all points are on one side of the camera.
     curve : (J,) array
         Rms error of the best start of the first view along its training.
     """
@@ -57,7 +55,6 @@ class Learnt:
     starts: NDArray[np.int64]
     agreed: NDArray[np.int64]
     iterations: int
-    in_front: NDArray[np.bool_]
     curve: Array
 
     @property
@@ -179,6 +176,4 @@ class _BestStarts:
 
     def result(self) -> Learnt:
         """The best start of each view."""
-        return Learnt(
-            self.W, self.V, self.rms, self.starts, self.agreed, self.iterations, self.in_front, self.curve
-        )
+        return Learnt(self.W, self.V, self.rms, self.starts, self.agreed, self.iterations, self.curve)

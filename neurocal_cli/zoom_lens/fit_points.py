@@ -24,7 +24,7 @@ from neurocal_cli.zoom_lens.initialisation import (
     may_reject,
     without,
 )
-from neurocal_cli.zoom_lens.joint_training import Joint, train_joint
+from neurocal_cli.zoom_lens.joint_training import Joint, JointLearner, train_joint
 from neurocal_cli.zoom_lens.outlier_settings import contradiction, most_suspect
 from neurocal_cli.zoom_lens.result import assemble, provisional
 from neurocal_cli.zoom_lens.settings import LensPoints
@@ -159,7 +159,7 @@ def _trained(start: CalibratedSettings, options: FitOptions) -> list[Joint]:
         options.budget,
         lambda share: options.report("fitting a network to each parameter", share),
     )
-    descend = None if options.training == "joint" else take_turns
+    descend = JointLearner.descend if options.training == "joint" else take_turns
     # Every network fits the scatter of a lens that does not repeat its positions. A poor network alone fits
     # more, so the smallest value counts.
     scatter = np.min([nets.local_scatter(start.tables.local) for nets in members], axis=0)
@@ -169,8 +169,8 @@ def _trained(start: CalibratedSettings, options: FitOptions) -> list[Joint]:
         def report_share(share: float, k: int = k) -> None:
             options.report("all networks together", (k + share) / len(members))
 
-        arguments = start.data, x, nets, start.tables.constants, start.variance, scatter
-        joints.append(train_joint(*arguments, report_share, descend))
+        learner = JointLearner(start.data, x, nets, start.tables.constants, start.variance, scatter)
+        joints.append(train_joint(learner, descend, report_share))
     joints = [joint for joint in joints if np.isfinite(joint.evidence)]
     if not joints:
         raise DegenerateGeometryError(

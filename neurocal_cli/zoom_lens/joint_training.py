@@ -61,39 +61,21 @@ class Joint:
 
 
 def train_joint(
-    data: PixelData,
-    x: Array,
-    nets: LensNets,
-    constants: Constants,
-    variance: float,
-    scatter: Array,
-    report: Callable[[float], None] | None = None,
-    descend: Callable[[JointLearner], float] | None = None,
+    learner: JointLearner, descend: Callable[[JointLearner], float], report: Callable[[float], None]
 ) -> Joint:
     """Minimise E, starting from networks that were fitted one at a time.
 
     Parameters
     ----------
-    data : PixelData
-    x : (S, D) array
-        Scaled controls of the settings.
-    nets : LensNets
-    constants : Constants
-    variance : float [px^2]
-        Of the noise of one coordinate.
-    scatter : (L,) array
-        Variance of each local parameter from setting to setting.
-    report : callable, optional
+    learner : JointLearner
+    descend : callable
+        Lowers 2 E on the present normal matrices and returns it: `JointLearner.descend`, or `take_turns`.
+    report : callable
         Called with the share that is done.
-    descend : callable, optional
-        Lowers 2 E on the present normal matrices and returns it; default `JointLearner.descend`.
     """
-    descend = descend or JointLearner.descend
-    learner = JointLearner(data, x, nets, constants, variance, scatter)
     converged = False
     for round_ in range(_ROUNDS):
-        if report is not None:
-            report(round_ / _ROUNDS)
+        report(round_ / _ROUNDS)
         before = learner.linearise()
         if round_ < _PRIOR_ROUNDS:
             learner.update_priors()
@@ -106,7 +88,20 @@ def train_joint(
 
 
 class JointLearner:
-    """Networks and constants in training, with the normal matrices of the settings."""
+    """Networks and constants in training, with the normal matrices of the settings.
+
+    Parameters
+    ----------
+    data : PixelData
+    x : (S, D) array
+        Scaled controls of the settings.
+    nets : LensNets
+    constants : Constants
+    variance : float [px^2]
+        Of the noise of one coordinate.
+    scatter : (L,) array
+        Variance of each local parameter from setting to setting.
+    """
 
     def __init__(
         self, data: PixelData, x: Array, nets: LensNets, constants: Constants, variance: float, scatter: Array
