@@ -180,10 +180,8 @@ def _one_start(seed: int, number: int, rates: tuple[float, float]) -> tuple[floa
     options = BackpropOptions(rate_weights=rates[0], rate_gamma=rates[1], halvings=0)
     trained = train_backprop(Task(patterns, W, V, *free), options)
     depth = output(trained.W, trained.V, patterns.inputs)[0, :, 2]
-    good = (
-        trained.settled[0]
-        and patterns.rms(trained.loss)[0]
-        <= _SAME * learn(patterns, options_for("lm", 20, 0).trainer, rng, 20).rms[0]
-        and depth.min() * depth.max() > 0
-    )
+    good = trained.settled[0] and depth.min() * depth.max() > 0
+    if good:
+        best = learn(patterns, options_for("lm", 20, 0).trainer, rng, 20).rms[0]
+        good = patterns.rms(trained.loss)[0] <= _SAME * best
     return float(good), float(trained.iterations[0])
