@@ -31,7 +31,7 @@ from neurocal_cli.network import (
 )
 from neurocal_cli.training import backprop_blocks as blocks
 from neurocal_cli.training import compile  # noqa: A004
-from neurocal_cli.training.backprop import BackpropOptions, train_backprop
+from neurocal_cli.training.backprop import BackpropOptions, _Run, train_backprop
 from neurocal_cli.training.task import Task
 
 UPPER = np.triu(np.ones((3, 3), dtype=bool)) & (np.arange(9).reshape(3, 3) < 8)
@@ -299,18 +299,27 @@ def test_a_flat_board_needs_three_inputs_only(method: Method) -> None:
     np.testing.assert_allclose(trained.product / trained.product[:, 2:, 2:], np.tile(H, (4, 1, 1)), atol=1e-7)
 
 
+def finished(task: Task, options: BackpropOptions) -> _Run:
+    """A training to its end, with how often each network was restarted, and the share of its rates left."""
+    training = _Run(task, options)
+    while training.active.any() and training.epoch < options.epochs:
+        training.advance()
+    return training
+
+
 def test_the_result_belongs_together(method: Method) -> None:
     scene = random_scene(0, points=60)
     task = scene.task(range(2))
-    trained = train_backprop(task, BackpropOptions(method=method))
+    run = finished(task, BackpropOptions(method=method))
+    trained = run.trained()
     np.testing.assert_array_equal(trained.loss, e_2d(trained.W, trained.V, trained.gamma, task.patterns))
     np.testing.assert_allclose(trained.curve[-1], trained.loss, rtol=1e-9)
     start = e_2d(task.W, task.V, np.ones((2, 60)), task.patterns)
     np.testing.assert_allclose(trained.curve[0], start, rtol=1e-12)
     resting = optimal_gamma(output(trained.W, trained.V, task.patterns.inputs), task.patterns.targets)
     np.testing.assert_allclose(trained.gamma, resting, rtol=1e-3)
-    assert trained.restarts.tolist() == [0, 0]
-    assert (trained.rate_weights < 0.05).all()
+    assert run.restarts.tolist() == [0, 0]
+    assert (run.scale < 1).all()
 
 
 def test_the_curve_stays_short_over_many_epochs() -> None:
@@ -389,8 +398,9 @@ CONTINUED = BackpropOptions(rate_weights=0.02, beta=10.0, resting_gamma=True)
 def test_the_constrained_rule_stays_at_an_optimum_where_it_starts(problem: int, method: Method) -> None:
     task, a = table_1().constrained(problem)
     options = replace(CONTINUED, epochs=300, a=a, floor=0.0, tolerance=0.0, method=method)
-    trained = train_backprop(task, options)
-    assert trained.restarts.tolist() == [0]
+    run = finished(task, options)
+    trained = run.trained()
+    assert run.restarts.tolist() == [0]
     np.testing.assert_allclose(trained.W, task.W, rtol=0, atol=1e-12)
     np.testing.assert_allclose(trained.V, task.V, rtol=0, atol=1e-12)
 
@@ -423,27 +433,28 @@ def test_type_4_finds_the_intrinsic_parameters_for_a_known_pose(method: Method) 
 def test_divergence_restarts_at_half_the_rates() -> None:
     pytest.importorskip("numba")
     task = random_scene(0, points=40).task(range(3))
-    trained = train_backprop(task, BackpropOptions(rate_weights=0.8))
-    usual = train_backprop(task)
-    assert (trained.restarts > 0).all()
+    run = finished(task, BackpropOptions(rate_weights=0.8))
+    trained, usual = run.trained(), train_backprop(task)
+    assert (run.restarts > 0).all()
     assert np.isfinite(trained.curve).all()
     np.testing.assert_allclose(trained.loss, usual.loss, rtol=0.02)
 
 
 def test_blocks_do_not_diverge_by_the_rate_of_the_weights() -> None:
     task = random_scene(0, points=40).task(range(3))
-    trained = train_backprop(task, BackpropOptions(rate_weights=50.0, method="blocks"))
+    run = finished(task, BackpropOptions(rate_weights=50.0, method="blocks"))
     usual = train_backprop(task, BackpropOptions(method="blocks"))
-    assert trained.restarts.tolist() == [0, 0, 0]
-    np.testing.assert_allclose(trained.loss, usual.loss, rtol=0.02)
+    assert run.restarts.tolist() == [0, 0, 0]
+    np.testing.assert_allclose(run.trained().loss, usual.loss, rtol=0.02)
 
 
 def test_hopeless_rates_return_the_initial_weights_unsettled(method: Method) -> None:
     task = random_scene(0, points=40).task(range(2))
-    trained = train_backprop(task, BackpropOptions(rate_gamma=1e9, halvings=2, method=method))
+    run = finished(task, BackpropOptions(rate_gamma=1e9, halvings=2, method=method))
+    trained = run.trained()
     np.testing.assert_array_equal(trained.W, task.W)
     np.testing.assert_array_equal(trained.V, task.V)
-    assert trained.restarts.tolist() == [3, 3]
+    assert run.restarts.tolist() == [3, 3]
     assert not trained.settled.any()
     assert np.isfinite(trained.loss).all()
     assert (trained.gamma == 1).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from neurocal_cli import Calibration, Camera, Intrinsics, Pose, calibrate, write
 from neurocal_cli.camera.distortion import Distortion
 from neurocal_cli.errors import InputError
 from neurocal_cli.io.result_files import lean_calibration
-from neurocal_cli.planning.advice import advise, candidates, uncertainty_with
+from neurocal_cli.planning.advice import Candidate, _Known, _target, advise, candidates
 from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
 from neurocal_cli.planning.report import advice_lines
 
@@ -43,6 +44,13 @@ def advised_over_random(seed: int) -> float:
         gains.append(before - after)
     assert before == pytest.approx(advice.before)
     return (advice.before - advice.after[-1]) / float(np.mean(gains))
+
+
+def uncertainty_with(calibration: Calibration, views: Sequence[Candidate]) -> tuple[float, float]:
+    """Worst standard deviation of a projected pixel now, and with some more views [px]; see `advise`."""
+    known, world = _Known.of(calibration), _target(calibration)
+    told = [view_information(known.camera, known.free, view.pose, world) for view in views]
+    return known.worst(), known.worst(np.sum(told, axis=0))
 
 
 def test_advised_views_are_twice_as_good_as_random_ones() -> None:

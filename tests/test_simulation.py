@@ -29,9 +29,9 @@ from neurocal_cli.simulation.scenes import (
     paper_scene,
     random_poses,
     scene_of,
+    true_calibration,
 )
 from neurocal_cli.simulation.starts import can_start, single_start, study_starts
-from neurocal_cli.simulation.truth import true_calibration
 
 METHODS = ("neuro", "nonlinear", "linear", "tsai")
 LENS = Camera(Intrinsics(700.0, 705.0, 320.0, 236.0), Distortion("k1", [-0.2]), (640, 480))

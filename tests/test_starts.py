@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from neurocal_cli.geometry import Array
 from neurocal_cli.network import Patterns
 from neurocal_cli.training import Task, Trained
-from neurocal_cli.training.starts import Agreement, FixedWeights, Learnt, learn
+from neurocal_cli.training.starts import Agreement, Learnt, learn
 
 K, N = 3, 8
 
@@ -85,7 +85,7 @@ def test_starts_end_at_the_limit_and_the_record_says_how_many_agreed() -> None:
 def test_points_on_both_sides_of_the_camera_lose_to_any_that_are_not() -> None:
     learnt = run(Script([[0.1, 0.1, 4.0, 4.0, 9.0, 9.0]], behind=((0, 0), (0, 1))))
     assert learnt.starts.tolist() == [6]
-    assert learnt.in_front.tolist() == [True]
+    assert learnt.V[0, 0, 0] == 2  # the first with all points on one side
     assert learnt.rms[0] == pytest.approx(np.sqrt(2 * 4 / N))
 
 
@@ -115,7 +115,7 @@ def test_given_weights_are_the_same_in_every_start_and_not_free() -> None:
     W = np.full((3, 3), np.nan)
     W[:2, 2] = 0.25
     script = Script([[1.0, 2.0, 3.0, 3.0, 3.0, 1.0]])
-    run(script, fixed=FixedWeights(W=W))
+    run(script, W=W)
     for task in script.tasks:
         assert (task.W[:, :2, 2] == 0.25).all()
         assert task.free_W.tolist() == np.isnan(W).tolist()
@@ -127,6 +127,6 @@ def test_given_weights_are_the_same_in_every_start_and_not_free() -> None:
 def test_a_given_pose_is_not_free() -> None:
     V = np.random.default_rng(0).normal(size=(1, 3, 4))
     script = Script([[1.0, 1.0]])
-    run(script, fixed=FixedWeights(V=V))
+    run(script, V=V)
     assert not script.tasks[0].free_V.any()
     assert (script.tasks[0].V == V).all()

@@ -23,7 +23,6 @@ from neurocal_cli.zoom_lens.fit_cameras import LensCameras, fit_lens_cameras
 from neurocal_cli.zoom_lens.fit_points import fit_lens
 from neurocal_cli.zoom_lens.interpolation import (
     grid_axes,
-    lookup_matrix,
     monomials,
     powers_up_to,
     spline_matrix,
@@ -345,9 +344,9 @@ def test_interpolation_is_that_of_an_independent_library() -> None:
     axes = grid_axes(nodes)
     assert axes is not None
     linear = RegularGridInterpolator((z, f), y.reshape(7, 5))(at)
-    np.testing.assert_allclose(lookup_matrix(axes, at) @ y, linear, atol=1e-12)
+    np.testing.assert_allclose(spline_matrix(axes, at, 1) @ y, linear, atol=1e-12)
     spline = RectBivariateSpline(z, f, y.reshape(7, 5), kx=3, ky=3).ev(*at.T)
-    np.testing.assert_allclose(spline_matrix(axes, at) @ y, spline, atol=1e-6 * np.abs(spline).max())
+    np.testing.assert_allclose(spline_matrix(axes, at, 3) @ y, spline, atol=1e-6 * np.abs(spline).max())
     np.testing.assert_allclose(thin_plate_matrix(nodes, at) @ y, RBFInterpolator(nodes, y)(at), atol=1e-6)
     assert grid_axes(nodes[1:]) is None
     powers = powers_up_to(nodes, 6)
@@ -413,7 +412,7 @@ def one_at_a_time(lens: ZoomLens, x: np.ndarray) -> np.ndarray:
     table, rng = lens.static, np.random.default_rng(0)
     settings = lens.scaled(lens.settings)
     members = fit_committee(
-        settings, lens.names, table.local, table.normal, lens.variance, rng, Budget(), lambda share: None
+        settings, lens.names, table.local, table.normal.H, lens.variance, rng, Budget(), lambda share: None
     )
     return np.mean([nets.local(x) for nets in members], axis=0)
 

@@ -262,20 +262,20 @@ def learner(scale: str) -> JointLearner:
 def test_the_joint_step_goes_down_the_derivative_of_the_joint_error(scale: str) -> None:
     state = learner(scale)
     state.linearise()
-    _, downhill = state.system()
+    _, downhill = state.error.system(state.nets, state.shared)
     P = len(state.nets.weights)
     rng = np.random.default_rng(7)
     for k in rng.choice(P, 25, replace=False):
         step = np.zeros(P)
         step[k] = 1e-5
-        there, back = (state.cost(state.nets.moved(sign * step), state.shared) for sign in (1, -1))
+        there, back = (state.error.cost(state.nets.moved(sign * step), state.shared) for sign in (1, -1))
         assert -0.5 * (there - back) / 2e-5 == pytest.approx(
             downhill[k], rel=1e-4, abs=1e-6 * np.abs(downhill[:P]).max()
         )
     for q, size in enumerate((1e-7, 1e-7, 1e-7, 1e-7, 1e-4, 1e-4)):
         step = np.zeros(6)
         step[q] = size
-        there, back = (state.cost(state.nets, sign * step) for sign in (1, -1))
+        there, back = (state.error.cost(state.nets, sign * step) for sign in (1, -1))
         assert -0.5 * (there - back) / (2 * size) == pytest.approx(downhill[P + q], rel=1e-4)
 
 
@@ -308,7 +308,7 @@ def test_tables_reach_the_truth_within_their_covariance() -> None:
     from support.zoom_laws import NAMES, truth
 
     true = np.column_stack([truth("c", lens.settings)[name] for name in NAMES])
-    covariance, _ = local_covariance(tables.normal, 5, variance)
+    covariance = local_covariance(tables.normal, 5, variance)
     z = (tables.local - true) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     assert np.abs(z).max() < 5
 
@@ -320,11 +320,13 @@ def test_alternating_ends_where_joint_training_ends() -> None:
     x = scaled_controls(lens.settings, lens.settings.min(axis=0), lens.settings.max(axis=0))
     budget = Budget(topologies=((1, 1),), starts=4, best=2, members=1, schedule=Schedule(150, 30, 80))
     rng = np.random.default_rng(0)
-    nets = fit_committee(x, data.names, tables.local, tables.normal, 0.0225, rng, budget, lambda share: None)[
-        0
-    ]
+    H = tables.normal.H
+    nets, *_ = fit_committee(x, data.names, tables.local, H, 0.0225, rng, budget, lambda share: None)
     arguments = (data, x, nets, tables.constants, 0.0225, np.zeros(5))
-    together, turns = train_joint(*arguments), train_joint(*arguments, descend=take_turns)
+    together, turns = (
+        train_joint(JointLearner(*arguments), descend, lambda share: None)
+        for descend in (JointLearner.descend, take_turns)
+    )
     probe = np.random.default_rng(9).uniform(-1, 1, (20, 2))
     ends = [joint.nets.local(probe) for joint in (together, turns)]
     # The two differ by far less than they move: alpha by less than a hundredth of a percent.

@@ -18,32 +18,6 @@ _STEP = 1.5e-8  # of differences
 
 
 @frozen_dataclass(eq=False)
-class Parts:
-    """Which residuals an unknown moves: all, or those of one view.
-
-    Attributes
-    ----------
-    of_residual : (m,) int array
-        View of each residual.
-    of_unknown : (n,) int array
-        View of each unknown, -1 for one of all views.
-    turn : (n,) int array
-        Unknowns of different views with the same number are varied at once.
-    """
-
-    of_residual: NDArray[np.intp]
-    of_unknown: NDArray[np.intp]
-    turn: NDArray[np.intp]
-
-    @classmethod
-    def of_views(cls, of_residual: NDArray[np.intp], shared: int, own: int, views: int) -> Parts:
-        """The unknowns that are shared, then each view's own."""
-        of_unknown = np.concatenate([np.full(shared, -1), np.repeat(np.arange(views), own)])
-        turn = np.concatenate([np.arange(shared), shared + np.tile(np.arange(own), views)])
-        return cls(of_residual, of_unknown, turn)
-
-
-@frozen_dataclass(eq=False)
 class Least:
     """A minimum.
 
@@ -59,7 +33,12 @@ class Least:
     converged: bool
 
 
-def least_squares(residuals: Callable[[Array], Array], start: Array, parts: Parts | None = None) -> Least:
+def least_squares(
+    residuals: Callable[[Array], Array],
+    start: Array,
+    view: NDArray[np.intp] | None = None,
+    shared: int = 0,
+) -> Least:
     """Minimise a sum of squares by Levenberg-Marquardt or, for many unknowns of views, by a trust region.
 
     Parameters
@@ -67,15 +46,17 @@ def least_squares(residuals: Callable[[Array], Array], start: Array, parts: Part
     residuals : callable
         From unknowns (n,) to residuals (m,).
     start : (n,) array
-    parts : Parts, optional
-        None: every unknown moves every residual.
+    view : (m,) int array, optional
+        View of each residual. None: every unknown moves every residual.
+    shared : int
+        With `view`: the first unknowns, which all views share; the others are each view's own, in order.
     """
     from scipy.optimize import least_squares as minimise
 
     def finite(x: Array) -> Array:
         return np.nan_to_num(residuals(x), nan=1e10, posinf=1e10, neginf=-1e10)
 
-    sparse = parts is not None and len(start) > _DENSE
+    sparse = view is not None and len(start) > _DENSE
     options: dict[str, Any] = {"method": "lm"}
     if sparse:
         options = {"method": "trf", "tr_solver": "lsmr"}
@@ -84,7 +65,7 @@ def least_squares(residuals: Callable[[Array], Array], start: Array, parts: Part
         found = minimise(
             finite,
             start,
-            jac=lambda x: _differences(finite, x, parts, sparse),
+            jac=lambda x: _differences(finite, x, view, shared, sparse),
             x_scale="jac",
             xtol=_TOLERANCE,
             ftol=_TOLERANCE,
@@ -95,25 +76,27 @@ def least_squares(residuals: Callable[[Array], Array], start: Array, parts: Part
     return Least(found.x, int(found.njev or found.nfev), bool(found.status > 0))
 
 
-def _differences(residuals: Callable[[Array], Array], x: Array, parts: Parts | None, sparse: bool) -> Any:
-    """Derivatives (m, n) by differences."""
+def _differences(
+    residuals: Callable[[Array], Array], x: Array, view: NDArray[np.intp] | None, shared: int, sparse: bool
+) -> Any:
+    """Derivatives (m, n) by differences; the unknowns of different views are varied at once."""
     at = residuals(x)
-    turn = np.arange(len(x)) if parts is None else parts.turn
+    if view is None:
+        view, shared = np.zeros(len(at), dtype=np.intp), len(x)
+    own = np.arange(shared, len(x)).reshape(int(view.max()) + 1, -1)
     steps = _STEP * np.maximum(np.abs(x), 1.0)
-    quotients = np.stack(
-        [residuals(np.where(turn == k, x + steps, x)) - at for k in range(int(turn.max()) + 1)],
-        axis=1,
-    )
-    if parts is None:
-        return quotients / steps
-    if not sparse:
-        mine = (parts.of_unknown < 0) | (parts.of_unknown == parts.of_residual[:, None])
-        return np.where(mine, quotients[:, turn], 0.0) / steps
-    from scipy.sparse import csr_matrix
-
-    shared = np.flatnonzero(parts.of_unknown < 0)
-    own = np.flatnonzero(parts.of_unknown >= 0).reshape(int(parts.of_residual.max()) + 1, -1)
-    columns = np.column_stack([np.tile(shared, (len(at), 1)), own[parts.of_residual]])
-    values = quotients[:, turn[columns[0]]] / steps[columns]
+    differences = []
+    for together in (*np.arange(shared)[:, None], *own.T):
+        moved = x.copy()
+        moved[together] += steps[together]
+        differences.append(residuals(moved) - at)
+    columns = np.column_stack([np.tile(np.arange(shared), (len(at), 1)), own[view]])
+    values = np.stack(differences, axis=1) / steps[columns]
     rows = np.repeat(np.arange(len(at)), columns.shape[1])
-    return csr_matrix((values.ravel(), (rows, columns.ravel())), shape=(len(at), len(x)))
+    if sparse:
+        from scipy.sparse import csr_matrix
+
+        return csr_matrix((values.ravel(), (rows, columns.ravel())), shape=(len(at), len(x)))
+    J = np.zeros((len(at), len(x)))
+    J[rows, columns.ravel()] = values.ravel()
+    return J

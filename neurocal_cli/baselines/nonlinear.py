@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.baselines.found import Found, as_seen
-from neurocal_cli.baselines.least_squares import Parts, least_squares
+from neurocal_cli.baselines.least_squares import least_squares
 from neurocal_cli.baselines.linear import linear_state
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, residuals
@@ -38,30 +38,19 @@ def descend(problem: Problem, start: CameraState) -> Found:
     model = problem.distortion.model
     if problem.free_distortion and start.model != model:
         start = replace(start, model=model, k=pinhole_coefficients(model))
-    free = problem.free_camera if problem.free_distortion else problem.free
-    unknowns = _Unknowns(start, np.flatnonzero(free), problem.free_poses)
-    error = whitened_residuals(problem.views)
-    parts = None
-    if problem.views.n_views > 1 and problem.free_poses:
-        parts = Parts.of_views(view_of_residual(problem.views), len(unknowns.free), 6, problem.views.n_views)
-    least = least_squares(lambda x: error(unknowns.state(x)), unknowns.zero, parts)
-    return Found(problem, unknowns.state(least.x), True, least.iterations, least.converged)
+    free = np.flatnonzero(problem.free_camera if problem.free_distortion else problem.free)
+    error, V, F = whitened_residuals(problem.views), len(start.R), len(free)
 
+    def state(x: Array) -> CameraState:
+        """At steps from the start: of the camera's free numbers, then of each pose's."""
+        by_camera = np.zeros((1, 5 + len(start.k)))
+        by_camera[0, free] = x[:F]
+        by_pose = x[F:].reshape(V, 6) if problem.free_poses else np.zeros((V, 6))
+        return start.moved(by_camera, by_pose)
 
-class _Unknowns:
-    """A state as a vector of what is to be added to the start: the camera's numbers, then each pose's."""
-
-    def __init__(self, start: CameraState, free: NDArray[np.intp], free_poses: bool) -> None:
-        self.start, self.free, self.free_poses = start, free, free_poses
-        self.width = 5 + len(start.k)
-        self.zero = np.zeros(len(free) + (6 * len(start.R) if free_poses else 0))
-
-    def state(self, x: Array) -> CameraState:
-        """The state at (n,) steps from the start, in the order of the free unknowns."""
-        by_camera = np.zeros((1, self.width))
-        by_camera[0, self.free] = x[: len(self.free)]
-        by_pose = x[len(self.free) :].reshape(-1, 6) if self.free_poses else np.zeros((len(self.start.R), 6))
-        return self.start.moved(by_camera, by_pose)
+    zero = np.zeros(F + 6 * V * problem.free_poses)
+    least = least_squares(lambda x: error(state(x)), zero, view_of_residual(problem.views), F)
+    return Found(problem, state(least.x), True, least.iterations, least.converged)
 
 
 def whitened_residuals(views: Views) -> Callable[[CameraState], Array]:

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.baselines.constrained_least_squares import smallest
 from neurocal_cli.baselines.found import Found, as_seen
-from neurocal_cli.baselines.least_squares import Least, Parts, least_squares
+from neurocal_cli.baselines.least_squares import Least, least_squares
 from neurocal_cli.baselines.linear import whole_groups
 from neurocal_cli.baselines.nonlinear import view_of_residual, whitened_residuals
 from neurocal_cli.bundle_adjustment.observability import check_points
@@ -262,7 +262,6 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Least]:
     V, free_s, free_k = views.n_views, known is None, model == "k1"
     start = np.concatenate([[np.log(f)], [0.0] * free_s, [0.0] * free_k, depth / f])
     error = whitened_residuals(views)
-    parts = Parts.of_views(view_of_residual(views), len(start) - V, 1, V)
 
     def state(p: Array) -> CameraState:
         f = np.exp(p[0])
@@ -272,5 +271,5 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Least]:
         entries = np.array([[aspect * f, 0.0, f, *centre]])
         return CameraState(entries, R, t, model, p[1 + free_s : 2 + free_s] if free_k else np.zeros(0))
 
-    least = least_squares(lambda p: error(state(p)), start, parts)
+    least = least_squares(lambda p: error(state(p)), start, view_of_residual(views), len(start) - V)
     return state(least.x), least

@@ -258,7 +258,7 @@ def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: in
     from neurocal_cli.io.board_yaml import write_board
     from neurocal_cli.io.calibration_yaml import write_calibration
     from neurocal_cli.io.points_csv import write_points
-    from neurocal_cli.simulation.truth import true_calibration
+    from neurocal_cli.simulation.scenes import true_calibration
 
     os.makedirs(folder, exist_ok=True)
     write_calibration(true_calibration(scene), os.path.join(folder, "truth.yaml"))

@@ -172,12 +172,12 @@ class _Search:
         seen = _SEEN[self.flat]
         key = self.rng.random((len(which), _STARTS, real.shape[1])) + 2.0 * ~real[:, None]
         slots = np.argpartition(key, seen, axis=2)[..., :seen].reshape(len(which), -1)
-        chosen = Patterns(
+        chosen = (
             np.take_along_axis(self.patterns.inputs[which], slots[..., None], axis=1),
             np.take_along_axis(self.patterns.targets[which], slots[..., None], axis=1),
             np.ones(slots.shape),
         )
-        few = Patterns(*(a.reshape(len(which) * _STARTS, seen, *a.shape[2:]) for a in _arrays(chosen)))
+        few = Patterns(*(a.reshape(len(which) * _STARTS, seen, *a.shape[2:]) for a in chosen))
         W, V = random_weights(self.rng, len(few.weights), few.n_inputs)
         product = _trained(few, W @ V, LMOptions(tolerance=1e-4, max_iterations=40))
         return product.reshape(len(which), _STARTS, 3, few.n_inputs)
@@ -252,10 +252,6 @@ class _Search:
             hopeless[k] = near.mean() <= _MAJORITY or self.scale[k] > _TIGHT * extent
             kept[rows] = near
         return hopeless
-
-
-def _arrays(patterns: Patterns) -> tuple[Array, Array, Array]:
-    return patterns.inputs, patterns.targets, patterns.weights
 
 
 def _trained(patterns: Patterns, product: Array, options: LMOptions) -> Array:

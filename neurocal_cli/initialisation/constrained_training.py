@@ -13,7 +13,7 @@ from neurocal_cli.bundle_adjustment.problem import Problem, intrinsic_matrix
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.geometry import nearest_rotation
-from neurocal_cli.initialisation.options import Options
+from neurocal_cli.initialisation.options import MOST_POINTS, Options
 from neurocal_cli.training import Task
 
 
@@ -34,7 +34,7 @@ def train_constrained(problem: Problem, options: Options, state: CameraState) ->
     V = np.concatenate([state.R, state.t[:, :, None]], axis=2) / depth
     free_W = np.zeros((3, 3), dtype=bool)
     free_W[ENTRIES] = problem.free
-    patterns = views.patterns(np.array([0]), False, options.finish_points)
+    patterns = views.patterns(np.array([0]), False, MOST_POINTS)
     task = Task(patterns, intrinsic_matrix(state.entries[0])[None], V, free_W, np.ones((3, 4), dtype=bool))
     trained = options.constrained(task, 1.0 / depth**2)
     entries, R = trained.W[0][ENTRIES], nearest_rotation(trained.V[:, :, :3])

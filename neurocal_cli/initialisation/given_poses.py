@@ -13,9 +13,9 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.projection import ENTRIES
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.options import Options
+from neurocal_cli.initialisation.options import MOST_POINTS, Options
 from neurocal_cli.network import Patterns
-from neurocal_cli.training.starts import FixedWeights, learn
+from neurocal_cli.training.starts import learn
 
 # With a wide lens: the depth of a point that trains the network, as a share of its distance (60 degrees from
 # the axis), and the fewest of them.
@@ -35,7 +35,7 @@ def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generat
     wide = problem.distortion.wide
     if not wide:
         _check_in_front(views, R, t)
-    rows = views.patterns(np.arange(views.n_views), False, options.finish_points, rng)
+    rows = views.patterns(np.arange(views.n_views), False, MOST_POINTS, rng)
     # Hidden outputs Y = V Z, eq. (6): the camera's coordinates.
     hidden = rows.inputs @ np.swapaxes(np.concatenate([R, t[..., None]], axis=2), 1, 2)
     # Each view has its own scale; gamma absorbs it, and starts at 1: depths should be about 1,
@@ -56,8 +56,7 @@ def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generat
     W = intrinsic_matrix(given)
     row, column = ENTRIES
     W[row[problem.free], column[problem.free]] = np.nan
-    fixed = FixedWeights(W, np.eye(3)[None])
-    learnt = learn(patterns, options.trainer, rng, options.starts, fixed, options.agreement)
+    learnt = learn(patterns, options.trainer, rng, options.starts, options.agreement, W=W, V=np.eye(3)[None])
     entries = np.where(problem.free, learnt.W[0][ENTRIES], given)[None]
     if (entries[0, [0, 2]] <= 0).any():
         raise DegenerateGeometryError(

@@ -101,7 +101,7 @@ class _Search:
         problem = self.problem
         every = np.ones(self.views.n_views, dtype=bool)
         groups, record = train_networks(problem, self.options, self.rng, every)
-        refuse_few_conditions(problem, self.options, groups)
+        refuse_few_conditions(problem, groups)
         first, *others = candidate_intrinsics(problem, groups, self.rng)
         best, record = self._constrained(cameras_from_products(problem, groups, first), record)
         for entries in others:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -13,6 +14,9 @@ from neurocal_cli.training.starts import Agreement
 
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions
+
+# Of each view, that a network sees: beyond it nothing changes but the time (tests/test_convergence.py).
+MOST_POINTS = 1024
 
 # Called with the name of a stage and the share of it that is done.
 Progress = Callable[[str, float], None]
@@ -31,9 +35,7 @@ class Options:
     start_points : (int, int)
         Points of each view that the starts see, for flat and for solid targets.
     finish : Trainer or None
-        Takes the best start on to more points; None when the starts saw them.
-    finish_points : int
-        Most points of each view that a network sees.
+        Takes the best start on to `MOST_POINTS`; None when the starts saw them.
     starts : int
         Most random starts for each network.
     constrained : callable or None
@@ -52,7 +54,6 @@ class Options:
     agreement: Agreement
     start_points: tuple[int, int]
     finish: Trainer | None
-    finish_points: int
     starts: int
     constrained: Callable[[Task, float], Trained] | None = None
     distortion: str = ""
@@ -74,24 +75,20 @@ def options_for(
     """Options of a trainer: "lm", Levenberg-Marquardt, or "backprop", the paper's learning rule.
 
     Starts see a few points of each view, as many as make their minimum that of all points; the best
-    goes on to at most 1024 of each view, beyond which nothing changes but the time
-    (tests/test_convergence.py).
+    goes on to `MOST_POINTS`.
     """
     report = progress or (lambda stage, share: None)
+    options = partial(
+        Options, starts=starts, distortion=distortion, preferred=preferred, seed=seed, progress=report
+    )
     if trainer == "lm":
         begin = LMOptions(tolerance=1e-4)
         finish = LMOptions(stiffness=(0.0,), tolerance=1e-2, damping=1e-8)
-        return Options(
+        return options(
             trainer=lambda task: train_lm(task, begin),
             agreement=Agreement(),
             start_points=(16, 40),
             finish=lambda task: train_lm(task, finish),
-            finish_points=1024,
-            starts=starts,
-            distortion=distortion,
-            preferred=preferred,
-            seed=seed,
-            progress=report,
         )
     from neurocal_cli.training.backprop import BackpropOptions, train_backprop
 
@@ -105,7 +102,10 @@ def options_for(
         gentle = replace(rates, rate_weights=0.4 * rates.rate_weights, beta=10.0, a=a, resting_gamma=True)
         return train_backprop(task, gentle, lambda share: report("training with orthogonality", share))
 
-    agreement = Agreement(0.02, 1e-4)
-    return Options(
-        train, agreement, (1024, 1024), None, 1024, starts, constrained, distortion, preferred, seed, report
+    return options(
+        trainer=train,
+        agreement=Agreement(0.02, 1e-4),
+        start_points=(MOST_POINTS, MOST_POINTS),
+        finish=None,
+        constrained=constrained,
     )

@@ -39,15 +39,12 @@ class SharedIntrinsics:
         W11, W12, W22, W13, W23 of each distinct minimum.
     loss : (C,) array
         Half the sum of squared conditions.
-    starts : int
-        Random starts used.
     agreed : int
-        How many of them ended at the best minimum.
+        How many random starts ended at the best minimum.
     """
 
     entries: Array
     loss: Array
-    starts: int
     agreed: int
 
 
@@ -86,7 +83,7 @@ def shared_intrinsics(
         gap = np.abs(p[n] - p[distinct]).max(axis=1).min()
         if np.isfinite(loss[n]) and gap > 1e-2:
             distinct.append(n)
-    return SharedIntrinsics(entries[distinct], loss[distinct], _STARTS, agreed)
+    return SharedIntrinsics(entries[distinct], loss[distinct], agreed)
 
 
 def _to_log(entries: Array) -> Array:

@@ -62,7 +62,7 @@ def radial_start(problem: Problem, options: Options) -> Solution | None:
     middle = middle_of_image(problem)
     reach = float(np.hypot(*(problem.points.pixels - middle).T).max())
     few = problem.with_points(problem.points.of_few_views(_VIEWS_THAT_TELL))
-    strength = _Search(_Radial(few, middle, reach), options).best_strength()
+    strength = _best_strength(_Radial(few, middle, reach), options.seed)
     best = None
     for pinhole in _pinholes(_Radial(problem, middle, reach).corrected(strength), middle):
         with suppress(DegenerateGeometryError):
@@ -94,40 +94,32 @@ def middle_of_image(problem: Problem) -> Array:
     return np.asarray(0.5 * (points.pixels.min(axis=0) + points.pixels.max(axis=0)))
 
 
-@frozen_dataclass(eq=False)
-class _Search:
-    """For the distortion with which the free networks fit best."""
+def _best_strength(radial: _Radial, seed: int) -> Array:
+    """lambda_1 and lambda_2: the best of a row, and from there in steps that become smaller."""
+    row = [np.array([value, 0.0]) for value in _STRENGTHS]
+    error, best = min(((_error(radial, one, seed), one) for one in row), key=lambda tried: tried[0])
+    step = _STEP
+    for _ in range(_ROUNDS):
+        around = [best + step * way for way in _WAYS]
+        tried = [(_error(radial, one, seed), one) for one in around if _one_to_one(one)]
+        lowest = min(tried, key=lambda one: one[0], default=(np.inf, best))
+        if lowest[0] < error:
+            error, best = lowest
+        else:
+            step = step / 2
+    return best
 
-    radial: _Radial
-    options: Options
 
-    def best_strength(self) -> Array:
-        """lambda_1 and lambda_2: the best of a row, and from there in steps that become smaller."""
-        best, error = min(
-            ((one, self.error(one)) for one in (np.array([value, 0.0]) for value in _STRENGTHS)),
-            key=lambda tried: tried[1],
-        )
-        step = _STEP
-        for _ in range(_ROUNDS):
-            around = [best + step * way for way in _WAYS]
-            tried = [(self.error(one), one) for one in around if _one_to_one(one)]
-            lowest = min(tried, key=lambda one: one[0], default=(np.inf, best))
-            if lowest[0] < error:
-                error, best = lowest
-            else:
-                step = step / 2
-        return best
-
-    def error(self, strength: Array) -> float:
-        """Squared error of all free networks in the pixels that were given."""
-        scan = options_for("lm", _SCAN_STARTS, self.options.seed)
-        problem = self.radial.corrected(strength)
-        able = np.ones(problem.views.n_views, dtype=bool)
-        groups, _ = train_networks(problem, scan, np.random.default_rng(scan.seed), able)
-        # The networks' weights have mean 1.
-        weight = problem.views.pixel_scale**2 * (1 / self.radial.magnification(strength)).mean()
-        error = weight * sum(float(group.bound.sum()) for group in groups)
-        return float(error) if np.isfinite(error) else np.inf
+def _error(radial: _Radial, strength: Array, seed: int) -> float:
+    """Squared error of all free networks in the pixels that were given."""
+    problem = radial.corrected(strength)
+    able = np.ones(problem.views.n_views, dtype=bool)
+    scan = options_for("lm", _SCAN_STARTS, seed)
+    groups, _ = train_networks(problem, scan, np.random.default_rng(seed), able)
+    # The networks' weights have mean 1.
+    weight = problem.views.pixel_scale**2 * (1 / radial.magnification(strength)).mean()
+    error = weight * sum(float(group.bound.sum()) for group in groups)
+    return float(error) if np.isfinite(error) else np.inf
 
 
 @frozen_dataclass(eq=False)

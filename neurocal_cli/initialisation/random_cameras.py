@@ -16,6 +16,7 @@ from neurocal_cli.bundle_adjustment.adjust import adjust
 from neurocal_cli.bundle_adjustment.point_batches import PointBatches
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.views import Views
+from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.network import Patterns
 
@@ -28,23 +29,21 @@ _TIE = 1e-4
 _BATCH = 48
 
 
+@frozen_dataclass(eq=False)
 class Found:
     """Best random starts.
 
     Attributes
     ----------
     state : CameraState
-    cost : (K,) array
-        Squared pixel error of each view (of all, for `find_camera`).
     agreed : (K,) int array
     starts, iterations : int
     """
 
-    def __init__(
-        self, state: CameraState, cost: Array, agreed: NDArray[np.int64], starts: int, iterations: int
-    ) -> None:
-        self.state, self.cost, self.agreed = state, cost, agreed
-        self.starts, self.iterations = starts, iterations
+    state: CameraState
+    agreed: NDArray[np.int64]
+    starts: int
+    iterations: int
 
 
 def find_poses(
@@ -73,7 +72,7 @@ def find_poses(
     agreed = (cost <= lowest[:, None] * (1 + _TIE) + 1e-20).sum(axis=1)
     chosen = np.arange(len(which)) * starts + best
     state = CameraState(entries, adjusted.state.R[chosen], adjusted.state.t[chosen])
-    return Found(state, lowest, agreed, starts * len(which), adjusted.iterations)
+    return Found(state, agreed, starts * len(which), adjusted.iterations)
 
 
 def find_camera(
@@ -127,7 +126,7 @@ def find_camera(
         agreed += int((total <= cost * (1 + _TIE) + 1e-20).sum())
     if best is None:
         return None
-    return Found(best, np.array([cost]), np.array([agreed]), used, iterations)
+    return Found(best, np.array([agreed]), used, iterations)
 
 
 def _as_batches(patterns: Patterns) -> PointBatches:

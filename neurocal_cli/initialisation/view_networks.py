@@ -13,10 +13,10 @@ from neurocal_cli.bundle_adjustment.solution import TrainingRecord
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-from neurocal_cli.initialisation.options import Options
+from neurocal_cli.initialisation.options import MOST_POINTS, Options
 from neurocal_cli.network import Patterns, residual_jacobian
 from neurocal_cli.training import Task
-from neurocal_cli.training.starts import FixedWeights, learn
+from neurocal_cli.training.starts import learn
 
 # Eigenvalue of the product's normal matrix, as a share of the largest, that rounding leaves of 0.
 _NO_CONDITION = 1e-13
@@ -79,11 +79,11 @@ def _train_group(
     record: TrainingRecord,
 ) -> tuple[Group, TrainingRecord]:
     views = problem.views
-    every = views.patterns(members, flat, options.finish_points)
+    every = views.patterns(members, flat, MOST_POINTS)
     small = every.weights.size <= _SMALL
     some = every if small else views.patterns(members, flat, options.start_points[0 if flat else 1], rng)
-    given = _given_weights(problem)
-    learnt = learn(some, options.trainer, rng, options.starts, given, options.agreement)
+    W = _given_weights(problem)
+    learnt = learn(some, options.trainer, rng, options.starts, options.agreement, W=W)
     iterations = learnt.iterations
     if options.finish is not None and not small:
         free = np.ones((3, 3), dtype=bool), np.ones((3, every.n_inputs), dtype=bool)
@@ -100,7 +100,7 @@ def _train_group(
     return Group(members, flat, learnt.product, bound), record
 
 
-def refuse_few_conditions(problem: Problem, options: Options, groups: Sequence[Group]) -> None:
+def refuse_few_conditions(problem: Problem, groups: Sequence[Group]) -> None:
     """Refuse a single view whose points all but determine a plane.
 
     However many they are, points of a plane put 8 conditions on the product W V, and each point off
@@ -112,7 +112,7 @@ def refuse_few_conditions(problem: Problem, options: Options, groups: Sequence[G
     """
     if problem.views.n_views > 1 or groups[0].flat:
         return
-    patterns = problem.views.patterns(np.array([0]), False, options.finish_points)
+    patterns = problem.views.patterns(np.array([0]), False, MOST_POINTS)
     product = groups[0].product
     _, J = residual_jacobian(np.eye(3)[None], product / np.linalg.norm(product), patterns)
     J = J.reshape(-1, 12)
@@ -127,16 +127,15 @@ def refuse_few_conditions(problem: Problem, options: Options, groups: Sequence[G
         )
 
 
-def _given_weights(problem: Problem) -> FixedWeights:
-    """Weights that the problem type gives, for trainers that move W and V themselves."""
+def _given_weights(problem: Problem) -> Array | None:
+    """W as far as the problem type gives it, nan elsewhere; for trainers that move W and V themselves."""
     if problem.type == 1:
-        return FixedWeights()
-    W = np.full((3, 3), np.nan)
+        return None
     if problem.type == 3:
-        W = intrinsic_matrix(problem.normalised_entries)
-    else:
-        W[:2, 2] = problem.normalised_entries[3:]
-    return FixedWeights(W=W)
+        return intrinsic_matrix(problem.normalised_entries)
+    W = np.full((3, 3), np.nan)
+    W[:2, 2] = problem.normalised_entries[3:]
+    return W
 
 
 def _pixel_error(

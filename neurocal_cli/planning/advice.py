@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from neurocal_cli.camera.pinhole import Pose
 from neurocal_cli.camera.rich_lens import NODES
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
-from neurocal_cli.geometry import Array, nearest_rotation
+from neurocal_cli.geometry import Array, cross_matrix, euler_to_rotation, nearest_rotation
 from neurocal_cli.planning.information import pixel_changes, view_information, worst_std
 from neurocal_cli.verdict.projection_uncertainty import image_grid
 
@@ -112,13 +111,6 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
     return Advice(tuple(chosen), before, tuple(after), known.camera.image_size)
 
 
-def uncertainty_with(calibration: Calibration, views: Sequence[Candidate]) -> tuple[float, float]:
-    """Worst standard deviation of a projected pixel now, and with some more views [px]; see `advise`."""
-    known, world = _Known.of(calibration), _target(calibration)
-    told = [view_information(known.camera, known.free, view.pose, world) for view in views]
-    return known.worst(), known.worst(np.sum(told, axis=0))
-
-
 @frozen_dataclass(eq=False)
 class _Known:
     """What is known of a camera, by the views that were taken.
@@ -205,7 +197,8 @@ def candidates(calibration: Calibration) -> list[Candidate]:
     corners = _outline(world - middle, frontal)
     extent = np.ptp((world - middle) @ frontal.T, axis=0)[:2]
     turns = [(*tilt, roll) for tilt in _TILTS for roll in _ROLLS]
-    R = np.array([_tilted(tilt, way) @ _rolled(roll) @ frontal for tilt, way, roll in turns])
+    rolled = {roll: euler_to_rotation(0, 0, np.radians(roll)) for roll in _ROLLS}
+    R = np.array([_tilted(tilt, way) @ rolled[roll] @ frontal for tilt, way, roll in turns])
     # Where the corners of a flat target are in the image, all of it is.
     flat = np.ptp((world - middle) @ frontal[2]) <= _FLAT * extent.max()
     checked = corners if flat else world - middle
@@ -255,11 +248,5 @@ def _outline(centred: Array, frontal: Array) -> Array:
 def _tilted(tilt: float, way: float) -> Array:
     """Turn that brings the side in a direction of the image nearer; degrees."""
     a, b = np.radians(tilt), np.radians(way)
-    axis = np.array([-np.sin(b), np.cos(b), 0.0])
-    K = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    K = cross_matrix(np.array([-np.sin(b), np.cos(b), 0.0]))
     return np.asarray(np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K)
-
-
-def _rolled(roll: float) -> Array:
-    c, s = np.cos(np.radians(roll)), np.sin(np.radians(roll))
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -6,7 +6,7 @@ image centre, is told the truth, and has a bound of its own, with fewer unknowns
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import field
 
 import numpy as np
@@ -18,9 +18,8 @@ from neurocal_cli.bundle_adjustment.parameter_uncertainty import parameter_covar
 from neurocal_cli.bundle_adjustment.problem import problem_for
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.units import normalised
-from neurocal_cli.calibration import Calibration
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
-from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.comparison.by_method import calibrate_with
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -139,19 +138,14 @@ def study_noise(
             fold.bound(cramer_rao(scene, method)),
             np.isnan(errors[..., 0]).sum(axis=1),
         )
-    truth = _parameters(scene.camera.intrinsics.values(), scene.camera.distortion.coefficients, scene)
     whole = cramer_rao(scene, "neuro")
     apart = {
         (a, b): _apart(noisy[:, :, chosen.index(a)], noisy[:, :, chosen.index(b)], np.array(sigma), whole)
         for a, b in (("neuro", "nonlinear"), ("neuro", "backprop"))
         if a in chosen and b in chosen and not (results[a].failed + results[b].failed >= trials).any()
     }
-    return NoiseStudy(parameter_names(scene), fold.first(truth), np.array(sigma), trials, results, apart)
-
-
-def parameter_names(scene: SimulatedScene) -> tuple[str, ...]:
-    """Intrinsic parameters, distortion coefficients, and those of a pose."""
-    return *INTRINSIC_NAMES, *coefficient_names(scene.camera.model), *POSE_NAMES
+    names = *INTRINSIC_NAMES, *coefficient_names(scene.camera.model), *POSE_NAMES
+    return NoiseStudy(names, _truth(scene)[: len(names)], np.array(sigma), trials, results, apart)
 
 
 def cramer_rao(scene: SimulatedScene, method: str) -> Array:
@@ -168,8 +162,8 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
     views = problem.views
     R = np.stack([scene.poses[name].R for name in views.names])
     t = np.stack([scene.poses[name].t for name in views.names])
-    k = camera.distortion.coefficients if camera.model != "none" else np.zeros(0)
-    state = normalised(CameraState(np.array([camera.entries]), R, t, camera.model, k), views)
+    state = CameraState(np.array([camera.entries]), R, t, camera.model, camera.distortion.coefficients)
+    state = normalised(state, views)
     normal, _ = normal_blocks(views.batches, state)
     spare = views.n_equations - problem.n_parameters
     normal[:, -1, -1] = 0.0
@@ -189,7 +183,7 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
 def _errors(task: _Task) -> Array:
     """(T, M, 5 + K + 6 V) errors of each trial and method; nan where there is no answer."""
     scene, model = task.scene, task.scene.camera.model
-    truth = _parameters(scene.camera.intrinsics.values(), scene.camera.distortion.coefficients, scene)
+    truth = _truth(scene)
     seeds = task.seeds or ((0,),)
     errors = np.full((len(seeds), len(task.methods), len(truth)), np.nan)
     for n, seed in enumerate(seeds):
@@ -201,18 +195,22 @@ def _errors(task: _Task) -> Array:
                 continue
             k = np.zeros(len(coefficient_names(model)))
             k[: len(found.distortion)] = found.distortion
-            errors[n, m] = _parameters(found.intrinsics.values(), k, scene, found) - truth
-    poses = errors[..., -6 * len(scene.poses) :].reshape(*errors.shape[:2], -1, 6)
-    poses[..., :3] = (poses[..., :3] + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
+            poses = [found.views[name].pose for name in scene.poses]
+            errors[n, m] = _parameters(found.intrinsics, k, poses) - truth
+    of_poses = errors[..., -6 * len(scene.poses) :].reshape(*errors.shape[:2], -1, 6)
+    of_poses[..., :3] = (of_poses[..., :3] + _HALF_TURN) % (2 * _HALF_TURN) - _HALF_TURN
     return errors
 
 
-def _parameters(
-    intrinsics: Array, k: Array, scene: SimulatedScene, found: Calibration | None = None
-) -> Array:
-    poses = [pose if found is None else found.views[name].pose for name, pose in scene.poses.items()]
-    own = k if scene.camera.model != "none" else k[:0]
-    return np.concatenate([intrinsics, own, *(np.concatenate([pose.euler, pose.t]) for pose in poses)])
+def _truth(scene: SimulatedScene) -> Array:
+    """(5 + K + 6 V,) the true parameters."""
+    return _parameters(scene.camera.intrinsics, scene.camera.distortion.coefficients, scene.poses.values())
+
+
+def _parameters(intrinsics: Intrinsics, k: Array, poses: Iterable[Pose]) -> Array:
+    return np.concatenate(
+        [intrinsics.values(), k, *(part for pose in poses for part in (pose.euler, pose.t))]
+    )
 
 
 def _apart(one: Array, two: Array, sigma: Array, bound: Array) -> float:
@@ -230,10 +228,6 @@ class _Fold:
 
     def _split(self, values: Array) -> tuple[Array, Array]:
         return values[..., : self.n], values[..., self.n :].reshape(*values.shape[:-1], -1, 6)
-
-    def first(self, values: Array) -> Array:
-        """Those of the first view."""
-        return values[..., : self.n + 6]
 
     def worst(self, errors: Array) -> Array:
         """The largest error of any view, with its sign."""

@@ -25,7 +25,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.initialisation.options import options_for
 from neurocal_cli.methods import calibrate
-from neurocal_cli.network import Patterns, output, random_weights
+from neurocal_cli.network import output, random_weights
 from neurocal_cli.points import Correspondences
 from neurocal_cli.processes import work_through
 from neurocal_cli.training import Task
@@ -180,14 +180,8 @@ def _one_start(seed: int, number: int, rates: tuple[float, float]) -> tuple[floa
     options = BackpropOptions(rate_weights=rates[0], rate_gamma=rates[1], halvings=0)
     trained = train_backprop(Task(patterns, W, V, *free), options)
     depth = output(trained.W, trained.V, patterns.inputs)[0, :, 2]
-    good = (
-        trained.settled[0]
-        and patterns.rms(trained.loss)[0] <= _SAME * _best(patterns, rng)
-        and depth.min() * depth.max() > 0
-    )
+    good = trained.settled[0] and depth.min() * depth.max() > 0
+    if good:
+        best = learn(patterns, options_for("lm", 20, 0).trainer, rng, 20).rms[0]
+        good = patterns.rms(trained.loss)[0] <= _SAME * best
     return float(good), float(trained.iterations[0])
-
-
-def _best(patterns: Patterns, rng: np.random.Generator) -> float:
-    """Lowest error (5)."""
-    return float(learn(patterns, options_for("lm", 20, 0).trainer, rng, 20).rms[0])

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.board import Board, Plane
-from neurocal_cli.calibration import Calibration
+from neurocal_cli.calibration import Calibration, ViewResult
 from neurocal_cli.camera.camera import Camera
-from neurocal_cli.camera.pinhole import Intrinsics, Pose
+from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, POSE_NAMES, Intrinsics, Pose
 from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
@@ -113,6 +114,34 @@ def calibrated_scene(calibration: Calibration) -> SimulatedScene:
     labels = None if points.point is None else np.asarray(points.point)
     view = np.array(points.view_names)[points.view_index]
     return SimulatedScene(camera, poses, points.world, pixels, view, labels, points.unit)
+
+
+def true_calibration(scene: SimulatedScene) -> Calibration:
+    """The true camera and its poses as a calibration without any error, whose parameters are all given."""
+    camera, points = scene.camera, scene.points()
+    names = (*INTRINSIC_NAMES, *coefficient_names(camera.model))
+    views = {
+        name: ViewResult(pose, dict.fromkeys(POSE_NAMES, 0.0), int((scene.view == name).sum()), 0.0, True)
+        for name, pose in scene.poses.items()
+    }
+    return Calibration(
+        intrinsics=camera.intrinsics,
+        std=dict.fromkeys(names, 0.0),
+        fixed=frozenset(names),
+        views=views,
+        points=points,
+        type=1,
+        method="simulation",
+        trainer="none",
+        seed=0,
+        converged=True,
+        stop_reason="the truth of a simulation",
+        rmse_px=0.0,
+        max_px=0.0,
+        distortion_model=camera.model,
+        distortion=camera.distortion.coefficients,
+        camera_name=camera.name,
+    )
 
 
 def _seen(camera: Camera, pose: Pose, world: Array, name: str) -> Array:

@@ -17,7 +17,6 @@ slower. tests/test_backprop.py trains on scenes of these kinds.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import field
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -88,27 +87,11 @@ class BackpropOptions:
             raise InputError("beta, tolerance, floor and halvings must not be negative")
 
 
-@frozen_dataclass(eq=False)
-class BackpropTrained(Trained):
-    """Networks after training by back-propagation.
-
-    Attributes
-    ----------
-    restarts : (G,) int array
-        Restarts of each network after it diverged.
-    rate_weights : (G,) array
-        Last rate of W and V of each network.
-    """
-
-    restarts: NDArray[np.int64] = field(kw_only=True)
-    rate_weights: Array = field(kw_only=True)
-
-
 def train_backprop(
     task: Task,
     options: BackpropOptions | None = None,
     progress: Callable[[float], None] | None = None,
-) -> BackpropTrained:
+) -> Trained:
     """Train a stack of networks by eqs. (9)-(11), with E_orth of eq. (14) where beta > 0.
 
     The rates of a network are halved whenever its loss no longer decreases. A network has settled when two
@@ -123,7 +106,7 @@ def train_backprop(
 
     Returns
     -------
-    BackpropTrained
+    Trained
         Its curve is the loss that is minimised: E_2D, plus beta E_orth for each pattern. A network that
         diverges at all rates has its initial weights and is not settled.
 
@@ -178,7 +161,6 @@ class _Run:
         self.iterations = np.zeros(networks, dtype=np.int64)
         self.restarts = np.zeros(networks, dtype=np.int64)
         self.scale = np.ones(networks)
-        self.rate = np.full(networks, options.rate_weights)
         # Checkpoint of the last change of the rates, and the loss before it.
         self.since = np.zeros(networks, dtype=np.int64)
         self.before = np.full(networks, np.inf)
@@ -236,8 +218,7 @@ class _Run:
         rate = np.full(len(self.W), self.options.rate_weights)
         if self.bound is not None:
             rate = np.fmin(rate, self.bound(self.Z, self.w, self.W, self.V, self.gamma, self.used))
-        self.rate[self.active] = (self.scale * rate)[self.active]
-        return self.rate
+        return self.scale * rate
 
     def _restart(self, diverged: NDArray[np.bool_], loss: Array) -> None:
         """Restart networks that diverged at their initial weights, with half the rates."""
@@ -266,13 +247,13 @@ class _Run:
         self.since[slower] = checkpoint
         self.scale[slower] /= 2
 
-    def trained(self) -> BackpropTrained:
+    def trained(self) -> Trained:
         """Put the result in the caller's order of patterns."""
         n_inputs = self.task.V.shape[2]
         gamma = np.ones_like(self.gamma)
         np.put_along_axis(gamma, self.order, self.gamma, axis=1)
         V = self.V[..., :n_inputs].copy()
-        return BackpropTrained(
+        return Trained(
             W=self.W,
             V=V,
             gamma=gamma,
@@ -280,8 +261,6 @@ class _Run:
             iterations=self.iterations,
             settled=self.settled,
             curve=np.array(self.curve),
-            restarts=self.restarts,
-            rate_weights=self.rate,
         )
 
 

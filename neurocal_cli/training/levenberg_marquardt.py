@@ -39,8 +39,6 @@ class LMOptions:
     ----------
     stiffness : tuple of float
         Values of mu in turn; the last must be 0.
-    release : float
-        A stiffness ends when a step lowers E by less than this share.
     tolerance : float
         Training has converged when a step lowers E by less than this share.
     max_iterations : int
@@ -50,7 +48,6 @@ class LMOptions:
     """
 
     stiffness: tuple[float, ...] = (300.0, 0.0)
-    release: float = 0.9
     tolerance: float = 1e-6
     max_iterations: int = 60
     damping: float = 1e-3
@@ -61,6 +58,7 @@ _FLOOR = 1e-13  # rms error of rounding alone, in units of the normalised image
 # counts, not the predicted one. test_convergence.py and test_starts.py check the share of starts that
 # converge.
 _FAR = DescentOptions(shrink=0.1, least_damping=1e-12, largest_damping=1e8, by_promise=False, flat=0.0)
+_RELEASED = 0.9  # a stiffness ends when a step lowers E by less than this share
 _SOFTENED = 0.1  # share of the initial damping after the stiffness is taken away
 
 
@@ -181,7 +179,7 @@ class _Networks:
         networks, damping = np.arange(len(self.loss)), options.damping
         for stage, mu in enumerate(options.stiffness):
             last = stage == len(options.stiffness) - 1
-            tolerance = options.tolerance if last else max(options.release, options.tolerance)
+            tolerance = options.tolerance if last else max(_RELEASED, options.tolerance)
             settings = replace(_FAR, damping=damping, tolerance=tolerance)
             ended = self._descend(_Stiffened(self, mu, networks), settings, options.max_iterations)
             networks, damping = networks[ended], _SOFTENED * options.damping

@@ -32,20 +32,6 @@ class Agreement:
 
 
 @frozen_dataclass(eq=False)
-class FixedWeights:
-    """Weights that are given; nan in W where they are not.
-
-    Parameters
-    ----------
-    W : (3, 3) array or None
-    V : (1, 3, I) array or None
-    """
-
-    W: Array | None = None
-    V: Array | None = None
-
-
-@frozen_dataclass(eq=False)
 class Learnt:
     """The best network of each view.
 
@@ -59,8 +45,6 @@ class Learnt:
         Number of starts, and number of those that ended at the best loss.
     iterations : int
         Of all the starts together.
-    in_front : (K,) bool array
-        Whether all points are on one side of the camera.
     curve : (J,) array
         Rms error of the best start of the first view along its training.
     """
@@ -71,7 +55,6 @@ class Learnt:
     starts: NDArray[np.int64]
     agreed: NDArray[np.int64]
     iterations: int
-    in_front: NDArray[np.bool_]
     curve: Array
 
     @property
@@ -85,8 +68,10 @@ def learn(
     trainer: Trainer,
     rng: np.random.Generator,
     limit: int,
-    fixed: FixedWeights | None = None,
     agreement: Agreement | None = None,
+    *,
+    W: Array | None = None,
+    V: Array | None = None,
 ) -> Learnt:
     """Train each network from random weights until two starts agree, with `limit` starts at most.
 
@@ -98,10 +83,13 @@ def learn(
     rng : numpy.random.Generator
     limit : int
         Most starts for each network, at least 2.
-    fixed : FixedWeights, optional
     agreement : Agreement, optional
+    W : (3, 3) array, optional
+        Output weights that are given; nan where they are not.
+    V : (1, 3, I) array, optional
+        Hidden weights that are given.
     """
-    search = _BestStarts(patterns, fixed or FixedWeights(), agreement or Agreement())
+    search = _BestStarts(patterns, trainer, rng, agreement or Agreement(), W, V)
     open_views = np.arange(len(patterns.weights))
     round_size = 2
     while open_views.size:
@@ -109,16 +97,25 @@ def learn(
         count = min(round_size, limit - used)
         if count <= 0:
             break
-        search.train(open_views, count, trainer, rng)
+        search.train(open_views, count)
         open_views = open_views[search.agreed[open_views] < 2]
         round_size = 4
     return search.result()
 
 
 class _BestStarts:
-    def __init__(self, patterns: Patterns, fixed: FixedWeights, agreement: Agreement) -> None:
+    def __init__(
+        self,
+        patterns: Patterns,
+        trainer: Trainer,
+        rng: np.random.Generator,
+        agreement: Agreement,
+        given_W: Array | None,
+        given_V: Array | None,
+    ) -> None:
         K = len(patterns.weights)
-        self.patterns, self.fixed, self.agreement = patterns, fixed, agreement
+        self.patterns, self.trainer, self.rng, self.agreement = patterns, trainer, rng, agreement
+        self.given_W, self.given_V = given_W, given_V
         self.W = np.zeros((K, 3, 3))
         self.V = np.zeros((K, 3, patterns.n_inputs))
         self.rms = np.full(K, np.inf)
@@ -128,19 +125,19 @@ class _BestStarts:
         self.iterations = 0
         self.curve = np.zeros(0)
 
-    def train(self, views: NDArray[np.intp], count: int, trainer: Trainer, rng: np.random.Generator) -> None:
+    def train(self, views: NDArray[np.intp], count: int) -> None:
         """Train `count` more starts of each of these views."""
         networks = np.repeat(views, count)
         patterns = self.patterns.take(networks)
-        W, V = random_weights(rng, len(networks), patterns.n_inputs)
+        W, V = random_weights(self.rng, len(networks), patterns.n_inputs)
         free_W, free_V = np.ones((3, 3), dtype=bool), np.ones((3, patterns.n_inputs), dtype=bool)
-        if self.fixed.W is not None:
-            free_W = np.isnan(self.fixed.W)
-            W = np.where(free_W, W, self.fixed.W)
-        if self.fixed.V is not None:
+        if self.given_W is not None:
+            free_W = np.isnan(self.given_W)
+            W = np.where(free_W, W, self.given_W)
+        if self.given_V is not None:
             free_V[:] = False
-            V = np.repeat(self.fixed.V, len(networks), axis=0)
-        trained = trainer(Task(patterns, W, V, free_W, free_V))
+            V = np.repeat(self.given_V, len(networks), axis=0)
+        trained = self.trainer(Task(patterns, W, V, free_W, free_V))
         self.iterations += int(trained.iterations.sum())
         self.starts[views] += count
         depth = output(trained.W, trained.V, patterns.inputs)[..., 2]
@@ -179,6 +176,4 @@ class _BestStarts:
 
     def result(self) -> Learnt:
         """The best start of each view."""
-        return Learnt(
-            self.W, self.V, self.rms, self.starts, self.agreed, self.iterations, self.in_front, self.curve
-        )
+        return Learnt(self.W, self.V, self.rms, self.starts, self.agreed, self.iterations, self.curve)

@@ -31,11 +31,11 @@ _EPOCHS = 150  # most turns on one set of normal matrices
 def take_turns(learner: JointLearner) -> float:
     """Lower 2 E on the present normal matrices, network by network; an argument of `train_joint`."""
     nets, shared = learner.nets, learner.shared
-    best = (nets, shared, learner.cost(nets, shared))
+    best = (nets, shared, learner.error.cost(nets, shared))
     rate = _RATE
     for _ in range(_EPOCHS):
         nets, shared = _turn(learner, nets, shared, rate)
-        cost = learner.cost(nets, shared)
+        cost = learner.error.cost(nets, shared)
         if cost < best[2]:
             best = (nets, shared, cost)
         else:  # the step was too long: restart at the best state with half the rate

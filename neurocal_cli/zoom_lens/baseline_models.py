@@ -19,7 +19,6 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
 from neurocal_cli.zoom_lens.interpolation import (
     grid_axes,
-    lookup_matrix,
     monomials,
     powers_up_to,
     spline_matrix,
@@ -53,8 +52,8 @@ def baselines_of(lens: ZoomLens, scale: str | None = None) -> dict[str, Baseline
         if lens.known and suffix:
             continue  # known cameras have no points for a joint fit
         if axes is not None:
-            baselines[f"lookup{suffix}"] = _through(table, scale, partial(lookup_matrix, axes))
-            baselines[f"spline{suffix}"] = _through(table, scale, partial(spline_matrix, axes))
+            baselines[f"lookup{suffix}"] = _through(table, scale, partial(spline_matrix, axes, degree=1))
+            baselines[f"spline{suffix}"] = _through(table, scale, partial(spline_matrix, axes, degree=3))
         if x.shape[1] > 1 and len(x) >= 4:
             baselines[f"thin_plate{suffix}"] = _through(table, scale, partial(thin_plate_matrix, x))
     for degree, powers in _degrees(x):
@@ -129,12 +128,12 @@ class _Polynomials:
         """(n, L) local parameters."""
         return outputs_to_local(self.scale, monomials(x, self.powers) @ self.coefficients)[0]
 
-    def local_with_jacobians(self, x: Array) -> tuple[Array, list[Array]]:
+    def local_with_jacobian(self, x: Array) -> tuple[Array, Array]:
         """Local parameters, and their derivatives by all coefficients (n, L, K L)."""
         Phi = monomials(x, self.powers)
         local, by_output = outputs_to_local(self.scale, Phi @ self.coefficients)
         J = Phi[:, None, :, None] * by_output[:, :, None]
-        return local, [J.reshape(*local.shape, -1)]
+        return local, J.reshape(*local.shape, -1)
 
 
 def _joint_polynomial(lens: ZoomLens, scale: str, x: Array, powers: Array) -> Baseline:

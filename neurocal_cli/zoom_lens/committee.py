@@ -24,7 +24,6 @@ from neurocal_cli.zoom_lens.mlfn import Topology
 from neurocal_cli.zoom_lens.network_training import Schedule, sparse_controls, train
 from neurocal_cli.zoom_lens.parameter_networks import SCALES, LensNets, ParameterNet, to_scale
 from neurocal_cli.zoom_lens.quadratic_error import inverse
-from neurocal_cli.zoom_lens.setting_normals import Normal
 
 # Two slow tests of tests/test_zoom_lens.py, with 45 settings and of a real lens, measure the errors that
 # these choices, `Budget` and `Schedule` reach between settings.
@@ -62,19 +61,11 @@ class Budget:
     schedule: Schedule = field(default_factory=Schedule)
 
 
-@frozen_dataclass(eq=False)
-class _Ranked:
-    """Networks of one parameter, the best first, and the evidence of the best, in units of the targets."""
-
-    nets: list[ParameterNet]
-    evidence: float
-
-
 def fit_committee(
     x: Array,
     names: Sequence[str],
     local: Array,
-    normal: Normal,
+    H: Array | None,
     variance: float,
     rng: np.random.Generator,
     budget: Budget,
@@ -90,8 +81,8 @@ def fit_committee(
         Of the L local parameters; alpha_u, alpha_v, u0, v0 first.
     local : (S, L) array
         The tables.
-    normal : Normal
-        At the tables, for the variances of the targets; H is empty where they are unknown.
+    H : (S, L + Q, L + Q) array or None
+        Normal matrices at the tables, for the variances of the targets; None where they are unknown.
     variance : float [px^2]
         Of the noise.
     rng : numpy.random.Generator
@@ -113,15 +104,15 @@ def fit_committee(
     scale = "log"
     for count, j in enumerate(order):
         report(count / L)
-        values, spread = _given(local, values, normal, variance, held)
+        values, spread = _given(local, values, H, variance, held)
         targets, derivative = values[:, j], np.ones(len(x))
         if j == 0:
-            scale, ranked = _best_scale(x, values[:, 0], spread[:, 0], rng, budget)
+            scale, nets = _best_scale(x, values[:, 0], spread[:, 0], rng, budget)
         else:
             if j == 1:
                 targets, derivative = np.log(values[:, 1] / values[:, 0]), 1 / values[:, 1]
-            ranked = _fit(x, targets, spread[:, j] * derivative**2, rng, budget)
-        chosen[j] = _agreeing(ranked.nets[: budget.best], probe, budget.members)
+            nets, _ = _fit(x, targets, spread[:, j] * derivative**2, rng, budget)
+        chosen[j] = _agreeing(nets[: budget.best], probe, budget.members)
         if names[j] == "t_z":
             values[:, j] = np.mean([net.output(x) for net in chosen[j]], axis=0)
             held[j] = True
@@ -142,13 +133,12 @@ def _probe(D: int) -> Array:
 
 
 def _given(
-    local: Array, values: Array, normal: Normal, variance: float, held: NDArray[np.bool_]
+    local: Array, values: Array, H: Array | None, variance: float, held: NDArray[np.bool_]
 ) -> tuple[Array, Array]:
     """Tables with some parameters held at other values, and the variances of the rest; (S, L) both."""
-    L = local.shape[1]
-    if not normal.H.size:
+    if H is None:
         return local, np.zeros_like(local)
-    free, H = np.flatnonzero(~held), normal.H[:, :L, :L]
+    free = np.flatnonzero(~held)
     pull = -(H[:, free[:, None], np.flatnonzero(held)] @ (values - local)[:, held, None])
     B = H[:, free[:, None], free]
     values = values.copy()
@@ -160,21 +150,23 @@ def _given(
 
 def _best_scale(
     x: Array, alpha: Array, variance: Array, rng: np.random.Generator, budget: Budget
-) -> tuple[str, _Ranked]:
+) -> tuple[str, list[ParameterNet]]:
     """The scale of alpha_u with the highest evidence, and its networks."""
     fits = {}
     for scale in SCALES:
         targets, derivative = to_scale(scale, alpha)
-        ranked = _fit(x, targets, variance * derivative**2, rng, budget)
+        nets, evidence = _fit(x, targets, variance * derivative**2, rng, budget)
         # The density of the targets as one of alpha.
-        fits[scale] = (ranked.evidence + float(np.log(np.abs(derivative)).sum()), ranked)
+        fits[scale] = (evidence + float(np.log(np.abs(derivative)).sum()), nets)
     best = max(fits, key=lambda name: fits[name][0])
     scale = best if fits[best][0] > fits["log"][0] + _LOG_ODDS else "log"
     return scale, fits[scale][1]
 
 
-def _fit(x: Array, targets: Array, variance: Array, rng: np.random.Generator, budget: Budget) -> _Ranked:
-    """Train all topologies from all starts and rank the networks by evidence."""
+def _fit(
+    x: Array, targets: Array, variance: Array, rng: np.random.Generator, budget: Budget
+) -> tuple[list[ParameterNet], float]:
+    """Networks of all topologies and starts, best first; the evidence of the best in units of the targets."""
     centre, spread = float(targets.mean()), float(targets.std())
     # Equal targets have no spread; their noise, or 1, replaces it.
     spread = max(spread, float(np.sqrt(variance.mean())), 1e-9 * abs(centre)) or 1.0
@@ -190,7 +182,7 @@ def _fit(x: Array, targets: Array, variance: Array, rng: np.random.Generator, bu
             nets.append(ParameterNet(topology, w, a, centre, spread, float(tau2) * spread**2))
             evidence.append(float(e))
     order = np.argsort(-np.array(evidence), kind="stable")
-    return _Ranked([nets[k] for k in order], evidence[order[0]] - len(x) * float(np.log(spread)))
+    return [nets[k] for k in order], evidence[order[0]] - len(x) * float(np.log(spread))
 
 
 def _agreeing(nets: Sequence[ParameterNet], probe: Array, count: int) -> list[ParameterNet]:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import ROUNDING, solve_scaled
 from neurocal_cli.zoom_lens.initialisation import CalibratedSettings
@@ -16,28 +15,19 @@ from neurocal_cli.zoom_lens.joint_training import Joint
 from neurocal_cli.zoom_lens.quadratic_error import inverse, with_scatter
 
 
-@frozen_dataclass(eq=False)
-class LeftOutErrors:
+def left_out_errors(start: CalibratedSettings, joint: Joint) -> tuple[Array, Array]:
     """Errors at settings, each predicted from all others.
 
-    Attributes
-    ----------
+    Returns
+    -------
     pixels : (S,) array [px]
         Rms reprojection error.
     normalised : (S,) array
         Squared error of the local parameters over its expectation, a mean over them; about 1.
     """
-
-    pixels: Array
-    normalised: Array
-
-
-def left_out_errors(start: CalibratedSettings, joint: Joint) -> LeftOutErrors:
-    """Predict each setting from all others."""
     tables, variance = start.tables, start.variance
     scatter = joint.nets.local_scatter(tables.local)
-    local, jacobians = joint.nets.local_with_jacobians(start.controls)
-    J = np.concatenate(jacobians, axis=2)
+    local, J = joint.nets.local_with_jacobian(start.controls)
     _, L, P = J.shape
     normal = tables.normal
     H = normal.H[:, :L, :L]
@@ -53,4 +43,4 @@ def left_out_errors(start: CalibratedSettings, joint: Joint) -> LeftOutErrors:
     normalised = (out * solve_scaled(expected, out, ROUNDING)).sum(axis=(1, 2)) / L
     squares = (np.swapaxes(out, 1, 2) @ H @ out)[:, 0, 0] + normal.cost
     counts = np.maximum(normal.H[:, 2, 2], 1.0)  # the derivative by u0 is 1, so this is the number of points
-    return LeftOutErrors(np.sqrt(np.maximum(squares, 0.0) / counts), np.maximum(normalised, 0.0))
+    return np.sqrt(np.maximum(squares, 0.0) / counts), np.maximum(normalised, 0.0)

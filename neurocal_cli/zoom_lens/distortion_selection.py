@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.zoom_lens.committee import Budget, fit_committee
-from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions, Progress, calibrate_settings
+from neurocal_cli.zoom_lens.initialisation import CalibratedSettings, FitOptions, calibrate_settings
 from neurocal_cli.zoom_lens.network_training import Schedule
 from neurocal_cli.zoom_lens.settings import LensPoints
 
@@ -20,14 +18,14 @@ _LARGEST_SHARE = 0.98
 _SIGMAS = 3.0
 
 
-def choose_model(lens: LensPoints, options: FitOptions, reject: bool, report: Progress) -> CalibratedSettings:
+def choose_model(lens: LensPoints, options: FitOptions) -> CalibratedSettings:
     """Step 1 with the simplest distortion model that predicts held-out settings as well as a richer one."""
     best: CalibratedSettings | None = None
     best_px: float | None = None  # computed when a richer model is compared
     failure: DegenerateGeometryError | None = None
     for model in LADDER:
         try:
-            start = calibrate_settings(lens, model, options, reject, report)
+            start = calibrate_settings(lens, model, options)
         except DegenerateGeometryError as error:
             failure = error
             continue
@@ -36,7 +34,7 @@ def choose_model(lens: LensPoints, options: FitOptions, reject: bool, report: Pr
             continue
         if not _explains_more(start, best):
             continue
-        report(f"trying distortion model {model}", 0.5)
+        options.report(f"trying distortion model {model}", 0.5)
         best_px = _held_out(best, options) if best_px is None else best_px
         error_px = _held_out(start, options)
         if error_px < _LARGEST_SHARE * best_px:
@@ -59,12 +57,10 @@ def _held_out(start: CalibratedSettings, options: FitOptions) -> float:
     inside = np.arange(len(x)) % 2 == 0
     squares = 0.0
     for part in (inside, ~inside):
-        normal = start.tables.normal
-        kept = replace(normal, H=normal.H[part], g=normal.g[part], cost=normal.cost[part])
-        rng = np.random.default_rng(options.seed)
-        names, local = start.data.names, start.tables.local
+        rng, names, local = np.random.default_rng(options.seed), start.data.names, start.tables.local
+        H = start.tables.normal.H[part]
         members = fit_committee(
-            x[part], names, local[part], kept, start.variance, rng, _QUICK_BUDGET, lambda share: None
+            x[part], names, local[part], H, start.variance, rng, _QUICK_BUDGET, lambda share: None
         )
         predicted = np.mean([nets.local(x) for nets in members], axis=0)
         there, _ = start.data.linearise(np.where(part[:, None], local, predicted), start.tables.constants)

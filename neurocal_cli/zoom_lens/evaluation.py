@@ -116,18 +116,16 @@ def _matched(lens: ZoomLens, points: LensPoints) -> tuple[LensPoints, list[str]]
             f"{source}: the points' image_size {here[0]} x {here[1]} differs from the lens's "
             f"{there[0]} x {there[1]}; give points of images of the lens's size"
         )
-    columns = dict(zip(points.controls, points.settings[points.point_setting].T, strict=True))
     # All points have the same weight in a reprojection error.
     plain = replace(points.points, covariance=None, across=None)
-    matched = LensPoints.grouped(plain, {name: columns[name] for name in lens.controls})
+    matched = LensPoints.grouped(plain, {name: points.columns[name] for name in lens.controls})
     outside = np.asarray(((matched.settings < lens.low) | (matched.settings > lens.high)).any(axis=1))
     warnings = []
     if outside.any():
         first = describe(lens.controls, matched.settings[int(np.argmax(outside))])
         warnings.append(
             f"{int(outside.sum())} of {len(outside)} settings lie outside the calibrated range, the "
-            f"first at {first}: "
-            "the networks extrapolate there"
+            f"first at {first}: the networks extrapolate there"
         )
     return matched, warnings
 

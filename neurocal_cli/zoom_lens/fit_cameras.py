@@ -116,12 +116,11 @@ def fit_lens_cameras(
     low, high = cameras.settings.min(axis=0), cameras.settings.max(axis=0)
     x = scaled_controls(cameras.settings, low, high)
     L, S = len(cameras.names), len(x)
-    empty = Normal(np.zeros((0, L, L)), np.zeros((0, L)), np.zeros(0), True)
     members = fit_committee(
         x,
         cameras.names,
         cameras.local,
-        empty,
+        None,
         1.0,
         np.random.default_rng(seed),
         Budget(topologies=topologies, members=_MEMBERS),

@@ -9,9 +9,10 @@ import numpy as np
 
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import MODELS, WITH_PRISM
-from neurocal_cli.errors import check_choice
+from neurocal_cli.errors import DegenerateGeometryError, check_choice
 from neurocal_cli.target import TARGETS, Target
-from neurocal_cli.zoom_lens.committee import Budget
+from neurocal_cli.zoom_lens.alternating_training import take_turns
+from neurocal_cli.zoom_lens.committee import Budget, fit_committee
 from neurocal_cli.zoom_lens.cross_validation import left_out_errors
 from neurocal_cli.zoom_lens.distortion_selection import choose_model
 from neurocal_cli.zoom_lens.initialisation import (
@@ -23,14 +24,13 @@ from neurocal_cli.zoom_lens.initialisation import (
     may_reject,
     without,
 )
-from neurocal_cli.zoom_lens.joint_training import Joint
+from neurocal_cli.zoom_lens.joint_training import Joint, JointLearner, train_joint
 from neurocal_cli.zoom_lens.outlier_settings import contradiction, most_suspect
 from neurocal_cli.zoom_lens.result import assemble, provisional
 from neurocal_cli.zoom_lens.settings import LensPoints
 from neurocal_cli.zoom_lens.static_calibration import common_tables, first_constants
 from neurocal_cli.zoom_lens.target import lens_target, on_target
 from neurocal_cli.zoom_lens.target_coupling import target_coupling
-from neurocal_cli.zoom_lens.training import train_all
 from neurocal_cli.zoom_lens.zoom_lens import RejectedSetting, ZoomLens
 
 TRAININGS = ("joint", "alternating")
@@ -101,15 +101,16 @@ def fit_lens(
     lens = points.varying()
     check_settings(lens.n_settings, len(lens.controls), lens.points.source)
     still = camera == "still" or (camera == "auto" and bool(np.bincount(lens.view_setting).max() == 1))
-    options = FitOptions(training, still, skew, Budget(topologies=topologies), seed)
-    reject = outliers == "reject"
+    options = FitOptions(
+        training, still, skew, outliers == "reject", Budget(topologies=topologies), seed, report
+    )
     found = None if still else lens_target(lens, target, distortion, skew, seed, report)
     lens = on_target(lens, found)
     if distortion == "auto":
-        start = choose_model(lens, options, reject, report)
+        start = choose_model(lens, options)
     else:
-        start = calibrate_settings(lens, distortion, options, reject, report)
-    start, joints = _train(start, options, reject, report)
+        start = calibrate_settings(lens, distortion, options)
+    start, joints = _train(start, options)
     fitted = assemble(start, joints, options)
     return fitted if found is None else _with_target(fitted, start, found)
 
@@ -122,23 +123,20 @@ def _with_target(fitted: ZoomLens, start: CalibratedSettings, found: Target) -> 
     return replace(fitted, target=found, target_coupling=coupling)
 
 
-def _train(
-    start: CalibratedSettings, options: FitOptions, reject: bool, report: Progress
-) -> tuple[CalibratedSettings, list[Joint]]:
+def _train(start: CalibratedSettings, options: FitOptions) -> tuple[CalibratedSettings, list[Joint]]:
     """Steps 2 and 3, with rejection of settings that contradict all others."""
     while True:
-        joints = train_all(start, options, options.budget, report)
-        if not reject or not may_reject(start.rejected, start.lens):
+        joints = _trained(start, options)
+        if not options.reject or not may_reject(start.rejected, start.lens):
             return start, joints
-        errors = left_out_errors(start, joints[0])
-        suspect = most_suspect(errors.pixels, errors.normalised)
+        suspect = most_suspect(*left_out_errors(start, joints[0]))
         if suspect is None:
             return start, joints
         keep = np.arange(start.lens.n_settings) != suspect
         lens, data, static = without(start.lens, start.static, keep, start.data.model, options)
         tables = common_tables(data, static.local, first_constants(static, lens, options.still))
         rest = CalibratedSettings(lens, data, static, tables, start.rejected)
-        trial = train_all(rest, options, replace(options.budget, starts=6), report)
+        trial = _trained(rest, replace(options, budget=replace(options.budget, starts=6)))
         reason = contradiction(
             provisional(rest, trial, options), start.lens.settings[suspect], start.tables, suspect
         )
@@ -146,3 +144,37 @@ def _train(
             return start, joints
         rejected = RejectedSetting(tuple(start.lens.settings[suspect].tolist()), reason)
         start = replace(rest, rejected=(*start.rejected, rejected))
+
+
+def _trained(start: CalibratedSettings, options: FitOptions) -> list[Joint]:
+    """Steps 2 and 3 with all settings. The members come in descending order of their evidence."""
+    x, rng = start.controls, np.random.default_rng(options.seed)
+    members = fit_committee(
+        x,
+        start.data.names,
+        start.tables.local,
+        start.tables.normal.H,
+        start.variance,
+        rng,
+        options.budget,
+        lambda share: options.report("fitting a network to each parameter", share),
+    )
+    descend = JointLearner.descend if options.training == "joint" else take_turns
+    # Every network fits the scatter of a lens that does not repeat its positions. A poor network alone fits
+    # more, so the smallest value counts.
+    scatter = np.min([nets.local_scatter(start.tables.local) for nets in members], axis=0)
+    joints = []
+    for k, nets in enumerate(members):
+
+        def report_share(share: float, k: int = k) -> None:
+            options.report("all networks together", (k + share) / len(members))
+
+        learner = JointLearner(start.data, x, nets, start.tables.constants, start.variance, scatter)
+        joints.append(train_joint(learner, descend, report_share))
+    joints = [joint for joint in joints if np.isfinite(joint.evidence)]
+    if not joints:
+        raise DegenerateGeometryError(
+            f"{start.lens.points.source}: no network fits the settings; give more settings"
+        )
+    joints.sort(key=lambda joint: -joint.evidence)
+    return joints

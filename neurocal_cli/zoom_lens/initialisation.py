@@ -33,8 +33,10 @@ class FitOptions:
     training: str
     still: bool
     free_theta: bool
+    reject: bool
     budget: Budget
     seed: int
+    report: Progress
 
 
 @frozen_dataclass(eq=False)
@@ -76,21 +78,20 @@ def check_settings(count: int, controls: int, source: str) -> None:
         )
 
 
-def calibrate_settings(
-    lens: LensPoints, model: str, options: FitOptions, reject: bool, report: Progress
-) -> CalibratedSettings:
+def calibrate_settings(lens: LensPoints, model: str, options: FitOptions) -> CalibratedSettings:
     """Calibrate each setting, then the tables; reject settings whose pixels do not fit."""
     rejected: list[RejectedSetting] = []
     data = PixelData.of(lens, options.still, model, options.free_theta)
-    static = calibrate_each(lens, data, options.seed, options.free_theta, report)
+    static = calibrate_each(lens, data, options.seed, options.free_theta, options.report)
     while True:
-        tables = common_tables(data, static.local, first_constants(static, lens, options.still), report)
+        constants = first_constants(static, lens, options.still)
+        tables = common_tables(data, static.local, constants, options.report)
         if not tables.normal.sensible or not np.isfinite(tables.normal.cost).all():
             raise DegenerateGeometryError(
                 f"{lens.points.source}: no common pose fits all settings; if the camera or the target "
                 "moved, give several views of the board at each setting, and --camera moving"
             )
-        bad = bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if reject else None
+        bad = bad_pixels(np.sqrt(tables.normal.cost / data.counts)) if options.reject else None
         if bad is None or not may_reject(rejected, lens):
             return CalibratedSettings(lens, data, static, tables, tuple(rejected))
         setting, reason = bad
@@ -108,19 +109,14 @@ def without(
     lens: LensPoints, static: StaticFit, keep: NDArray[np.bool_], model: str, options: FitOptions
 ) -> tuple[LensPoints, PixelData, StaticFit]:
     """The data of the settings to keep (S,). Nothing is calibrated again."""
-    views = keep[lens.view_setting]
-    rest = lens.select(keep)
+    rest, views = lens.select(keep), keep[lens.view_setting]
     check_settings(rest.n_settings, len(rest.controls), lens.points.source)
-    number = {name: k for k, name in enumerate(lens.points.view_names)}
-    order = [number[name] for name in rest.points.view_names]
-    assert views[order].all()
     part = replace(
         static,
         local=static.local[keep],
         theta=static.theta[keep],
-        R=static.R[order],
-        t=static.t[order],
+        R=static.R[views],
+        t=static.t[views],
         good=static.good[keep],
-        rmse=static.rmse[keep],
     )
     return rest, PixelData.of(rest, options.still, model, options.free_theta), part

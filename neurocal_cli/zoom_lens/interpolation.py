@@ -20,18 +20,23 @@ def grid_axes(x: Array) -> list[Array] | None:
     return axes if np.array_equal(grid, x) else None
 
 
-def lookup_matrix(axes: list[Array], x: Array) -> Array:
-    """Matrix (n, nodes) of linear (bilinear) interpolation in a grid at x (n, D); the rim extrapolates."""
-    return _tensor([_spline(axis, column, 1) for axis, column in zip(axes, x.T, strict=True)])
+def spline_matrix(axes: list[Array], x: Array, degree: int) -> Array:
+    """Matrix (n, nodes) of splines in a grid at x (n, D), the tensor product of those along its axes.
 
+    Degree 1 is linear (bilinear) interpolation; 3 are cubic (bicubic) not-a-knot splines, of a few values
+    polynomials. The outermost pieces extrapolate.
+    """
+    from scipy.interpolate import make_interp_spline
 
-def spline_matrix(axes: list[Array], x: Array) -> Array:
-    """Matrix (n, nodes) of cubic (bicubic) not-a-knot splines at x (n, D); of a few values, polynomials."""
-    return _tensor([_spline(axis, column, 3) for axis, column in zip(axes, x.T, strict=True)])
+    product = np.ones((len(x), 1))
+    for axis, column in zip(axes, x.T, strict=True):
+        spline = make_interp_spline(axis, np.eye(len(axis)), k=min(degree, len(axis) - 1))
+        product = (product[:, :, None] * spline(column)[:, None]).reshape(len(x), -1)
+    return product
 
 
 def thin_plate_matrix(nodes: Array, x: Array) -> Array:
-    """Matrix (n, nodes) of thin-plate splines through nodes (nodes, D) anywhere, at x (n, D).
+    """Matrix (n, nodes) of thin-plate splines through nodes (nodes, 2) anywhere, at x (n, 2).
 
     The solution has the smallest norm, as all settings of two controls may be on one line. SciPy's
     `RBFInterpolator` refuses those as singular.
@@ -39,8 +44,6 @@ def thin_plate_matrix(nodes: Array, x: Array) -> Array:
 
     def kernel(a: Array, b: Array) -> Array:
         r2 = ((a[:, None] - b[None]) ** 2).sum(axis=-1)
-        if a.shape[1] == 1:
-            return r2 * np.sqrt(r2)
         return 0.5 * r2 * np.log(np.maximum(r2, 1e-300))
 
     S, D = nodes.shape
@@ -61,19 +64,3 @@ def powers_up_to(nodes: Array, degree: int) -> Array:
 def monomials(x: Array, powers: Array) -> Array:
     """Products of powers (K, D) of the controls (n, D); (n, K)."""
     return np.asarray(np.prod(x[:, None] ** powers, axis=2))
-
-
-def _tensor(matrices: list[Array]) -> Array:
-    """Weights on a grid, the tensor product of those along its axes."""
-    product = matrices[0]
-    for more in matrices[1:]:
-        product = (product[:, :, None] * more[:, None]).reshape(len(product), -1)
-    return product
-
-
-def _spline(axis: Array, x: Array, degree: int) -> Array:
-    """(n, S) weights of the values at the knots in a spline at x; the outermost pieces extrapolate."""
-    from scipy.interpolate import make_interp_spline
-
-    spline = make_interp_spline(axis, np.eye(len(axis)), k=min(degree, len(axis) - 1))
-    return np.asarray(spline(x), dtype=float)

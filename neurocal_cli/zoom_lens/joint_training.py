@@ -19,8 +19,8 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions
 from neurocal_cli.zoom_lens.network_training import updated_precision
 from neurocal_cli.zoom_lens.parameter_networks import LensNets
-from neurocal_cli.zoom_lens.quadratic_error import QuadraticError, gauss_newton, inverse, with_scatter
-from neurocal_cli.zoom_lens.setting_normals import Constants, Normal, PixelData
+from neurocal_cli.zoom_lens.quadratic_error import QuadraticError, inverse, with_scatter
+from neurocal_cli.zoom_lens.setting_normals import Constants, PixelData
 
 # 2 E is chi-squared: a change of 1 is one standard deviation of a single parameter. The training stops far
 # below that; test_alternating_ends_where_joint_training_ends checks that its end does not depend on the way.
@@ -61,39 +61,21 @@ class Joint:
 
 
 def train_joint(
-    data: PixelData,
-    x: Array,
-    nets: LensNets,
-    constants: Constants,
-    variance: float,
-    scatter: Array,
-    report: Callable[[float], None] | None = None,
-    descend: Callable[[JointLearner], float] | None = None,
+    learner: JointLearner, descend: Callable[[JointLearner], float], report: Callable[[float], None]
 ) -> Joint:
     """Minimise E, starting from networks that were fitted one at a time.
 
     Parameters
     ----------
-    data : PixelData
-    x : (S, D) array
-        Scaled controls of the settings.
-    nets : LensNets
-    constants : Constants
-    variance : float [px^2]
-        Of the noise of one coordinate.
-    scatter : (L,) array
-        Variance of each local parameter from setting to setting.
-    report : callable, optional
+    learner : JointLearner
+    descend : callable
+        Lowers 2 E on the present normal matrices and returns it: `JointLearner.descend`, or `take_turns`.
+    report : callable
         Called with the share that is done.
-    descend : callable, optional
-        Lowers 2 E on the present normal matrices and returns it; default `JointLearner.descend`.
     """
-    descend = descend or JointLearner.descend
-    learner = JointLearner(data, x, nets, constants, variance, scatter)
     converged = False
     for round_ in range(_ROUNDS):
-        if report is not None:
-            report(round_ / _ROUNDS)
+        report(round_ / _ROUNDS)
         before = learner.linearise()
         if round_ < _PRIOR_ROUNDS:
             learner.update_priors()
@@ -106,7 +88,20 @@ def train_joint(
 
 
 class JointLearner:
-    """Networks and constants in training, with the normal matrices of the settings."""
+    """Networks and constants in training, with the normal matrices of the settings.
+
+    Parameters
+    ----------
+    data : PixelData
+    x : (S, D) array
+        Scaled controls of the settings.
+    nets : LensNets
+    constants : Constants
+    variance : float [px^2]
+        Of the noise of one coordinate.
+    scatter : (L,) array
+        Variance of each local parameter from setting to setting.
+    """
 
     def __init__(
         self, data: PixelData, x: Array, nets: LensNets, constants: Constants, variance: float, scatter: Array
@@ -121,15 +116,7 @@ class JointLearner:
         self.normal = with_scatter(normal, self.scatter, self.variance)
         self.error = QuadraticError(self.x, self.reference, self.normal, self.variance)
         self.shared = np.zeros(self.data.n_shared)
-        return self.cost(self.nets, self.shared)
-
-    def cost(self, nets: LensNets, shared: Array) -> float:
-        """2 E on the present normal matrices, after a step `shared` of the constants."""
-        return self.error.cost(nets, shared)
-
-    def system(self) -> tuple[Array, Array]:
-        """Gauss-Newton matrix and downhill direction of E over all weights and the constants."""
-        return self.error.system(self.nets, self.shared)
+        return self.error.cost(self.nets, self.shared)
 
     def descend(self) -> float:
         """Levenberg-Marquardt on the present normal matrices; 2 E at the end."""
@@ -143,7 +130,7 @@ class JointLearner:
 
     def update_priors(self) -> None:
         """Update the priors by MacKay's formula, half the way on a logarithmic scale."""
-        N, _ = self.system()
+        N, _ = self.error.system(self.nets, self.shared)
         leverage = np.diagonal(inverse(N))
         nets, start = [], 0
         for net in self.nets.nets:
@@ -158,14 +145,8 @@ class JointLearner:
 
     def result(self, converged: bool) -> Joint:
         """Result of the training; call `linearise` before."""
-        N, _ = self.system()
-        cost = self.cost(self.nets, self.shared)
+        N, _ = self.error.system(self.nets, self.shared)
+        cost = self.error.cost(self.nets, self.shared)
         _, volume = np.linalg.slogdet(N)
         evidence = -0.5 * cost - 0.5 * volume + 0.5 * float(np.log(self.nets.prior).sum())
         return Joint(self.nets, self.constants, cost, inverse(N), float(evidence), converged)
-
-
-def posterior(x: Array, nets: LensNets, normal: Normal, variance: float, scatter: Array) -> Array:
-    """Covariance of all weights and the constants (P + Q, P + Q), from normal matrices of the settings."""
-    J = np.concatenate(nets.local_with_jacobians(x)[1], axis=2)
-    return inverse(gauss_newton(J, with_scatter(normal, scatter, variance).H / variance, nets.prior))

@@ -40,15 +40,10 @@ def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict | 
         return None
     measures = {
         "held_out_px": lens.left_out_px,
-        "precision_px": _floor(lens),
+        "precision_px": lens.noise_floor_px,
         "alpha_share": _alpha_share(lens),
     }
     return verdict_of((*_findings(lens), _elsewhere(lens, elsewhere_px)), measures)
-
-
-def _floor(lens: ZoomLens) -> float:
-    """Rms error [px] of a separate camera at each setting, freedom accounted for."""
-    return float(np.sqrt(2 * lens.variance))
 
 
 def _alpha_share(lens: ZoomLens) -> float:
@@ -73,7 +68,7 @@ def _between(lens: ZoomLens) -> Array:
 
 def _elsewhere(lens: ZoomLens, px: float) -> Finding:
     """What the error at other points says, such as at settings between."""
-    floor = _floor(lens)
+    floor = lens.noise_floor_px
     return (
         _BETWEEN.grade(px / max(floor, 1e-9)),
         f"the error at the given points is {px:.3g} px, but the noise floor {floor:.3g} px",
@@ -88,7 +83,7 @@ def _findings(lens: ZoomLens) -> Iterator[Finding]:
             "training did not converge, so the settings may contradict each other",
             "check that the lens returns to the same position; give more settings or a simpler --distortion",
         )
-    floor = _floor(lens)
+    floor = lens.noise_floor_px
     rejected = lens.rejected
     if rejected:
         total = len(lens.settings) + len(rejected)

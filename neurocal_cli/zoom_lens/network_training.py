@@ -110,9 +110,6 @@ def train(
     variance: Array,
     weights: Array,
     schedule: Schedule | None = None,
-    include: NDArray[np.bool_] | None = None,
-    precision: Array | None = None,
-    scatter: Array | None = None,
 ) -> TrainedNets:
     """Train a stack of networks, all at once.
 
@@ -128,13 +125,8 @@ def train(
     weights : (B, P) array
         Initial weights.
     schedule : Schedule, optional
-    include : (B, n) bool array, optional
-        Settings on which each network is trained; default all.
-    precision, scatter : (B, G), (B,) arrays, optional
-        Initial values, which remain if the schedule never reaches `warm`.
     """
-    learner = _NetworkStack(topology, x, targets, variance, weights, include)
-    learner.set_priors(precision, scatter)
+    learner = _NetworkStack(topology, x, targets, variance, weights)
     schedule = schedule or Schedule()
     descent = LevenbergMarquardt(learner, _OPTIONS, floor=-1.0)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
@@ -152,38 +144,22 @@ _Trial = tuple[Array, Array, Array, Array]  # weights, outputs, their derivative
 class _NetworkStack:
     """Networks in training as a problem of `least_squares`: each network is a group of cost 2 E."""
 
-    def __init__(
-        self,
-        topology: Topology,
-        x: Array,
-        targets: Array,
-        variance: Array,
-        weights: Array,
-        include: NDArray[np.bool_] | None,
-    ) -> None:
+    def __init__(self, topology: Topology, x: Array, targets: Array, variance: Array, weights: Array) -> None:
         self.topology, self.x, self.targets, self.variance = topology, x, targets, variance
         self.w = weights
-        B, n = len(weights), len(x)
-        self.include = np.ones((B, n)) if include is None else include.astype(float)
-        self.count = self.include.sum(axis=1)
         self.kinds = topology.membership
         self.sizes = self.kinds.sum(axis=1)
         self.diagonal = range(topology.n_weights)
-
-    def set_priors(self, precision: Array | None, scatter: Array | None) -> None:
-        """Begin with precisions (B, groups) of the weights and scatters (B,), or with their usual values."""
-        B = len(self.w)
-        self.a = np.full((B, self.topology.n_groups), 0.3) if precision is None else precision
+        self.a = np.full((len(weights), topology.n_groups), 0.3)
         # For targets without a variance, a thousandth of their spread until the noise is estimated.
-        unknown = 1e-6 if not self.variance.any() else 0.0
-        self.tau2 = np.full(B, unknown) if scatter is None else scatter
-        self.y, self.J = respond_with_jacobian(self.topology, self.w, self.x)
+        self.tau2 = np.full(len(weights), 0.0 if variance.any() else 1e-6)
+        self.y, self.J = respond_with_jacobian(topology, weights, x)
         self._weigh()
 
     def _weigh(self) -> None:
         """Apply new priors and scatter."""
         self.prior = prior_precision(self.topology, self.a)
-        self.weight = self.include / (self.variance + self.tau2[:, None])
+        self.weight = 1 / (self.variance + self.tau2[:, None])
         self.cost = self._cost(self.w, self.y)
 
     def _cost(self, w: Array, y: Array) -> Array:
@@ -228,12 +204,12 @@ class _NetworkStack:
         self.a = np.sqrt(self.a * updated_precision(effective, squares, self.x))
         if allow_scatter:
             gamma = self.topology.n_weights - (self.prior * leverage).sum(axis=1)
-            self._update_scatter(np.maximum(self.count - gamma, 0.05 * self.count))
+            self._update_scatter(np.maximum(len(self.x) - gamma, 0.05 * len(self.x)))
         self._weigh()
 
     def _update_scatter(self, freedom: Array) -> None:
         """Update tau^2 so that the squared errors have their expected size; 0 if they are smaller."""
-        squares = self.include * (self.y - self.targets) ** 2
+        squares = (self.y - self.targets) ** 2
         total = self.variance + self.tau2[:, None]
         ratio = (squares / total).sum(axis=1) / freedom
         known = self.variance.any()
@@ -247,7 +223,7 @@ class _NetworkStack:
         sign, volume = np.linalg.slogdet(self._normal())
         volume = np.where(sign > 0, volume, np.inf)
         log_prior = 0.5 * np.log(self.prior).sum(axis=1)
-        noise = (self.include * np.log(self.variance + self.tau2[:, None])).sum(axis=1)
+        noise = np.log(self.variance + self.tau2[:, None]).sum(axis=1)
         # Symmetric permutations of the weights are not counted, as idle units have none.
         evidence = -0.5 * self.cost - 0.5 * volume + log_prior - 0.5 * noise
         return TrainedNets(

@@ -26,7 +26,7 @@ def bad_pixels(rms: Array) -> tuple[int, str] | None:
 
 
 def most_suspect(pixels: Array, normalised: Array) -> int | None:
-    """The setting that the others predict worst, if far worse than the rest; of (S,) `LeftOutErrors`."""
+    """The setting that the others predict worst, if far worse than the rest; of (S,) `left_out_errors`."""
     worst = int((normalised * pixels).argmax())
     return worst if pixels[worst] > _SUSPECT * np.median(pixels) else None
 
@@ -49,6 +49,6 @@ def contradiction(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str
     own = lens.variance * np.linalg.pinv(H, hermitian=True)
     sigmas = float(np.sqrt(error @ np.linalg.solve(prediction.covariance[0, :L, :L] + own, error) / L))
     pixels = float(np.sqrt(max(error @ H @ error, 0.0) / max(tables.normal.H[s, 2, 2], 1.0)))
-    if sigmas < _SIGMAS or pixels < _LEAST_ERROR * np.sqrt(2 * lens.variance):
+    if sigmas < _SIGMAS or pixels < _LEAST_ERROR * lens.noise_floor_px:
         return None
     return f"it is {pixels:.3g} px and {sigmas:.0f} standard deviations off what the other settings predict"

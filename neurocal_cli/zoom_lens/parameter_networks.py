@@ -115,11 +115,12 @@ class LensNets:
         """(n, L) local parameters at scaled controls (n, D)."""
         return outputs_to_local(self.scale, np.column_stack([net.output(x) for net in self.nets]))[0]
 
-    def local_with_jacobians(self, x: Array) -> tuple[Array, list[Array]]:
-        """Local parameters (n, L) and their derivatives by each network's weights (n, L, P)."""
+    def local_with_jacobian(self, x: Array) -> tuple[Array, Array]:
+        """Local parameters (n, L) and their derivatives by all weights (n, L, P)."""
         pairs = [net.output_with_jacobian(x) for net in self.nets]
         local, by_output = outputs_to_local(self.scale, np.column_stack([y for y, _ in pairs]))
-        return local, [by_output[:, :, j, None] * J[:, None] for j, (_, J) in enumerate(pairs)]
+        parts = [by_output[:, :, j, None] * J[:, None] for j, (_, J) in enumerate(pairs)]
+        return local, np.concatenate(parts, axis=2)
 
     def local_scatter(self, local: Array) -> Array:
         """(L,) variance of the local parameters from setting to setting; `local` (S, L) are their values."""

@@ -106,7 +106,7 @@ def _draw_parameter(axes: Axes, lens: ZoomLens, j: int, name: str) -> None:
 
     slices = _slices(lens)
     L = len(lens.names)
-    C, _ = local_covariance(lens.tables.normal, L, lens.variance)
+    C = local_covariance(lens.tables.normal, L, lens.variance)
     error = 2 * np.sqrt(np.maximum(C[:, j, j], 0.0))
     along = np.linspace(lens.low[0], lens.high[0], _FINE)
     for k, (value, members) in enumerate(slices):

@@ -45,8 +45,8 @@ class LocalModel(Protocol):
         """(n, L) local parameters at scaled controls (n, D)."""
         ...
 
-    def local_with_jacobians(self, x: Array) -> tuple[Array, list[Array]]:
-        """Local parameters and their derivatives by parts of the weights, (n, L, part) each."""
+    def local_with_jacobian(self, x: Array) -> tuple[Array, Array]:
+        """Local parameters and their derivatives by the weights (n, L, P)."""
         ...
 
 
@@ -83,8 +83,7 @@ class QuadraticError:
 
     def system(self, model: LocalModel, shared: Array) -> tuple[Array, Array]:
         """Gauss-Newton matrix and downhill direction of E over all weights and the constants."""
-        local, jacobians = model.local_with_jacobians(self.x)
-        J, prior = np.concatenate(jacobians, axis=2), model.prior
+        (local, J), prior = model.local_with_jacobian(self.x), model.prior
         pull = (self.normal.g - self.offset(local, shared)[1]) / self.variance
         L, P = J.shape[1:]
         rhs = np.empty(P + pull.shape[1] - L)

@@ -41,8 +41,7 @@ def lens_report(lens: ZoomLens) -> str:
         tail.append(f"scatter of the cameras around the networks: {_scatter_text(lens, scatter)}")
     else:
         tail.append(
-            f"reprojection error: rms {lens.rmse_px:.3f} px; noise floor {np.sqrt(2 * lens.variance):.3f} "
-            "px; "
+            f"reprojection error: rms {lens.rmse_px:.3f} px; noise floor {lens.noise_floor_px:.3f} px; "
             f"cross-validation error, each setting left out in turn: {lens.left_out_px:.3f} px"
         )
     scale = _SCALES[lens.members[0].nets.scale]
@@ -69,7 +68,7 @@ def lens_json(lens: ZoomLens) -> dict[str, Any]:
         "still": bool(lens.still),
         "known_cameras": bool(lens.known),
         "rmse_px": number_or_none(float(lens.rmse_px)),
-        "noise_floor_px": None if lens.known else number_or_none(float(np.sqrt(2 * lens.variance))),
+        "noise_floor_px": None if lens.known else number_or_none(lens.noise_floor_px),
         "left_out_px": number_or_none(float(lens.left_out_px)),
         "members": len(lens.members),
         "target": target_json(lens.target, lens.unit),
@@ -133,8 +132,7 @@ def evaluation_report(
         settings.append([*numbers, str(setting.n_points), _pixels(setting.rmse_px), _pixels(setting.max_px)])
     head = (
         f"{evaluation.n_points} points at {len(evaluation.settings)} settings: rms "
-        f"{_pixels(evaluation.rmse_px)} px, "
-        f"maximum {_pixels(evaluation.max_px)} px"
+        f"{_pixels(evaluation.rmse_px)} px, maximum {_pixels(evaluation.max_px)} px"
     )
     title = "settings with the largest error:" if len(evaluation.settings) > len(shown) else "settings:"
     blocks = [[head], align(_baseline_rows(evaluation)), [title, *align(settings)]]

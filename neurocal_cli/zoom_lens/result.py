@@ -25,9 +25,7 @@ def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOpti
     """The lens without its errors and warnings."""
     still = start.data.still
     scatter = np.min([joint.nets.local_scatter(start.tables.local) for joint in joints], axis=0)
-    averaged = fit_local(
-        start.data, start.tables.local, first_constants(start.static, start.lens, options.still)
-    )
+    averaged = fit_local(start.data, start.tables.local, first_constants(start.static, start.lens, still))
     return ZoomLens(
         controls=start.lens.controls,
         settings=start.lens.settings,
@@ -35,9 +33,7 @@ def provisional(start: CalibratedSettings, joints: list[Joint], options: FitOpti
         model=start.data.model,
         still=still,
         known=False,
-        members=tuple(
-            Member(joint.nets, _without_views(joint.constants, start.data.still)) for joint in joints
-        ),
+        members=tuple(Member(joint.nets, _without_views(joint.constants, still)) for joint in joints),
         tables=replace(start.tables, constants=_without_views(start.tables.constants, still)),
         static=replace(averaged, constants=_without_views(averaged.constants, still)),
         variance=start.variance,
@@ -77,9 +73,8 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
     constants = replace(constants, theta=float(np.mean([joint.constants.theta for joint in joints])))
     there, _ = start.data.linearise(local, constants)
     rmse = np.sqrt(there.cost / start.data.counts)
-    errors = [left_out_errors(start, joint) for joint in joints]
     # The linearisation fails for a member now and then, so the median counts.
-    squares = np.median([e.pixels**2 for e in errors], axis=0)
+    squares = np.median([left_out_errors(start, joint)[0] ** 2 for joint in joints], axis=0)
     left_out = float(np.sqrt((squares * start.data.counts).sum() / len(start.lens.points)))
     tables_rms = float(np.sqrt(start.tables.normal.cost.sum() / len(start.lens.points)))
     finished = replace(lens, rmse=rmse, left_out_px=left_out)
@@ -113,8 +108,7 @@ def _warnings(lens: ZoomLens, start: CalibratedSettings, tables_rms: float) -> t
     if lens.rmse_px > _POOR_FIT * tables_rms:
         warnings.append(
             f"the error of the networks is {lens.rmse_px:.3g} px, that of separate settings {tables_rms:.3g} "
-            "px: "
-            "the lens does not return to the same position, or changes too much between the settings; give "
-            "more settings"
+            "px: the lens does not return to the same position, or changes too much between the settings; "
+            "give more settings"
         )
     return tuple(warnings)

@@ -88,6 +88,11 @@ class LensPoints:
         """(N,) number of the setting of each point."""
         return self.view_setting[self.points.view_index]
 
+    @property
+    def columns(self) -> dict[str, Array]:
+        """(N,) value of each control at each point."""
+        return dict(zip(self.controls, self.settings[self.point_setting].T, strict=True))
+
     def varying(self) -> LensPoints:
         """Remove controls that never change.
 
@@ -108,9 +113,9 @@ class LensPoints:
 
     def select(self, keep: NDArray[np.bool_]) -> LensPoints:
         """Keep some of the settings; keep is (S,)."""
-        columns = dict(zip(self.controls, self.settings[self.point_setting].T, strict=True))
         rows = keep[self.point_setting]
-        return LensPoints.grouped(self.points.select(rows), {name: c[rows] for name, c in columns.items()})
+        columns = {name: column[rows] for name, column in self.columns.items()}
+        return LensPoints.grouped(self.points.select(rows), columns)
 
 
 def describe(controls: tuple[str, ...], setting: Array) -> str:

@@ -39,8 +39,6 @@ class StaticFit:
         Pose of each view.
     good : (S,) bool array
         Where the calibration succeeded. Elsewhere the values are those of the nearest good setting.
-    rmse : (S,) array [px]
-        nan where it failed.
     reasons : dict of str by setting
         Of the failures.
     """
@@ -50,7 +48,6 @@ class StaticFit:
     R: Array
     t: Array
     good: NDArray[np.bool_]
-    rmse: Array
     reasons: dict[int, str]
 
 
@@ -67,7 +64,7 @@ def calibrate_each(
     S, V = lens.n_settings, lens.points.n_views
     local = np.zeros((S, len(data.names)))
     theta, R, t = np.full(S, np.pi / 2), np.tile(np.eye(3), (V, 1, 1)), np.zeros((V, 3))
-    rmse, reasons = np.full(S, np.nan), {}
+    good, reasons = np.zeros(S, dtype=bool), {}
     number = {name: k for k, name in enumerate(lens.points.view_names)}
     rows = lens.point_setting
     for s in range(S):
@@ -84,15 +81,14 @@ def calibrate_each(
         local[s, : 4 + data.still] = [K.alpha_u, K.alpha_v, K.u0, K.v0, *t_z]
         if cal.distortion_model == data.model:
             local[s, 4 + data.still :] = cal.distortion
-        theta[s], rmse[s] = K.theta, cal.rmse_px
-    good = np.isfinite(rmse)
+        theta[s], good[s] = K.theta, np.isfinite(cal.rmse_px)
     _refuse_failures(lens, good, reasons)
     nearest = _nearest_good(lens, good)
     for v, s in enumerate(lens.view_setting):
         if not good[s]:
             donor = int(np.flatnonzero(lens.view_setting == nearest[s])[0])
             R[v], t[v] = R[donor], t[donor]
-    return StaticFit(local[nearest], theta[nearest], R, t, good, rmse, reasons)
+    return StaticFit(local[nearest], theta[nearest], R, t, good, reasons)
 
 
 def _calibrate(points: Correspondences, model: str, seed: int, skew: bool) -> Calibration:
@@ -209,7 +205,7 @@ class _CommonTables:
             self.local, self.constants, self.normal = trial
 
 
-def local_covariance(normal: Normal, L: int, variance: float) -> tuple[Array, Array]:
-    """Covariance of each setting's local parameters (S, L, L) and of the constants (Q, Q)."""
+def local_covariance(normal: Normal, L: int, variance: float) -> Array:
+    """Covariance of each setting's local parameters (S, L, L)."""
     found = schur_covariance(normal.blocks, np.arange(L, normal.H.shape[1]), np.arange(L))
-    return variance * found.own, variance * found.shared
+    return variance * found.own

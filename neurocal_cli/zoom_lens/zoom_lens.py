@@ -11,8 +11,8 @@ from neurocal_cli.errors import InputError, UsageError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.target import Target
-from neurocal_cli.zoom_lens.joint_training import posterior
 from neurocal_cli.zoom_lens.parameter_networks import LensNets
+from neurocal_cli.zoom_lens.quadratic_error import gauss_newton, inverse, with_scatter
 from neurocal_cli.zoom_lens.setting_normals import Constants, Tables
 from neurocal_cli.zoom_lens.settings import describe, scaled_controls
 from neurocal_cli.zoom_lens.target_coupling import with_target_uncertain
@@ -142,6 +142,11 @@ class ZoomLens:
         """Rms reprojection error over all points [px]."""
         return float(np.sqrt((self.rmse**2 * self.counts).sum() / max(self.counts.sum(), 1)))
 
+    @property
+    def noise_floor_px(self) -> float:
+        """Rms error of a separate camera at each setting, freedom accounted for [px]."""
+        return float(np.sqrt(2 * self.variance))
+
     def scaled(self, settings: Array) -> Array:
         """Settings on the scale of the networks' inputs, -1 to 1."""
         return scaled_controls(settings, self.low, self.high)
@@ -150,22 +155,15 @@ class ZoomLens:
     def posteriors(self) -> tuple[Array, ...]:
         """Covariance of each member's weights and constants."""
         x = self.scaled(self.settings)
-        found = tuple(
-            posterior(x, member.nets, self.tables.normal, self.variance, self.scatter)
-            for member in self.members
-        )
-        coupling = self.target_coupling
-        if coupling is None:
-            return found
-        return tuple(
-            with_target_uncertain(
-                covariance,
-                np.concatenate(member.nets.local_with_jacobians(x)[1], axis=2),
-                coupling,
-                self.variance,
-            )
-            for covariance, member in zip(found, self.members, strict=True)
-        )
+        H = with_scatter(self.tables.normal, self.scatter, self.variance).H / self.variance
+        found = []
+        for member in self.members:
+            _, J = member.nets.local_with_jacobian(x)
+            covariance = inverse(gauss_newton(J, H, member.nets.prior))
+            if self.target_coupling is not None:
+                covariance = with_target_uncertain(covariance, J, self.target_coupling, self.variance)
+            found.append(covariance)
+        return tuple(found)
 
     def setting_of(
         self, values: dict[str, float | None], extrapolate: bool = False
@@ -217,7 +215,7 @@ class ZoomLens:
             A scale factor is not positive, which happens only far outside the calibrated range.
         """
         x = self.scaled(np.asarray(settings, dtype=float))
-        pairs = [member.nets.local_with_jacobians(x) for member in self.members]
+        pairs = [member.nets.local_with_jacobian(x) for member in self.members]
         locals_ = np.array([local for local, _ in pairs])
         valid = (np.isfinite(locals_).all(axis=2) & (locals_[:, :, :2] > 0).all(axis=2)).all(axis=0)
         if not valid.all():
@@ -241,9 +239,8 @@ class ZoomLens:
         return Prediction(locals_.mean(axis=0), constants, covariance)
 
 
-def _spread(jacobians: list[Array], covariance: Array, Q: int) -> Array:
+def _spread(J: Array, covariance: Array, Q: int) -> Array:
     """Covariance of local parameters and constants (n, L + Q, L + Q) from that of the weights."""
-    J = np.concatenate(jacobians, axis=2)
     n, L, P = J.shape
     full = np.zeros((n, L + Q, P + Q))
     full[:, :L, :P] = J

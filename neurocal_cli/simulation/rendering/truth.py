@@ -68,12 +68,9 @@ class Truth:
     ----------
     planes : tuple of PlaneTruth
         In the order of the scene's targets.
-    clearance : float [px]
-        Distance from a visible point within which nothing hides its plane.
     """
 
     planes: tuple[PlaneTruth, ...]
-    clearance: float
 
 
 def ground_truth(scene: Scene, clearance: float | None = None) -> Truth:
@@ -83,12 +80,11 @@ def ground_truth(scene: Scene, clearance: float | None = None) -> Truth:
     ----------
     scene : Scene
     clearance : float, optional [px]
-        See `Truth`; three times the blur (pixel included) by default.
+        Distance from a visible point within which nothing hides its plane; three times the blur (pixel
+        included) by default.
     """
-    distance = 3 * scene.sigma_t if clearance is None else float(clearance)
-    sight = _Sight(scene, distance)
-    planes = tuple(_plane_truth(scene, sight, k) for k in range(len(scene.targets)))
-    return Truth(planes, distance)
+    sight = _Sight(scene, 3 * scene.sigma_t if clearance is None else clearance)
+    return Truth(tuple(_plane_truth(scene, sight, k) for k in range(len(scene.targets))))
 
 
 def _plane_truth(scene: Scene, sight: _Sight, index: int) -> PlaneTruth:
