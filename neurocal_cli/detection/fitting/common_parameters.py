@@ -20,7 +20,8 @@ from neurocal_cli.detection.fitting.batched_newton import (
     ProfileShape,
     rows_for,
 )
-from neurocal_cli.detection.fitting.edge_fit import OFFSET, EdgeData
+from neurocal_cli.detection.fitting.edge_fit import OFFSET
+from neurocal_cli.detection.fitting.edge_pixels import EdgePixels
 from neurocal_cli.detection.fitting.edge_profile import (
     RESPONSE_TERMS,
     erf_and_density,
@@ -98,7 +99,7 @@ class PixelNoise:
 
 
 def profile_shape(
-    data: EdgeData, fit: BatchFit, shape: ProfileShape, good: NDArray[np.bool_]
+    data: EdgePixels, fit: BatchFit, shape: ProfileShape, good: NDArray[np.bool_]
 ) -> ProfileShape:
     """Improve the shape of the profile by linear least squares on the residuals of all fits.
 
@@ -106,7 +107,7 @@ def profile_shape(
 
     Parameters
     ----------
-    data : EdgeData
+    data : EdgePixels
     fit : BatchFit
     shape : ProfileShape
         The shape used in these fits.

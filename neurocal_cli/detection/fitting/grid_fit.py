@@ -11,7 +11,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import CONTRAST, MEAN, BatchFit, ProfileShape
+from neurocal_cli.detection.fitting.batched_newton import (
+    CONTRAST,
+    MEAN,
+    BatchFit,
+    ProfileShape,
+    fit_batch,
+)
 from neurocal_cli.detection.fitting.common_parameters import (
     BoardBlur,
     FieldBlur,
@@ -19,15 +25,8 @@ from neurocal_cli.detection.fitting.common_parameters import (
     level_prior,
     profile_shape,
 )
-from neurocal_cli.detection.fitting.edge_fit import (
-    OFFSET,
-    EdgeData,
-    fit_edges,
-    light_at,
-    moments,
-    with_weight,
-)
-from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.edge_fit import OFFSET, edge_model, light_at, moments
+from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, EdgePixels, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of
@@ -36,7 +35,13 @@ from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Levels, LocalShading, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
-from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
+from neurocal_cli.detection.fitting.vertex_fit import (
+    FIRST,
+    SECOND,
+    vertex_lines,
+    vertex_model,
+    vertex_pixels,
+)
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
@@ -169,7 +174,7 @@ class GridFit:
     ----------
     lines : Lines
     fit : BatchFit
-    data : EdgeData
+    data : EdgePixels
     map : MapFit
     shading : Shading
     shape : ProfileShape
@@ -180,7 +185,7 @@ class GridFit:
 
     lines: Lines
     fit: BatchFit
-    data: EdgeData
+    data: EdgePixels
     map: MapFit
     shading: Shading
     shape: ProfileShape
@@ -315,9 +320,9 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
 
 def _fine_fit(
     grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading
-) -> tuple[BatchFit, EdgeData, ProfileShape, PixelNoise]:
+) -> tuple[BatchFit, EdgePixels, ProfileShape, PixelNoise]:
     """Fits to all pixels, with levels, blur, profile and noise of the whole board."""
-    n, half_length = len(first.good), 0.5 * lines.length
+    n = len(first.good)
     shape = profile_shape(first.data, first.fit, first.shape, first.good)
     noise = PixelNoise.of(first.fit, first.data.root, grid_image.floor)
     sigma, spread = _blur(first, lines, lines)
@@ -328,15 +333,15 @@ def _fine_fit(
         # A fit that went astray in the dark of the rim starts at the map again.
         offset = np.where(first.good, offset, first.map.shift[0])
     start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
-    data = with_weight(data, noise.weights(light_at(data, start)))
-    fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
+    data = data.weighed(noise.weights(light_at(data, start)))
+    fit = fit_batch(edge_model, data, start, prior, shape, _STEPS)
     usual = upper_median(sigma)
     if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # The profile, estimated from a part of the pixels, is now the largest error: estimate it again.
         shape = profile_shape(data, fit, shape, first.good)
         noise = PixelNoise.of(fit, data.root, grid_image.floor)
-        data = with_weight(data, noise.weights(fit.linear.x))
-        fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
+        data = data.weighed(noise.weights(fit.linear.x))
+        fit = fit_batch(edge_model, data, fit.values, prior, shape, _STEPS)
     return fit, data, shape, noise
 
 
@@ -353,8 +358,8 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     if fitted.shape.half is not None:
         shape = replace(shape, half=half_widths(lines.normal))
     start = np.concatenate([np.full((n, 1), shift), np.zeros((n, 1)), prior.mean], axis=1)
-    data = with_weight(data, fitted.noise.weights(light_at(data, start)))
-    fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, _STEPS)
+    data = data.weighed(fitted.noise.weights(light_at(data, start)))
+    fit = fit_batch(edge_model, data, start, prior, shape, _STEPS)
     variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
     departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
     # A rim that is bad all around would agree with itself.
@@ -372,22 +377,17 @@ def fit_grid_vertices(
     place = lines[0].middle
     (first, spread), (second, _) = (_blur(fitted, fitted.lines, line) for line in lines)
     sigma = 0.5 * (first + second)
-    contrast = fitted.shading.at(place)[1]
-    slopes = fitted.shading.slopes(place)
-    data = vertex_data(
-        grid_image.image, lines, light, sigma, REACH, slopes, contrast, _ends(grid_image.grid.seen)
-    )
+    data = vertex_pixels(grid_image.image, lines, light, sigma, fitted.shading, _ends(grid_image.grid.seen))
     tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
     shape = ProfileShape(tails, fitted.shape.nonlinearity)
     if fitted.shape.half is not None:
         shape = replace(shape, half=np.stack([half_widths(line.normal) for line in lines], axis=1))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
-    half = (0.5 * lines[0].length, 0.5 * lines[1].length)
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
-    fit = fit_vertices(unit, start, prior, half, shape, _STEPS)
-    root = np.sqrt(fitted.noise.weights(fit.linear.x)) * (data.root > 0)
-    fit = fit_vertices(replace(data, root=root), fit.values, prior, half, shape, _STEPS)
+    fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
+    data = data.weighed(fitted.noise.weights(fit.linear.x))
+    fit = fit_batch(vertex_model, data, fit.values, prior, shape, _STEPS)
     fit = fit.scaled(max(upper_median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):

@@ -9,10 +9,22 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import BLUR, BatchFit, LevelPrior, ProfileShape
+from neurocal_cli.detection.fitting.batched_newton import (
+    BLUR,
+    BatchFit,
+    LevelPrior,
+    ProfileShape,
+    fit_batch,
+)
 from neurocal_cli.detection.fitting.common_parameters import profile_shape
-from neurocal_cli.detection.fitting.edge_fit import EdgeData, fit_edges, with_weight
-from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.edge_fit import edge_model
+from neurocal_cli.detection.fitting.edge_pixels import (
+    REACH,
+    SHARP,
+    EdgePixels,
+    edge_pixels,
+    usual_stride,
+)
 from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis
 from neurocal_cli.detection.fitting.fit_quality import is_typical
 from neurocal_cli.detection.fitting.pixel_box import half_widths
@@ -38,13 +50,12 @@ class InitialFit:
 
     Attributes
     ----------
-    data : EdgeData
-        The pixels used.
+    data : EdgePixels
     fit : BatchFit
     shape : ProfileShape
     """
 
-    data: EdgeData
+    data: EdgePixels
     fit: BatchFit
     shape: ProfileShape
 
@@ -95,28 +106,28 @@ def _few_steps(
     image: NDArray[np.generic], lines: Lines, start: Array, known: Array, shading: Shading, noise: float
 ) -> InitialFit:
     """A few steps, to estimate the blur; known (E, 3) are mean level, contrast and blur."""
-    blur, half_length = known[:, 2], 0.5 * lines.length
+    blur = known[:, 2]
     data = edge_pixels(image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
-    data = with_weight(data, np.full_like(data.root, 1 / noise))
+    data = data.weighed(np.full_like(data.root, 1 / noise))
     spread = known * [0.0, 0.0, _LOOSE_BLUR] + known[:, 1:2] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
     prior = LevelPrior(known.copy(), (1 / spread**2)[:, :, None] * np.eye(3))
     shape = _blur_profiles(lines, float(blur[0]))[-1]
-    return InitialFit(data, fit_edges(data, start, prior, half_length, shape, _FEW_STEPS, 0), shape)
+    return InitialFit(data, fit_batch(edge_model, data, start, prior, shape, _FEW_STEPS, 0), shape)
 
 
 def _with_best_profile(started: InitialFit, lines: Lines, sigma: float) -> InitialFit:
     """Continue the fits with the blur profile that gives the lower chi2."""
-    results = [_converged(started, lines, shape) for shape in _blur_profiles(lines, sigma)]
+    results = [_converged(started, shape) for shape in _blur_profiles(lines, sigma)]
     # Prefer the pixel's box: both agree where all edges run along the pixels.
     return results[0] if results[0].rough < _CLEARLY * results[-1].rough else results[-1]
 
 
-def _converged(started: InitialFit, lines: Lines, shape: ProfileShape) -> InitialFit:
-    data, fit, half_length = started.data, started.fit, 0.5 * lines.length
+def _converged(started: InitialFit, shape: ProfileShape) -> InitialFit:
+    data, fit = started.data, started.fit
     if (shape.half is None) != (started.shape.half is None):
-        fit = fit_edges(data, fit.values, fit.prior, half_length, shape, _FEW_STEPS, 0)
+        fit = fit_batch(edge_model, data, fit.values, fit.prior, shape, _FEW_STEPS, 0)
     shape = profile_shape(data, fit, shape, is_typical(fit))
-    return InitialFit(data, fit_edges(data, fit.values, fit.prior, half_length, shape, _STEPS), shape)
+    return InitialFit(data, fit_batch(edge_model, data, fit.values, fit.prior, shape, _STEPS), shape)
 
 
 def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:

@@ -16,6 +16,8 @@ from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_medi
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
+Single = NDArray[np.float32]
+
 _x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
 # Weights of a square's corners in places (64, 4) of its interior, away from the blurred edges.
 _INTERIOR = np.stack([(1 - _x) * (1 - _y), _x * (1 - _y), (1 - _x) * _y, _x * _y], axis=-1)
@@ -80,6 +82,28 @@ class Shading:
         dv = np.stack([zero, zero, one, zero, x, 2 * y], axis=-1) / self.frame.unit
         dark, light = (np.stack([du @ c, dv @ c], axis=-1) for c in (self.dark, self.light))
         return 0.5 * (light + dark), 0.5 * (light - dark)
+
+    def off(self, place: Array, u: Single, v: Single, value: Single) -> tuple[Single, Single]:
+        """Take the slopes of the levels at places (N, 2) off the pixels around them.
+
+        Parameters
+        ----------
+        place : (N, 2) array [px]
+        u, v : (N, M) arrays [px]
+            Of pixels, relative to the places.
+        value : (N, M) array [DN]
+
+        Returns
+        -------
+        value : (N, M) array [DN]
+            Without the slope of the mean level.
+        gain : (N, M) array
+            Half contrast relative to that at the places.
+        """
+        by_mean, by_contrast = (slope.astype(np.float32) for slope in self.slopes(place))
+        by_contrast /= self.at(place)[1].astype(np.float32)[:, None]
+        gain = 1 + u * by_contrast[:, :1] + v * by_contrast[:, 1:]
+        return value - u * by_mean[:, :1] - v * by_mean[:, 1:], gain
 
 
 @frozen_dataclass(eq=False)
