@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,9 +11,10 @@ from support.maps import some_map
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     BatchFit,
+    FitPixels,
     LevelPrior,
     Linearised,
-    Part,
+    ProfileShape,
     fit_batch,
     rows_for,
 )
@@ -89,19 +89,19 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
 def test_fits_settle_where_their_steps_are_too_long() -> None:
     """An arctangent's Gauss-Newton steps from beyond 1.4 lead farther and farther away."""
 
-    def model_of(part: Part) -> Callable[[Array], Linearised]:
-        def model(values: Array) -> Linearised:
-            place = values[:, :1]
-            rows = np.zeros((len(values), 5, 1), dtype=np.float32)
-            rows[:, 0] = -100 * np.arctan(place)
-            rows[:, 1] = 100 / (1 + place**2)
-            return Linearised(rows, rows[:, 0], rows[:, 0])
+    def model(pixels: FitPixels, values: Array, shape: ProfileShape) -> Linearised:
+        place = values[:, :1]
+        rows = np.zeros((len(values), 5, 1), dtype=np.float32)
+        rows[:, 0] = -100 * np.arctan(place)
+        rows[:, 1] = 100 / (1 + place**2)
+        return Linearised(rows, rows[:, 0], rows[:, 0])
 
-        return model
-
+    one = np.ones((20, 1), dtype=np.float32)
+    pixels = FitPixels(one, one, one, one, np.zeros(20))
+    shape = ProfileShape(np.zeros((20, 2)), np.zeros(1))
     start = np.array([[0.3, 0, 1, 5.0]] * 19 + [[4.0, 0, 1, 5.0]])
     prior = LevelPrior(start[:, 1:].copy(), np.tile(np.eye(3) * 1e3, (20, 1, 1)))
-    fit = fit_batch(model_of, start, prior, np.ones(20, dtype=np.int64), 6)
+    fit = fit_batch(model, pixels, start, prior, shape, 6)
     np.testing.assert_allclose(fit.values[:, 0], 0, atol=0.01)
     assert fit.step.max() < 0.5
 
