@@ -152,9 +152,20 @@ class GridImage:
         anchors = Observations.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
         return cls(image, grid, GridEdges.of(grid), anchors, floor)
 
-    def lines(self, at: SmoothMap) -> Lines:
-        """The edges in the image, by a map."""
-        return self.edges.lines(at)
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image [px]."""
+        return self.image.shape[1], self.image.shape[0]
+
+    @property
+    def vertices(self) -> Array:
+        """(V, 2) grid coordinates of the found vertices."""
+        return np.argwhere(self.grid.seen)[:, ::-1].astype(float)
+
+    @property
+    def pixels(self) -> Array:
+        """(V, 2) pixels of the found vertices."""
+        return self.grid.pixels[self.grid.seen]
 
     def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
         """Edges as observations of a map, with an unknown common shift to the light side."""
@@ -206,12 +217,10 @@ class GridFit:
 
 def fit_grid(grid_image: GridImage) -> GridFit:
     """All stages: map of the found vertices, moments, first fit, common parameters, last fit."""
-    frame = Frame.of(grid_image.anchors.grid, (grid_image.image.shape[1], grid_image.image.shape[0]))
-    n = len(grid_image.anchors.grid) // 2
-    points = grid_image.anchors.value.reshape(2, n).T
-    start = homography_start(frame, grid_image.anchors.grid[:n], points)
+    vertices = grid_image.vertices
+    start = homography_start(Frame.of(vertices, grid_image.size), vertices, grid_image.pixels)
     found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
-    if found.model_index > found.map.richest_lens or _bend(grid_image, found) > _STRONGLY_BENT:
+    if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
         found = _wide_if_better(grid_image, found, grid_image.anchors, _GOOD_START)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = _shading_of(found.map, dark, light)
@@ -221,19 +230,11 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     return _last_fit(grid_image, first)
 
 
-def _bend(grid_image: GridImage, mapped: MapFit) -> float:
-    """Greatest displacement of a vertex by the lens, relative to its distance from the lens's centre."""
-    return mapped.map.bend(grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2])
-
-
 def _wide_if_better(
     grid_image: GridImage, found: MapFit, observations: Observations, enough: float = 0.0
 ) -> MapFit:
     """The map of a wide lens, where that fits better than a lens that displaces slopes."""
-    grid = grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2]
-    size = grid_image.image.shape[1], grid_image.image.shape[0]
-    points = grid_image.anchors.value.reshape(2, -1).T
-    start = wide_start(found.map.frame, grid, points, size)
+    start = wide_start(found.map.frame, grid_image.vertices, grid_image.pixels, grid_image.size)
     if start is None:
         return found
     wide = select_map(start, observations, found.shift, enough, most=start.richest_lens)
@@ -254,7 +255,7 @@ def _may_be_wide(bend: float, excess: float) -> bool:
 
 def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
     """The map through offsets from moments, and the blur [px]."""
-    lines = grid_image.lines(found.map)
+    lines = grid_image.edges.lines(found.map)
     # Oblique crossing lines enter wide strips from the side.
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
@@ -270,7 +271,7 @@ def _first_fit(
     grid_image: GridImage, mapped: MapFit, sigma: float, shading: Shading, noise: float
 ) -> GridFit:
     """Edges fitted with independent levels, and the map through them."""
-    lines = grid_image.lines(mapped.map)
+    lines = grid_image.edges.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
     free = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
     data, fit, shape = free.data, free.fit, free.shape
@@ -287,7 +288,9 @@ def _first_fit(
         least=mapped.model_index,
         most=max(mapped.model_index, mapped.map.richest_lens),
     )
-    if not isinstance(chosen.map, WideMap) and _may_be_wide(_bend(grid_image, chosen), chosen.excess):
+    if not isinstance(chosen.map, WideMap) and _may_be_wide(
+        chosen.map.bend(grid_image.vertices), chosen.excess
+    ):
         wide = _wide_if_better(grid_image, chosen, observations)
         # An uneven board departs from both.
         chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
@@ -298,7 +301,7 @@ def _first_fit(
 def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     """Edges fitted with common parameters, and the map through them."""
     good, n = first.good, len(first.good)
-    lines = grid_image.lines(first.map.map)
+    lines = grid_image.edges.lines(first.map.map)
     shading = _shading(first)
     fit, data, shape, noise = _fine_fit(grid_image, first, lines, shading)
     scale = max(upper_median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
@@ -371,7 +374,7 @@ def fit_grid_vertices(
     grid_image: GridImage, fitted: GridFit
 ) -> tuple[BatchFit, tuple[Lines, Lines], NDArray[np.bool_]]:
     """Fits of all known vertices after those of the edges, with their lines and a mask of reliable ones."""
-    grid = grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2]
+    grid = grid_image.vertices
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
