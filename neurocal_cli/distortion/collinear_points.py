@@ -59,6 +59,11 @@ class CollinearPoints:
         """(M,) line of each entry of `row`."""
         return np.repeat(np.arange(len(self.first)), self.counts)
 
+    def only(self, which: NDArray[np.bool_]) -> CollinearPoints:
+        """Some of the lines; which is a mask (L,)."""
+        kept = self.counts[which]
+        return CollinearPoints(self.row[which[self.line]], np.cumsum(kept) - kept)
+
 
 def find_lines(points: Correspondences) -> CollinearPoints:
     """Find the lines of at least `FEWEST_ON_LINE` known points in each view, or of three along edges.
@@ -81,16 +86,18 @@ def find_lines(points: Correspondences) -> CollinearPoints:
     label = line[np.repeat(begins[ids], copies) + rank].astype(np.int64)
     label = label * points.n_views + points.view_index[row]
     order = np.argsort(label, kind="stable")
-    row, first = row[order], _run_starts(label[order])
-    return _thinned(*_along_edges(points, *_enough(row, first, fewest)))
+    changes = np.diff(label[order], prepend=-1) != 0
+    lines = CollinearPoints(row[order], np.flatnonzero(changes))
+    lines = lines.only(lines.counts >= fewest)
+    if points.across is not None and len(lines):
+        lines = _along_edges(lines, points.pixels, points.across)
+    every = -(-len(lines.row) // _MOST_PLACES)
+    return lines.only(np.arange(len(lines)) % every == 0) if every > 1 else lines
 
 
-def _along_edges(points: Correspondences, row: Index, first: Index) -> tuple[Index, Index]:
+def _along_edges(lines: CollinearPoints, pixels: Array, across: Array) -> CollinearPoints:
     """Drop lines across the edges of their points: a position along an edge is not measured."""
-    if points.across is None or not first.size:
-        return row, first
-    counts = np.diff(first, append=len(row))
-    pixels, line = points.pixels, np.repeat(np.arange(len(first)), counts)
+    row, first, counts, line = lines.row, lines.first, lines.counts, lines.line
     chord = pixels[row[first + counts - 1]] - pixels[row[first]]
     order = np.lexsort(((pixels[row] * chord[line]).sum(axis=1), line))
     row = row[order]
@@ -98,35 +105,9 @@ def _along_edges(points: Correspondences, row: Index, first: Index) -> tuple[Ind
     place = np.arange(len(row))
     before = np.maximum(place - 1, first[line])
     after = np.minimum(place + 1, (first + counts - 1)[line])
-    n = unit(points.across)[row]
+    n = unit(across)[row]
     slant = np.abs((n * unit(pixels[row[after]] - pixels[row[before]])).sum(axis=1))
-    return _kept(row, counts, ~np.logical_or.reduceat(slant > _ALONG, first))
-
-
-def _run_starts(sorted_labels: NDArray[np.int64]) -> Index:
-    if not sorted_labels.size:
-        return np.zeros(0, dtype=np.intp)
-    return np.flatnonzero(np.concatenate([[True], sorted_labels[1:] != sorted_labels[:-1]]))
-
-
-def _enough(row: Index, first: Index, fewest: int) -> tuple[Index, Index]:
-    """Drop lines with too few points."""
-    counts = np.diff(first, append=len(row))
-    return _kept(row, counts, counts >= fewest)
-
-
-def _kept(row: Index, counts: Index, keep: NDArray[np.bool_]) -> tuple[Index, Index]:
-    """Rows and first entries of the lines to keep."""
-    kept = counts[keep]
-    return row[np.repeat(keep, counts)], np.cumsum(kept) - kept
-
-
-def _thinned(row: Index, first: Index) -> CollinearPoints:
-    """An even choice of the lines where there are very many."""
-    every = -(-len(row) // _MOST_PLACES)
-    if every > 1:
-        row, first = _kept(row, np.diff(first, append=len(row)), np.arange(len(first)) % every == 0)
-    return CollinearPoints(row, first)
+    return CollinearPoints(row, first).only(~np.logical_or.reduceat(slant > _ALONG, first))
 
 
 def _distinct(world: Array) -> tuple[Index, Array]:

@@ -176,17 +176,12 @@ def _with_slope(
             return None
         A = problem.matrix(state.entries[0])
         if where_not_monotonic(state.distortion, A, problem.points) is None:
-            return _settled(restrained, adjusted)
+            # The descent creeps along the condition's edge where several coefficients share it.
+            adjusted = adjusted if adjusted.converged else restrained.adjust(adjusted, _MORE_STEPS)
+            return (restrained, adjusted) if adjusted.converged else None
         corner = beyond * _farthest(problem, state)
         last += max(corner - _distorted(state, last), 0.01 * corner) / _GUESS
     return None
-
-
-def _settled(problem: Problem, adjusted: Adjusted) -> tuple[Problem, Adjusted] | None:
-    """The end of the descent, which creeps along the condition's edge where several coefficients share it."""
-    if not adjusted.converged:
-        adjusted = problem.adjust(adjusted, _MORE_STEPS)
-    return (problem, adjusted) if adjusted.converged else None
 
 
 def _turn(state: CameraState) -> float:

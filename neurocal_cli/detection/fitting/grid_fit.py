@@ -245,12 +245,15 @@ def _wide_if_better(
     return wide if costs[1] < costs[0] else found
 
 
-def _may_be_wide(bend: float, excess: float) -> bool:
-    """Whether a lens that bends so much can be what is left of the variance.
+def _may_be_wide(found: MapFit, vertices: Array) -> bool:
+    """Whether a wide lens, of which the map knows nothing, can be what is left of the variance.
 
     A weak bend follows slopes up to hundredths of a pixel, and what is more comes from an uneven board.
     """
-    return excess > _NOT_NOISE and (bend > _BENT or (bend > _WEAKLY_BENT and excess < _UNEVEN))
+    if isinstance(found.map, WideMap) or not found.excess > _NOT_NOISE:
+        return False
+    bend = found.map.bend(vertices)
+    return bend > _BENT or (bend > _WEAKLY_BENT and found.excess < _UNEVEN)
 
 
 def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
@@ -288,9 +291,7 @@ def _first_fit(
         least=mapped.model_index,
         most=max(mapped.model_index, mapped.map.richest_lens),
     )
-    if not isinstance(chosen.map, WideMap) and _may_be_wide(
-        chosen.map.bend(grid_image.vertices), chosen.excess
-    ):
+    if _may_be_wide(chosen, grid_image.vertices):
         wide = _wide_if_better(grid_image, chosen, observations)
         # An uneven board departs from both.
         chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
