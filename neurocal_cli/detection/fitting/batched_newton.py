@@ -122,6 +122,11 @@ class ProfileShape:
             self.tails[which], self.nonlinearity, None if self.half is None else self.half[which]
         )
 
+    def elsewhere(self, half: Array) -> ProfileShape:
+        """That of other fits of the same image, with half widths of the pixel's box where they matter."""
+        tails = np.tile(self.tails.mean(axis=0), (len(half), 1))
+        return ProfileShape(tails, self.nonlinearity, None if self.half is None else half)
+
 
 @frozen_dataclass(eq=False)
 class Linearised:
@@ -206,6 +211,11 @@ class BatchFit:
         diagonal *= 1 + _FLOAT32
         diagonal += _NOTHING
         return np.asarray(np.linalg.inv(total), dtype=float)
+
+    @property
+    def roughness(self) -> Array:
+        """(E,) chi2 of each pixel."""
+        return self.chi2 / np.maximum(self.count, 1)
 
     @property
     def variance_growth(self) -> Array:

@@ -305,7 +305,7 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     lines = grid_image.edges.lines(first.map.map)
     shading = _shading(first)
     fit, data, shape, noise = _fine_fit(grid_image, first, lines, shading)
-    scale = max(upper_median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
+    scale = max(upper_median(fit.roughness[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
@@ -329,45 +329,61 @@ def _fine_fit(
     n = len(first.good)
     shape = profile_shape(first.data, first.fit, first.shape, first.good)
     noise = PixelNoise.of(first.fit, first.data.root, grid_image.floor)
-    sigma, spread = _blur(first, lines, lines)
-    data = edge_pixels(grid_image.image, lines, sigma, shading, REACH * sigma, 1)
-    prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
+    blur = _blur(first, lines, lines)
     offset = first.map.residual[:n] + first.map.shift[0]
     if isinstance(first.map.map, WideMap):
         # A fit that went astray in the dark of the rim starts at the map again.
         offset = np.where(first.good, offset, first.map.shift[0])
-    start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
-    data = data.weighed(noise.weights(light_at(data, start)))
-    fit = fit_batch(edge_model, data, start, prior, shape, _STEPS)
-    usual = upper_median(sigma)
+    data, fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise)
+    usual = upper_median(blur[0])
     if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # The profile, estimated from a part of the pixels, is now the largest error: estimate it again.
         shape = profile_shape(data, fit, shape, first.good)
         noise = PixelNoise.of(fit, data.root, grid_image.floor)
         data = data.weighed(noise.weights(fit.linear.x))
-        fit = fit_batch(edge_model, data, fit.values, prior, shape, _STEPS)
+        fit = fit_batch(edge_model, data, fit.values, fit.prior, shape, _STEPS)
     return fit, data, shape, noise
+
+
+def _fitted(
+    image: Image,
+    lines: Lines,
+    offset: Array,
+    blur: tuple[Array, Array | float],
+    shading: Shading,
+    shape: ProfileShape,
+    noise: PixelNoise,
+    crossed: NDArray[np.bool_] | None = None,
+) -> tuple[EdgePixels, BatchFit]:
+    """Fits of edges to all their pixels, begun at offsets (E,), with what the whole board has in common."""
+    sigma, spread = blur
+    data = edge_pixels(image, lines, sigma, shading, REACH * sigma, 1, crossed)
+    prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
+    start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), prior.mean], axis=1)
+    data = data.weighed(noise.weights(light_at(data, start)))
+    return data, fit_batch(edge_model, data, start, prior, shape, _STEPS)
 
 
 def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]:
     """Fits of the edges to the board's rim, after those of all others, whose common parameters they have."""
     edges = GridEdges.to_rim(grid_image.grid)
     lines = edges.lines(fitted.map.map)
-    sigma, spread = _blur(fitted, fitted.lines, lines)
     shift = fitted.map.shift[0]
-    data = edge_pixels(grid_image.image, lines, sigma, fitted.shading, REACH * sigma, 1, crossed=edges.known)
-    prior = level_prior(fitted.shading, lines.middle, sigma, spread, fitted.noise.edge)
-    n = len(sigma)
-    shape = ProfileShape(np.tile(fitted.shape.tails.mean(axis=0), (n, 1)), fitted.shape.nonlinearity)
-    if fitted.shape.half is not None:
-        shape = replace(shape, half=half_widths(lines.normal))
-    start = np.concatenate([np.full((n, 1), shift), np.zeros((n, 1)), prior.mean], axis=1)
-    data = data.weighed(fitted.noise.weights(light_at(data, start)))
-    fit = fit_batch(edge_model, data, start, prior, shape, _STEPS)
+    shape = fitted.shape.elsewhere(half_widths(lines.normal))
+    data, fit = _fitted(
+        grid_image.image,
+        lines,
+        np.full(len(edges.index), shift),
+        _blur(fitted, fitted.lines, lines),
+        fitted.shading,
+        shape,
+        fitted.noise,
+        crossed=edges.known,
+    )
     variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
     departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
     # A rim that is bad all around would agree with itself.
-    good = is_reliable(fit, departure, data.beyond, known=(fitted.fit.chi2 / fitted.fit.count)[fitted.good])
+    good = is_reliable(fit, departure, data.beyond, known=fitted.fit.roughness[fitted.good])
     return edges, replace(fitted, lines=lines, fit=fit, data=data, shape=shape, good=good)
 
 
@@ -382,17 +398,14 @@ def fit_grid_vertices(
     (first, spread), (second, _) = (_blur(fitted, fitted.lines, line) for line in lines)
     sigma = 0.5 * (first + second)
     data = vertex_pixels(grid_image.image, lines, light, sigma, fitted.shading, _ends(grid_image.grid.seen))
-    tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
-    shape = ProfileShape(tails, fitted.shape.nonlinearity)
-    if fitted.shape.half is not None:
-        shape = replace(shape, half=np.stack([half_widths(line.normal) for line in lines], axis=1))
+    shape = fitted.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
     data = data.weighed(fitted.noise.weights(fit.linear.x))
     fit = fit_batch(vertex_model, data, fit.values, prior, shape, _STEPS)
-    fit = fit.scaled(max(upper_median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
+    fit = fit.scaled(max(upper_median(fit.roughness), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
         variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)

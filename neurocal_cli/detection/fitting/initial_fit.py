@@ -62,7 +62,7 @@ class InitialFit:
     @property
     def rough(self) -> float:
         """Typical chi2 per pixel."""
-        return upper_median(self.fit.chi2 / np.maximum(self.fit.count, 1))
+        return upper_median(self.fit.roughness)
 
     def blur(self, otherwise: float) -> float:
         """Typical blur [px]."""

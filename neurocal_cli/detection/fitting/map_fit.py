@@ -9,7 +9,7 @@ In: a start, observations. Out: the map with its covariance, residuals, weights 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,8 +72,8 @@ class Observations:
 
     def joined_with(self, other: Observations) -> Observations:
         """Both together."""
-        names = ("grid", "direction", "value", "variance", "shift")
-        return Observations(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return Observations(*map(np.concatenate, pairs))
 
 
 @frozen_dataclass(eq=False)
@@ -90,8 +90,6 @@ class MapFit:
         Value minus map and shift.
     weight : (N,) array
         From 1 down to 0 for outliers.
-    chi2 : float
-        Of the good observations; about their number minus that of the parameters.
     excess : float
         Variance of the good and informative residuals relative to the given variances; 1 where the
         difference may be chance, less where they are smaller.
@@ -102,7 +100,6 @@ class MapFit:
     shift_variance: Array
     residual: Array
     weight: Array
-    chi2: float
     excess: float
 
     @property
@@ -233,6 +230,5 @@ def with_covariance(solution: MapSolution, observations: Observations) -> MapFit
         shift_variance=np.diag(inverse)[len(free) :].copy(),
         residual=residual,
         weight=weight,
-        chi2=float((z[good] ** 2).sum()),
         excess=excess if excess > 1 + 3 * np.sqrt(2 / max(left, 1)) else shrunk,
     )

@@ -118,33 +118,31 @@ class LocalShading(Shading):
         What they are above the polynomials there.
     """
 
-    near: tuple[Array, Array] = field(default_factory=lambda: (np.zeros((0, 2)), np.zeros((0, 2))))
-    above: tuple[Array, Array] = field(default_factory=lambda: (np.zeros(0), np.zeros(0)))
+    near: tuple[Array, Array]
+    above: tuple[Array, Array]
 
     @classmethod
-    def of(cls, smooth: Shading, dark: Levels, light: Levels) -> LocalShading:
-        """From polynomials, and the levels that they were fitted to."""
-        near = dark.place, light.place
-        above = tuple(
-            levels.level - _terms(smooth.frame, levels.place) @ coefficients
-            for levels, coefficients in ((dark, smooth.dark), (light, smooth.light))
-        )
-        spread = []
-        for levels, rest, before in zip((dark, light), above, smooth.spread, strict=True):
-            if len(rest) <= _NEAREST:
-                return cls(
-                    smooth.frame, smooth.dark, smooth.light, smooth.spread, near, (0 * above[0], 0 * above[1])
-                )
+    def of(cls, smooth: Shading, dark: Levels, light: Levels) -> Shading:
+        """From polynomials, and the levels that they were fitted to; the polynomials where these are few."""
+        if min(len(dark.level), len(light.level)) <= _NEAREST:
+            return smooth
+        above, spread = [], []
+        for levels, coefficients, before in zip(
+            (dark, light), (smooth.dark, smooth.light), smooth.spread, strict=True
+        ):
+            rest = levels.level - _terms(smooth.frame, levels.place) @ coefficients
             left = rest - _nearby(levels.place, rest, levels.place, itself=False)
             chance = 2 * upper_median(levels.variance)
+            above.append(rest)
             spread.append(min(max(upper_median(left**2) / CHI2_MEDIAN - chance, 0.0), before))
+        near = dark.place, light.place
         return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, (above[0], above[1]))
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
         terms = _terms(self.frame, place)
         dark, light = (
-            terms @ coefficients + (_nearby(near, above, place) if len(above) else 0.0)
+            terms @ coefficients + _nearby(near, above, place)
             for coefficients, near, above in zip((self.dark, self.light), self.near, self.above, strict=True)
         )
         return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
@@ -155,8 +153,7 @@ def _nearby(near: Array, value: Array, place: Array, itself: bool = True) -> Arr
     away = ((place[:, None] - near) ** 2).sum(axis=-1)
     if not itself:
         np.fill_diagonal(away, np.inf)
-    rank = min(_NEAREST, len(near)) - 1
-    width = np.partition(away, rank, axis=1)[:, rank]
+    width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
     weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
     return np.asarray(weight @ value / np.maximum(weight.sum(axis=1), 1e-12))
 

@@ -170,19 +170,20 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
 
 def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidate:
     alone = len(board.planes) == 1
-    whole = any(sorted(grid.shape) == sorted((plane.cols, plane.rows)) for plane in board.planes)
-    ends = board_ends(grey, grid) if alone or not whole else {}
+    alike = [
+        k for k, plane in enumerate(board.planes) if sorted(grid.shape) == sorted((plane.cols, plane.rows))
+    ]
+    ends = board_ends(grey, grid) if alone or not alike else {}
     if not alone:  # beyond a fold lies the pattern of another plane
         ends = {direction: end for direction, end in ends.items() if end is End.BOARD}
     possible = [
         placement
-        for index, plane in enumerate(board.planes)
-        if not whole or sorted(grid.shape) == sorted((plane.cols, plane.rows))
-        for placement in placements(grid, plane, index, ends, mirrored=not alone)
+        for k in alike or range(len(board.planes))
+        for placement in placements(grid, board.planes[k], k, ends, mirrored=not alone)
     ]
     if alone and (board.planes[0].cols + board.planes[0].rows) % 2 == 1:
         possible = [placement for placement in possible if placement.first_square_is_dark(grid.dark)]
-    return _Candidate(grid, tuple(possible), whole, ends)
+    return _Candidate(grid, tuple(possible), bool(alike), ends)
 
 
 def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement]:
