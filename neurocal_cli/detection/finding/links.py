@@ -12,12 +12,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.finding.lattice import Index
 from neurocal_cli.detection.finding.levels import Level, interpolate
 from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-
-Index = NDArray[np.intp]
 
 _FEWEST = 9  # saddles, of 3 x 3 vertices
 # Insensitive; tests/test_finding.py.

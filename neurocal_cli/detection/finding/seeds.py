@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.links import Index, Links
+from neurocal_cli.detection.finding.lattice import Index
+from neurocal_cli.detection.finding.links import Links
 from neurocal_cli.geometry import Array
 
 # Insensitive; tests/test_finding.py.

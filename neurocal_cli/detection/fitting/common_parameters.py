@@ -18,6 +18,7 @@ from neurocal_cli.detection.fitting.batched_newton import (
     BatchFit,
     LevelPrior,
     ProfileShape,
+    Single,
     rows_for,
 )
 from neurocal_cli.detection.fitting.edge_fit import OFFSET
@@ -35,8 +36,6 @@ from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-
-Single = NDArray[np.float32]
 
 # Insensitive, apart from _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.
 _FLAT = 0.95  # light, from -1 to 1, beyond which a pixel has the dark or the light level

@@ -12,16 +12,13 @@ A and B are mean level and half contrast, with fixed slopes; E and F are `edge_p
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import BLUR, Linearised, ProfileShape, rows_for
+from neurocal_cli.detection.fitting.batched_newton import BLUR, Linearised, ProfileShape, Single, rows_for
 from neurocal_cli.detection.fitting.edge_pixels import EdgePixels
 from neurocal_cli.detection.fitting.edge_profile import erf_and_density, response
 from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.strips import Strips
 from neurocal_cli.geometry import Array
-
-Single = NDArray[np.float32]
 
 OFFSET, TILT = 0, 1  # the first two values of an edge's fit
 _BLUR_LOSS = float(4 / np.sqrt(np.pi))  # integral of 1 - erf(z / sqrt 2)^2

@@ -11,15 +11,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import FitPixels
+from neurocal_cli.detection.fitting.batched_newton import FitPixels, Single
 from neurocal_cli.detection.fitting.edge_profile import erf_and_density
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines, strip_pixels
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-
-Single = NDArray[np.float32]
 
 # Half of REACH raises errors by 16 %; doubled it lowers them by 2 %, with twice the pixels. Half of SHARP
 # raises the errors of edges sharper than a pixel up to 9 times. The others are insensitive.

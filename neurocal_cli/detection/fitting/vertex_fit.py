@@ -16,7 +16,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import FitPixels, Linearised, ProfileShape, rows_for
+from neurocal_cli.detection.fitting.batched_newton import (
+    FitPixels,
+    Linearised,
+    ProfileShape,
+    Single,
+    rows_for,
+)
 from neurocal_cli.detection.fitting.edge_pixels import ALONE, REACH
 from neurocal_cli.detection.fitting.edge_profile import Real, erf_and_density, response
 from neurocal_cli.detection.fitting.pixel_box import sharp_profile
@@ -25,8 +31,6 @@ from neurocal_cli.detection.fitting.smooth_map import SmoothMap
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, packed, strip_pixels
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-
-Single = NDArray[np.float32]
 
 # Values of a vertex's fit: offset [px] and tilt [px over the half length] of the line along c and of that
 # along r, then those of `BatchFit`.
