@@ -26,6 +26,8 @@ _OF_EDGES = 8  # the same where only lines along edges are used
 _ALONG = 0.25  # largest sine of the angle between an edge and the line along it
 _ALL_PAIRS = 700  # largest target of which all pairs are compared
 _MOST_PAIRS = 500_000  # pairs of some points with all others, for larger targets
+# Numbers without a relation: two directions, or two places, have the same product only if they are the same.
+_OF_DIRECTION, _OF_PLACE = np.array([0.618, 0.4142, 0.2361]), np.array([0.7321, 0.2361, 0.6458])
 _MOST_PLACES = 200_000  # points on lines; more of them do not change the result but cost time
 
 Index = NDArray[np.intp]
@@ -148,8 +150,8 @@ def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Inde
     along /= np.linalg.norm(along, axis=1)[:, None]
     along *= _sign(along)[:, None]
     offset = target[a] - (target[a] * along).sum(axis=1)[:, None] * along
-    by_direction = _clusters(along @ np.array([0.618, 0.4142, 0.2361]), _TOLERANCE)
-    place = offset @ np.array([0.7321, 0.2361, 0.6458])
+    by_direction = _clusters(along @ _OF_DIRECTION, _TOLERANCE)
+    place = offset @ _OF_PLACE
     # Offsets are compared only between pairs of one direction.
     labels = _clusters(4.0 * by_direction + place, _TOLERANCE)
     counts = np.bincount(labels)
@@ -188,7 +190,7 @@ def _checked(
 
 def _commonest(directions: Array, members: Index, most: int) -> Array:
     """Directions of the lines with the most points."""
-    labels = _clusters(directions @ np.array([0.618, 0.4142, 0.2361]), _TOLERANCE)
+    labels = _clusters(directions @ _OF_DIRECTION, _TOLERANCE)
     _, first = np.unique(labels, return_index=True)
     weight = np.bincount(labels, members)
     return directions[first[np.argsort(-weight, kind="stable")[:most]]]
@@ -199,7 +201,7 @@ def _parallels(target: Array, directions: Array, fewest: int) -> tuple[Index, In
     lines, members, total = [], [], 0
     for direction in directions:
         offset = target - (target @ direction)[:, None] * direction
-        labels = _clusters(offset @ np.array([0.7321, 0.2361, 0.6458]), _TOLERANCE)
+        labels = _clusters(offset @ _OF_PLACE, _TOLERANCE)
         order = np.argsort(labels, kind="stable")
         along = np.broadcast_to(direction, (len(target), 3))
         line, member, kept = _checked(labels[order], order, target, labels, along, fewest)
