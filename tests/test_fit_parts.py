@@ -81,7 +81,9 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
     nothing = np.zeros((60, 1), dtype=np.float32)
     linear = Linearised(rows_for(60, 5, 1, nothing.dtype), nothing, nothing)
     ones = np.ones(60)
-    fit = BatchFit(values, information, prior, ones, ones.astype(np.int64), ones, linear)
+    pixels = FitPixels(nothing, nothing, nothing, nothing, ones)
+    shape = ProfileShape(np.zeros((60, 2)), np.zeros(1))
+    fit = BatchFit(values, information, prior, ones, lambda *_: linear, pixels, shape, ones, linear)
     blur = BoardBlur.of(fit, normal, ones.astype(bool))
     np.testing.assert_allclose(blur.along(normal), true, rtol=0.08)
 

@@ -124,9 +124,10 @@ def _polarity(fitted: GridFit) -> float:
     """Displacement [px] of the middle between the levels from the true edge, towards the dark side."""
     z = np.linspace(-_FAR, _FAR, _PLACES)[None]
     sigma = upper_median(fitted.fit.values[:, BLUR])
-    half = None if fitted.shape.half is None else fitted.shape.half[:1]
-    edge = sharp_profile(z, np.array([[sigma]]), fitted.shape.tails[:1], half)[0]
-    light = response(edge, fitted.shape.nonlinearity)[0][0]
+    shape = fitted.fit.shape
+    half = None if shape.half is None else shape.half[:1]
+    edge = sharp_profile(z, np.array([[sigma]]), shape.tails[:1], half)[0]
+    light = response(edge, shape.nonlinearity)[0][0]
     after = max(int(np.argmax(light > 0)), 1)
     share = light[after] / (light[after] - light[after - 1])
     zero = z[0, after] - share * (z[0, 1] - z[0, 0])

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,11 +59,6 @@ class FitPixels:
     Q: Single
     root: Single
     beyond: Array
-
-    @property
-    def count(self) -> NDArray[np.int64]:
-        """(E,) number of pixels used."""
-        return np.count_nonzero(self.root, axis=1)
 
     def part(self: Pixels, which: Part) -> Pixels:
         """The pixels of some fits."""
@@ -185,8 +180,11 @@ class BatchFit:
     information : (E, P, P) array
         Fisher information of the pixels, without the prior.
     prior : LevelPrior
-    chi2, count : (E,) arrays
-        Weighted sum of squared residuals, and number of pixels.
+    chi2 : (E,) array
+        Weighted sum of squared residuals.
+    model : function of pixels, values and shape
+    pixels : FitPixels
+    shape : ProfileShape
     step : (E,) array
         The last step, in standard deviations.
     linear : Linearised
@@ -197,7 +195,9 @@ class BatchFit:
     information: Array
     prior: LevelPrior
     chi2: Array
-    count: NDArray[np.int64]
+    model: Callable[[Any, Array, ProfileShape], Linearised]
+    pixels: FitPixels
+    shape: ProfileShape
     step: Array
     linear: Linearised
 
@@ -212,6 +212,11 @@ class BatchFit:
         diagonal += _NOTHING
         return np.asarray(np.linalg.inv(total), dtype=float)
 
+    @cached_property
+    def count(self) -> NDArray[np.int64]:
+        """(E,) number of pixels used."""
+        return np.count_nonzero(self.pixels.root, axis=1)
+
     @property
     def roughness(self) -> Array:
         """(E,) chi2 of each pixel."""
@@ -225,6 +230,13 @@ class BatchFit:
     def scaled(self, noise: float) -> BatchFit:
         """The same fits for a variance of the pixels that is larger by a factor."""
         return replace(self, information=self.information / noise, chi2=self.chi2 / noise)
+
+    def continued(
+        self, shape: ProfileShape, steps: int, more: int = _MORE_STEPS, weight: Single | None = None
+    ) -> BatchFit:
+        """Further steps from these values, with another shape, and with other weights [1/DN^2] if given."""
+        pixels = self.pixels if weight is None else self.pixels.weighed(weight)
+        return fit_batch(self.model, pixels, self.values, self.prior, shape, steps, more)
 
 
 def fit_batch(
@@ -264,7 +276,7 @@ def fit_batch(
         part.iterate(model_of(unconverged), prior.part(unconverged), more, 1.0)
         state.put(unconverged, part)
     information, chi2 = state.products[:, 1:, 1:], state.products[:, 0, 0]
-    return BatchFit(state.values, information, prior, chi2, pixels.count, state.size, state.linear)
+    return BatchFit(state.values, information, prior, chi2, model, pixels, shape, state.size, state.linear)
 
 
 @dataclass(eq=False)

@@ -26,7 +26,7 @@ from neurocal_cli.detection.fitting.common_parameters import (
     profile_shape,
 )
 from neurocal_cli.detection.fitting.edge_fit import OFFSET, edge_model, light_at, moments
-from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, EdgePixels, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
 from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of
@@ -185,10 +185,8 @@ class GridFit:
     ----------
     lines : Lines
     fit : BatchFit
-    data : EdgePixels
     map : MapFit
     shading : Shading
-    shape : ProfileShape
     noise : PixelNoise
     good : (E,) bool array
         Edges that passed the quality tests.
@@ -196,10 +194,8 @@ class GridFit:
 
     lines: Lines
     fit: BatchFit
-    data: EdgePixels
     map: MapFit
     shading: Shading
-    shape: ProfileShape
     noise: PixelNoise
     good: NDArray[np.bool_]
 
@@ -276,8 +272,7 @@ def _first_fit(
     """Edges fitted with independent levels, and the map through them."""
     lines = grid_image.edges.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
-    free = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
-    data, fit, shape = free.data, free.fit, free.shape
+    fit = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
     good = is_typical(fit)
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
@@ -296,7 +291,7 @@ def _first_fit(
         # An uneven board departs from both.
         chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
     good &= chosen.weight[: len(good)] > 0
-    return GridFit(lines, fit, data, chosen, shading, shape, PixelNoise(noise, noise, noise), good)
+    return GridFit(lines, fit, chosen, shading, PixelNoise(noise, noise, noise), good)
 
 
 def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
@@ -304,7 +299,7 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     good, n = first.good, len(first.good)
     lines = grid_image.edges.lines(first.map.map)
     shading = _shading(first)
-    fit, data, shape, noise = _fine_fit(grid_image, first, lines, shading)
+    fit, noise = _fine_fit(grid_image, first, lines, shading)
     scale = max(upper_median(fit.roughness[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
@@ -318,31 +313,29 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     # of them are less certain.
     uneven = max(MAD_TO_SIGMA * upper_median(np.abs(departure)), 1.0)
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
-    good = is_reliable(fit, departure, data.beyond)
-    return GridFit(lines, fit, data, mapped, shading, shape, noise, good)
+    return GridFit(lines, fit, mapped, shading, noise, is_reliable(fit, departure))
 
 
 def _fine_fit(
     grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading
-) -> tuple[BatchFit, EdgePixels, ProfileShape, PixelNoise]:
+) -> tuple[BatchFit, PixelNoise]:
     """Fits to all pixels, with levels, blur, profile and noise of the whole board."""
     n = len(first.good)
-    shape = profile_shape(first.data, first.fit, first.shape, first.good)
-    noise = PixelNoise.of(first.fit, first.data.root, grid_image.floor)
+    shape = profile_shape(first.fit, first.good)
+    noise = PixelNoise.of(first.fit, grid_image.floor)
     blur = _blur(first, lines, lines)
     offset = first.map.residual[:n] + first.map.shift[0]
     if isinstance(first.map.map, WideMap):
         # A fit that went astray in the dark of the rim starts at the map again.
         offset = np.where(first.good, offset, first.map.shift[0])
-    data, fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise)
+    fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise)
     usual = upper_median(blur[0])
     if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # The profile, estimated from a part of the pixels, is now the largest error: estimate it again.
-        shape = profile_shape(data, fit, shape, first.good)
-        noise = PixelNoise.of(fit, data.root, grid_image.floor)
-        data = data.weighed(noise.weights(fit.linear.x))
-        fit = fit_batch(edge_model, data, fit.values, fit.prior, shape, _STEPS)
-    return fit, data, shape, noise
+        shape = profile_shape(fit, first.good)
+        noise = PixelNoise.of(fit, grid_image.floor)
+        fit = fit.continued(shape, _STEPS, weight=noise.weights(fit.linear.x))
+    return fit, noise
 
 
 def _fitted(
@@ -354,14 +347,14 @@ def _fitted(
     shape: ProfileShape,
     noise: PixelNoise,
     crossed: NDArray[np.bool_] | None = None,
-) -> tuple[EdgePixels, BatchFit]:
+) -> BatchFit:
     """Fits of edges to all their pixels, begun at offsets (E,), with what the whole board has in common."""
     sigma, spread = blur
     data = edge_pixels(image, lines, sigma, shading, REACH * sigma, 1, crossed)
     prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), prior.mean], axis=1)
     data = data.weighed(noise.weights(light_at(data, start)))
-    return data, fit_batch(edge_model, data, start, prior, shape, _STEPS)
+    return fit_batch(edge_model, data, start, prior, shape, _STEPS)
 
 
 def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]:
@@ -369,22 +362,21 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     edges = GridEdges.to_rim(grid_image.grid)
     lines = edges.lines(fitted.map.map)
     shift = fitted.map.shift[0]
-    shape = fitted.shape.elsewhere(half_widths(lines.normal))
-    data, fit = _fitted(
+    fit = _fitted(
         grid_image.image,
         lines,
         np.full(len(edges.index), shift),
         _blur(fitted, fitted.lines, lines),
         fitted.shading,
-        shape,
+        fitted.fit.shape.elsewhere(half_widths(lines.normal)),
         fitted.noise,
         crossed=edges.known,
     )
     variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
     departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
     # A rim that is bad all around would agree with itself.
-    good = is_reliable(fit, departure, data.beyond, known=fitted.fit.roughness[fitted.good])
-    return edges, replace(fitted, lines=lines, fit=fit, data=data, shape=shape, good=good)
+    good = is_reliable(fit, departure, known=fitted.fit.roughness[fitted.good])
+    return edges, replace(fitted, lines=lines, fit=fit, good=good)
 
 
 def fit_grid_vertices(
@@ -398,20 +390,19 @@ def fit_grid_vertices(
     (first, spread), (second, _) = (_blur(fitted, fitted.lines, line) for line in lines)
     sigma = 0.5 * (first + second)
     data = vertex_pixels(grid_image.image, lines, light, sigma, fitted.shading, _ends(grid_image.grid.seen))
-    shape = fitted.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
+    shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
-    data = data.weighed(fitted.noise.weights(fit.linear.x))
-    fit = fit_batch(vertex_model, data, fit.values, prior, shape, _STEPS)
+    fit = fit.continued(shape, _STEPS, weight=fitted.noise.weights(fit.linear.x))
     fit = fit.scaled(max(upper_median(fit.roughness), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
         variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
         variance *= fitted.map.excess
         departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
-    return fit, lines, is_reliable(fit, departure, data.beyond)
+    return fit, lines, is_reliable(fit, departure)
 
 
 def _blur(fitted: GridFit, edges: Lines, lines: Lines) -> tuple[Array, Array | float]:

@@ -1,6 +1,6 @@
 """The first fits of a board's edges, each with its own levels, to estimate blur and profile.
 
-In: lines from the map, rough offsets and blur. Out: `InitialFit`, from which `grid_fit` estimates what all
+In: lines from the map, rough offsets and blur. Out: `BatchFit`, from which `grid_fit` estimates what all
 edges have in common.
 """
 
@@ -21,7 +21,6 @@ from neurocal_cli.detection.fitting.edge_fit import edge_model
 from neurocal_cli.detection.fitting.edge_pixels import (
     REACH,
     SHARP,
-    EdgePixels,
     edge_pixels,
     usual_stride,
 )
@@ -31,7 +30,6 @@ from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 # Insensitive, apart from edges sharper than a pixel ("straight, psf 0.15" in tests/rendered.py). There, half
@@ -44,35 +42,9 @@ _BLUR_OFF = 0.2  # relative error of the blur that makes the fits start again
 _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations of the prior
 
 
-@frozen_dataclass(eq=False)
-class InitialFit:
-    """Fits of edges with independent levels.
-
-    Attributes
-    ----------
-    data : EdgePixels
-    fit : BatchFit
-    shape : ProfileShape
-    """
-
-    data: EdgePixels
-    fit: BatchFit
-    shape: ProfileShape
-
-    @property
-    def rough(self) -> float:
-        """Typical chi2 per pixel."""
-        return upper_median(self.fit.roughness)
-
-    def blur(self, otherwise: float) -> float:
-        """Typical blur [px]."""
-        good = is_typical(self.fit)
-        return upper_median(self.fit.values[good, BLUR]) if good.any() else otherwise
-
-
 def fit_initial(
     image: NDArray[np.generic], lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
-) -> InitialFit:
+) -> BatchFit:
     """Fit edges with independent levels.
 
     Parameters
@@ -90,21 +62,22 @@ def fit_initial(
     known = np.stack([*shading.at(lines.middle), np.full(len(offset), sigma)], axis=-1)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), known], axis=1)
     started = _few_steps(image, lines, start, known, shading, noise)
-    found = started.blur(sigma)
+    typical = is_typical(started)
+    found = upper_median(started.values[typical, BLUR]) if typical.any() else sigma
     # The effect of crossing lines on the pixels depends on the blur.
     if abs(found - sigma) > _BLUR_OFF * sigma or (found < SHARP) != (sigma < SHARP):
         known[:, 2] = found
-        start = np.where(is_typical(started.fit)[:, None], started.fit.values, start)
+        start = np.where(typical[:, None], started.values, start)
         start[:, BLUR] = found
         again = _with_best_profile(_few_steps(image, lines, start, known, shading, noise), lines, found)
-        if again.rough < _WORSE * started.rough:
+        if upper_median(again.roughness) < _WORSE * upper_median(started.roughness):
             return again
     return _with_best_profile(started, lines, sigma)
 
 
 def _few_steps(
     image: NDArray[np.generic], lines: Lines, start: Array, known: Array, shading: Shading, noise: float
-) -> InitialFit:
+) -> BatchFit:
     """A few steps, to estimate the blur; known (E, 3) are mean level, contrast and blur."""
     blur = known[:, 2]
     data = edge_pixels(image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
@@ -112,22 +85,21 @@ def _few_steps(
     spread = known * [0.0, 0.0, _LOOSE_BLUR] + known[:, 1:2] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
     prior = LevelPrior(known.copy(), (1 / spread**2)[:, :, None] * np.eye(3))
     shape = _blur_profiles(lines, float(blur[0]))[-1]
-    return InitialFit(data, fit_batch(edge_model, data, start, prior, shape, _FEW_STEPS, 0), shape)
+    return fit_batch(edge_model, data, start, prior, shape, _FEW_STEPS, 0)
 
 
-def _with_best_profile(started: InitialFit, lines: Lines, sigma: float) -> InitialFit:
+def _with_best_profile(started: BatchFit, lines: Lines, sigma: float) -> BatchFit:
     """Continue the fits with the blur profile that gives the lower chi2."""
     results = [_converged(started, shape) for shape in _blur_profiles(lines, sigma)]
+    smooth, box = (upper_median(results[k].roughness) for k in (0, -1))
     # Prefer the pixel's box: both agree where all edges run along the pixels.
-    return results[0] if results[0].rough < _CLEARLY * results[-1].rough else results[-1]
+    return results[0] if smooth < _CLEARLY * box else results[-1]
 
 
-def _converged(started: InitialFit, shape: ProfileShape) -> InitialFit:
-    data, fit = started.data, started.fit
-    if (shape.half is None) != (started.shape.half is None):
-        fit = fit_batch(edge_model, data, fit.values, fit.prior, shape, _FEW_STEPS, 0)
-    shape = profile_shape(data, fit, shape, is_typical(fit))
-    return InitialFit(data, fit_batch(edge_model, data, fit.values, fit.prior, shape, _STEPS), shape)
+def _converged(fit: BatchFit, shape: ProfileShape) -> BatchFit:
+    if (shape.half is None) != (fit.shape.half is None):
+        fit = fit.continued(shape, _FEW_STEPS, 0)
+    return fit.continued(profile_shape(fit, is_typical(fit)), _STEPS)
 
 
 def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:
