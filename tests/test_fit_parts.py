@@ -19,8 +19,7 @@ from neurocal_cli.detection.fitting.batched_newton import (
     rows_for,
 )
 from neurocal_cli.detection.fitting.common_parameters import BoardBlur
-from neurocal_cli.detection.fitting.map_fit import Observations, fit_map
-from neurocal_cli.detection.fitting.map_selection import select_map
+from neurocal_cli.detection.fitting.map_fit import Observations, fit_map, select_map
 from neurocal_cli.detection.fitting.shading import Levels, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import grid_lines, strip_pixels
