@@ -121,8 +121,7 @@ def _find_bent(
 
     found = find_bent(level, links, known, unfinished, search)
     left = drop_duplicates(found + known) if found else known
-    bent = [x for x in left if any(x is y for y in found)]
-    return [x for x in left if not any(x is y for y in bent)], bent
+    return [x for x in left if x not in found], [x for x in left if x in found]
 
 
 def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:

@@ -1,8 +1,7 @@
-"""Maximum-likelihood fits of the vertices, where two edges cross.
+"""Model of the vertices, where two edges cross, for maximum-likelihood fits to their pixels.
 
-In: the map, levels and blur of the fitted edges. Out: `BatchFit` with offset and tilt of both lines through
-each vertex. With z1, z2 the distances from the two lines in sigma, towards growing r and growing c, the
-light is
+The values are offset and tilt of both lines through each vertex, and those of `BatchFit`. With z1, z2 the
+distances from the two lines in sigma, towards growing r and growing c, the light is
 
     x = +-(E(z1) E(z2) + 4 rho phi(z1) phi(z2) + ...) Q
 
