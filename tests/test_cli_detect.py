@@ -217,8 +217,7 @@ def test_planes_that_are_missing_and_rejected_points_are_noted(
     from neurocal_cli.detection import batch
 
     def poor(*words: Any) -> Detection:
-        found = detect_points(*words)
-        return replace(found, measured=tuple(replace(one, rejected=100) for one in found.measured))
+        return replace(detect_points(*words), rejected=100)
 
     detect_points = batch.detect_points
     monkeypatch.setattr(batch, "detect_points", poor)

@@ -19,7 +19,6 @@ from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.finding.lattice import Lattice
 from neurocal_cli.detection.finding.levels import Level, levels_of
 from neurocal_cli.detection.finding.links import find_links
-from neurocal_cli.detection.finding.saddles import find_saddles
 from neurocal_cli.detection.finding.seeds import find_seeds_3x3
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
@@ -347,10 +346,11 @@ def test_noise_of_large_pictures_is_found_in_bands(monkeypatch: pytest.MonkeyPat
 
 def linked_first(level: Level) -> Lattice | None:
     """What is linked with the best seed of a level."""
-    saddles = find_saddles(level)
-    links = find_links(level, saddles)
-    seeds = find_seeds_3x3(saddles, links)
-    return lattice_from_links(level, saddles, links, int(seeds[0, 1, 1]), np.zeros(len(saddles), dtype=bool))
+    links = find_links(level)
+    assert links is not None
+    seeds = find_seeds_3x3(links)
+    none = np.zeros(len(links.saddles), dtype=bool)
+    return lattice_from_links(level, links, int(seeds[0, 1, 1]), none)
 
 
 @pytest.mark.parametrize("name", slow_but(("noise 12",), ("base", "noise 12", "k1 -0.3")))
@@ -369,11 +369,11 @@ def test_links_do_not_lead_over_a_fold(seed: int) -> None:
     """On the smallest level of the second one, holes hide the fold from what looks for it."""
     shot = picture("three planes across", seed)
     level = levels_of(shot.image)[-1]
-    saddles = find_saddles(level)
-    links = find_links(level, saddles)
-    seeds = find_seeds_3x3(saddles, links)
-    none = np.zeros(len(saddles), dtype=bool)
-    together = [lattice_from_links(level, saddles, links, int(s), none) for s in np.unique(seeds[:, 1, 1])]
+    links = find_links(level)
+    assert links is not None
+    seeds = find_seeds_3x3(links)
+    none = np.zeros(len(links.saddles), dtype=bool)
+    together = [lattice_from_links(level, links, int(s), none) for s in np.unique(seeds[:, 1, 1])]
     assert any(together)
     for lattice in filter(None, together):
         assert largest_second_difference(lattice) < 0.16

@@ -10,10 +10,9 @@ import numpy as np
 import pytest
 from support.maps import some_map
 
-from neurocal_cli.detection.fitting import edge_fit as fit_edges
-from neurocal_cli.detection.fitting import vertex_fit as fit_vertices
 from neurocal_cli.detection.fitting.batched_newton import ProfileShape
-from neurocal_cli.detection.fitting.edge_fit import EdgeData
+from neurocal_cli.detection.fitting.edge_fit import edge_model
+from neurocal_cli.detection.fitting.edge_pixels import EdgePixels
 from neurocal_cli.detection.fitting.edge_profile import (
     RESPONSE_TERMS,
     box_kurtosis,
@@ -25,7 +24,7 @@ from neurocal_cli.detection.fitting.edge_profile import (
 )
 from neurocal_cli.detection.fitting.pixel_box import PIXEL, box_profile, half_widths
 from neurocal_cli.detection.fitting.smooth_map import homography_start
-from neurocal_cli.detection.fitting.vertex_fit import VertexData
+from neurocal_cli.detection.fitting.vertex_fit import VertexPixels, vertex_model
 from neurocal_cli.geometry import Array
 
 STEP = 1e-5
@@ -86,14 +85,14 @@ def test_pixel_box_is_in_the_profile(angle: float, psf: float) -> None:
     assert with_box < 0.3 * without
 
 
-def some_edges() -> tuple[EdgeData, Array, ProfileShape, Array]:
+def some_edges() -> tuple[EdgePixels, Array, ProfileShape]:
     rng = np.random.default_rng(1)
     E, N = 3, 60
     s, d = rng.uniform(-15, 15, (E, N)), rng.uniform(-3, 3, (E, N))
     value, gain, Q, R = (
         rng.uniform(low, high, (E, N)) for low, high in ((20, 230), (0.9, 1.1), (0.5, 1), (-0.5, 0.5))
     )
-    data = EdgeData(s, d, value, gain, Q, R, np.ones((E, N)), np.zeros(E))  # type: ignore[arg-type]
+    data = EdgePixels(value, gain, Q, np.ones((E, N)), np.zeros(E), s / 15, d, R)  # type: ignore[arg-type]
     values = np.column_stack(
         [
             rng.normal(0, 0.3, E),
@@ -104,7 +103,7 @@ def some_edges() -> tuple[EdgeData, Array, ProfileShape, Array]:
         ]
     )
     shape = ProfileShape(np.tile([0.02, -0.005], (E, 1)), np.array([0.1, -0.05, 0.02, 0.01]))
-    return data, values, shape, s / 15
+    return data, values, shape
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.01, 0.4, np.pi / 4])
@@ -127,53 +126,47 @@ def test_box_profile_is_that_of_a_pixel(angle: float, psf: float) -> None:
 
 @pytest.mark.parametrize("sharp", [False, True])
 def test_edge_model_has_the_derivatives_it_says(sharp: bool) -> None:
-    data, values, shape, lever = some_edges()
+    data, values, shape = some_edges()
     if sharp:
         angle = np.arange(len(values)) * 0.3
         normal = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
         shape, values[:, 4] = replace(shape, half=half_widths(normal)), 0.33
-    linear = fit_edges.linearised(data, lever, values, shape)  # type: ignore[arg-type]
+    linear = edge_model(data, values, shape)
     for k in range(5):
         h = np.zeros(5)
         h[k] = STEP
-        ahead, behind = (
-            fit_edges.linearised(data, lever, values + sign * h, shape).residual  # type: ignore[arg-type]
-            for sign in (1, -1)
-        )
+        ahead, behind = (edge_model(data, values + sign * h, shape).residual for sign in (1, -1))
         # The error function's own error is 1e-9, and differences of it over the box make more of that.
         atol = 2e-4 if sharp else 3e-6
         np.testing.assert_allclose(linear.rows[:, 1 + k], (behind - ahead) / (2 * STEP), atol=atol)
 
 
-def some_vertices() -> tuple[VertexData, Array, ProfileShape, tuple[Array, Array]]:
+def some_vertices() -> tuple[VertexPixels, Array, ProfileShape]:
     rng = np.random.default_rng(2)
     V, N = 3, 80
     s1, d1, s2, d2 = rng.uniform(-3, 3, (4, V, N))
     value, gain, Q = rng.uniform(20, 230, (V, N)), rng.uniform(0.9, 1.1, (V, N)), rng.choice([-1, 1], (V, N))
     rho = np.array([[0.0], [0.3], [-0.9]])
-    arrays = (s1, d1, s2, d2, value, gain, Q, rho, np.ones((V, N)))
-    data = VertexData(*arrays, np.zeros(V))  # type: ignore[arg-type]
+    arrays = (value, gain, Q, np.ones((V, N)), np.zeros(V), s1 / 3, d1, s2 / 3, d2, rho)
+    data = VertexPixels(*arrays)  # type: ignore[arg-type]
     places = rng.normal(0, 0.2, (V, 4))
     values = np.column_stack([places, np.full(V, 120.0), np.full(V, 90.0), rng.uniform(0.6, 1.2, V)])
     shape = ProfileShape(np.tile([0.02, -0.005], (V, 1)), np.array([0.1, -0.05, 0.02, 0.01]))
-    return data, values, shape, (s1 / 3, s2 / 3)
+    return data, values, shape
 
 
 @pytest.mark.parametrize("sharp", [False, True])
 def test_vertex_model_has_the_derivatives_it_says(sharp: bool) -> None:
-    data, values, shape, levers = some_vertices()
+    data, values, shape = some_vertices()
     if sharp:
         normal = np.array([[0.0, 1.0], [0.6, 0.8], [0.1, np.sqrt(0.99)]])
         half = half_widths(normal)
         shape, values[:, 6] = replace(shape, half=np.stack([half, half], axis=1)), 0.36
-    linear = fit_vertices.linearised(data, levers, values, shape)  # type: ignore[arg-type]
+    linear = vertex_model(data, values, shape)
     for k in range(7):
         h = np.zeros(7)
         h[k] = STEP
-        ahead, behind = (
-            fit_vertices.linearised(data, levers, values + sign * h, shape).residual  # type: ignore[arg-type]
-            for sign in (1, -1)
-        )
+        ahead, behind = (vertex_model(data, values + sign * h, shape).residual for sign in (1, -1))
         atol = 2e-4 if sharp else 3e-6
         np.testing.assert_allclose(linear.rows[:, 1 + k], (behind - ahead) / (2 * STEP), atol=atol)
 
@@ -188,10 +181,11 @@ def test_blurred_oblique_cross_is_as_modelled(angle: float) -> None:
     exact = [(np.sign((cloud + p) @ a) * np.sign((cloud + p) @ b)).mean() for p in places]
     d1, d2 = (places @ a)[None], (places @ b)[None]
     one, zero = np.ones_like(d1), np.zeros_like(d1)
-    data = VertexData(zero, d1, zero, d2, zero, one, one, np.array([[a @ b]]), one, np.zeros(1))  # type: ignore[arg-type]
+    rho = np.array([[a @ b]])
+    data = VertexPixels(zero, one, one, one, np.zeros(1), zero, d1, zero, d2, rho)  # type: ignore[arg-type]
     values = np.array([[0, 0, 0, 0, 0, 1, 1.0]])
     shape = ProfileShape(np.zeros((1, 2)), np.zeros(RESPONSE_TERMS))
-    linear = fit_vertices.linearised(data, (zero, zero), values, shape)  # type: ignore[arg-type]
+    linear = vertex_model(data, values, shape)
     np.testing.assert_allclose(linear.x[0], exact, atol=0.006)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -12,15 +11,15 @@ from support.maps import some_map
 from neurocal_cli.detection.fitting.batched_newton import (
     BLUR,
     BatchFit,
+    FitPixels,
     LevelPrior,
     Linearised,
-    Part,
+    ProfileShape,
     fit_batch,
     rows_for,
 )
 from neurocal_cli.detection.fitting.common_parameters import BoardBlur
-from neurocal_cli.detection.fitting.map_fit import Observations, fit_map
-from neurocal_cli.detection.fitting.map_selection import select_map
+from neurocal_cli.detection.fitting.map_fit import Observations, fit_map, select_map
 from neurocal_cli.detection.fitting.shading import Levels, fit_shading
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import grid_lines, strip_pixels
@@ -81,7 +80,9 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
     nothing = np.zeros((60, 1), dtype=np.float32)
     linear = Linearised(rows_for(60, 5, 1, nothing.dtype), nothing, nothing)
     ones = np.ones(60)
-    fit = BatchFit(values, information, prior, ones, ones.astype(np.int64), ones, linear)
+    pixels = FitPixels(nothing, nothing, nothing, nothing, ones)
+    shape = ProfileShape(np.zeros((60, 2)), np.zeros(1))
+    fit = BatchFit(values, information, prior, ones, lambda *_: linear, pixels, shape, ones, linear)
     blur = BoardBlur.of(fit, normal, ones.astype(bool))
     np.testing.assert_allclose(blur.along(normal), true, rtol=0.08)
 
@@ -89,19 +90,19 @@ def test_blur_depends_on_the_direction_of_edges(sigma: tuple[float, float]) -> N
 def test_fits_settle_where_their_steps_are_too_long() -> None:
     """An arctangent's Gauss-Newton steps from beyond 1.4 lead farther and farther away."""
 
-    def model_of(part: Part) -> Callable[[Array], Linearised]:
-        def model(values: Array) -> Linearised:
-            place = values[:, :1]
-            rows = np.zeros((len(values), 5, 1), dtype=np.float32)
-            rows[:, 0] = -100 * np.arctan(place)
-            rows[:, 1] = 100 / (1 + place**2)
-            return Linearised(rows, rows[:, 0], rows[:, 0])
+    def model(pixels: FitPixels, values: Array, shape: ProfileShape) -> Linearised:
+        place = values[:, :1]
+        rows = np.zeros((len(values), 5, 1), dtype=np.float32)
+        rows[:, 0] = -100 * np.arctan(place)
+        rows[:, 1] = 100 / (1 + place**2)
+        return Linearised(rows, rows[:, 0], rows[:, 0])
 
-        return model
-
+    one = np.ones((20, 1), dtype=np.float32)
+    pixels = FitPixels(one, one, one, one, np.zeros(20))
+    shape = ProfileShape(np.zeros((20, 2)), np.zeros(1))
     start = np.array([[0.3, 0, 1, 5.0]] * 19 + [[4.0, 0, 1, 5.0]])
     prior = LevelPrior(start[:, 1:].copy(), np.tile(np.eye(3) * 1e3, (20, 1, 1)))
-    fit = fit_batch(model_of, start, prior, np.ones(20, dtype=np.int64), 6)
+    fit = fit_batch(model, pixels, start, prior, shape, 6)
     np.testing.assert_allclose(fit.values[:, 0], 0, atol=0.01)
     assert fit.step.max() < 0.5
 

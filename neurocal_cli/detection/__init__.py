@@ -14,9 +14,9 @@ image -> levels of a pyramid                `finding.levels`
                                             `stretch`)
 -> identity: the board's coordinates        `identity.identify` (`ends`, `trim`, `placement`,
                                             `linear_camera`)
--> edge fits, each to all its pixels        `fitting.grid_fit` (`initial_fit`, `edge_fit`, `edge_profile`,
-                                            `common_parameters`, `fit_quality`)
--> smooth map from grid to pixels           `fitting.smooth_map`, `fitting.map_fit`, `map_selection`
+-> edge fits, each to all its pixels        `fitting.grid_fit` (`initial_fit`, `edge_pixels`, `edge_fit`,
+                                            `edge_profile`, `common_parameters`, `fit_quality`)
+-> smooth map from grid to pixels           `fitting.smooth_map`, `fitting.map_fit`
 -> mid-points or vertices with covariance   `measuring`
 -> labelled points of an image              `detect`; of many images `batch`, drawn by `overlay`
 ==========================================  ===========================================================

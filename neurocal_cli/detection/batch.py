@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -13,13 +15,15 @@ from neurocal_cli.detection.detect import Detection, detect_points, wanted_sizes
 from neurocal_cli.detection.finding.grids import find_grids
 from neurocal_cli.detection.identity.messages import NoBoardError
 from neurocal_cli.detection.measuring import Points
-from neurocal_cli.detection.memory import Memory, Remembered
 from neurocal_cli.detection.overlay import draw_detection, draw_failure
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.images import Image, encode_png, parse_image
 from neurocal_cli.processes import start_worker, usable_cores, work_through
+
+if TYPE_CHECKING:
+    from neurocal_cli.detection.memory import Memory
 
 _WORTH_A_PROCESS = 4  # images; fewer take less time than the start of a process
 _KEPT = 31 << 20  # bytes; glibc learns nothing from blocks of 32 MiB and more
@@ -103,7 +107,7 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
         data, source = read_bytes(path)
         known = None if options.memory is None else options.memory.recall(data)
         if known is not None:
-            return _named(path, source, known)
+            return _named(known, path, source)
         image = parse_image(data, source)
     except NeurocalError as error:
         return Outcome(path, problem=str(error))
@@ -111,7 +115,7 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
         found = _detected(image, options)
         if options.memory is not None:
             options.memory.keep(data, found)
-        return _named(path, source, found)
+        return _named(found, path, source)
     except NeurocalError as error:
         problem = str(error)
     except MemoryError:
@@ -123,13 +127,13 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
     return Outcome(path, problem=f"{image.source}: {problem}", notes=image.notes)
 
 
-def _named(path: str, source: str, found: Remembered) -> Outcome:
+def _named(found: Outcome, path: str, source: str) -> Outcome:
     """What was found, with the name of the image that it was found in."""
-    problem = found["problem"] and f"{source}: {found['problem']}"
-    return Outcome(path, **{**found, "problem": problem})
+    return replace(found, path=path, problem=found.problem and f"{source}: {found.problem}")
 
 
-def _detected(image: Image, options: DetectionOptions) -> Remembered:
+def _detected(image: Image, options: DetectionOptions) -> Outcome:
+    """What was found in an image, without its name."""
     grids = find_grids(image.grey, wanted_sizes(options.board))
     overlay: bytes | None = None
     try:
@@ -138,26 +142,10 @@ def _detected(image: Image, options: DetectionOptions) -> Remembered:
         if options.overlay:
             overlay = encode_png(draw_failure(image.grey, grids, str(error)))
         shown = error.shown if isinstance(error, NoBoardError) else None
-        return _remembered(None, str(error), image.notes, overlay, shown)
+        return Outcome("", None, str(error), image.notes, overlay, shown)
     if options.overlay:
         overlay = encode_png(draw_detection(image.grey, found))
-    return _remembered(found, "", (*image.notes, *_remarks(found, options.board)), overlay, None)
-
-
-def _remembered(
-    detection: Detection | None,
-    problem: str,
-    notes: tuple[str, ...],
-    overlay: bytes | None,
-    shown: tuple[int, int] | None,
-) -> Remembered:
-    return {
-        "detection": detection,
-        "problem": problem,
-        "notes": notes,
-        "overlay": overlay,
-        "shown": shown,
-    }
+    return Outcome("", found, "", (*image.notes, *_remarks(found, options.board)), overlay)
 
 
 def _remarks(found: Detection, board: Board) -> Iterator[str]:

@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,11 +80,13 @@ class Detection:
         Unit vector across the edge of each mid-point, the direction in which it has a measurement of its
         own; None for vertices.
     image_size : (width, height) [px]
+    rejected : int
+        Number of points rejected for their fits.
+    warnings : tuple of str
     located : tuple of Located
-        The grids that belong to the board.
+        The grids that belong to the board, for pictures; empty where it was found in an earlier run.
     measured : tuple of Measured
         The points measured on each of them.
-    warnings : tuple of str
     """
 
     ids: tuple[str, ...]
@@ -94,14 +95,10 @@ class Detection:
     covariance: Array
     across: Array | None
     image_size: tuple[int, int]
-    located: tuple[Located, ...]
-    measured: tuple[Measured, ...]
-    warnings: tuple[str, ...] = ()
-
-    @property
-    def rejected(self) -> int:
-        """Number of points rejected for their fits."""
-        return sum(measured.rejected for measured in self.measured)
+    rejected: int
+    warnings: tuple[str, ...]
+    located: tuple[Located, ...] = ()
+    measured: tuple[Measured, ...] = ()
 
 
 def detect_points(
@@ -149,9 +146,10 @@ def detect_points(
         joined(one.covariance for one in measured),
         None if points == "vertices" else joined(_directions(one) for one in measured),
         (image.shape[1], image.shape[0]),
+        sum(one.rejected for one in measured),
+        identified.warnings,
         located,
         measured,
-        identified.warnings,
     )
 
 
@@ -188,12 +186,7 @@ def _sound(measured: Measured) -> Measured:
     with np.errstate(invalid="ignore", over="ignore"):
         good = (suu > 0) & (svv > 0) & (suu * svv > suv**2) & np.isfinite(suu * svv)
     good &= np.isfinite(measured.pixels).all(axis=1)
-    if good.all():
-        return measured
-    parts = {name: getattr(measured, name)[good] for name in ("kind", "index", "pixels", "covariance")}
-    if measured.across is not None:
-        parts["across"] = measured.across[good]
-    return replace(measured, **parts, rejected=measured.rejected + int((~good).sum()))
+    return measured if good.all() else measured.only(good)
 
 
 def label(located: Located, measured: Measured) -> Labels:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.medians import median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
@@ -46,6 +47,17 @@ class Grid:
     def shape(self) -> tuple[int, int]:
         """(cols, rows), as boards are named."""
         return self.pixels.shape[1], self.pixels.shape[0]
+
+    @property
+    def square(self) -> float:
+        """Typical side of a square [px]: the shorter one of its medians along rows and along columns."""
+        p = self.pixels
+        return min(
+            median(np.hypot(step[..., 0], step[..., 1])) for step in (p[1:] - p[:-1], p[:, 1:] - p[:, :-1])
+        )
+
+
+_OF_POINTS = ("kind", "index", "pixels", "covariance", "across")  # of `Measured`, one value for each point
 
 
 @frozen_dataclass(eq=False)
@@ -81,19 +93,15 @@ class Measured:
     rejected: int
     polarity: float
 
+    def only(self, good: NDArray[np.bool_]) -> Measured:
+        """The good points (N,); the others are rejected."""
+        known = {name: values for name in _OF_POINTS if (values := getattr(self, name)) is not None}
+        kept = {name: values[good] for name, values in known.items()}
+        return replace(self, **kept, rejected=self.rejected + int((~good).sum()))
 
-def joined(first: Measured, second: Measured) -> Measured:
-    """Mid-points of the same grid from two sets of edges."""
-
-    def both(name: str) -> Any:
-        return np.concatenate([getattr(first, name), getattr(second, name)])
-
-    return replace(
-        first,
-        kind=both("kind"),
-        index=both("index"),
-        pixels=both("pixels"),
-        covariance=both("covariance"),
-        across=both("across"),
-        rejected=first.rejected + second.rejected,
-    )
+    def joined_with(self, other: Measured) -> Measured:
+        """Mid-points of the same grid from two sets of edges."""
+        both: dict[str, Any] = {
+            name: np.concatenate([getattr(self, name), getattr(other, name)]) for name in _OF_POINTS
+        }
+        return replace(self, **both, rejected=self.rejected + other.rejected)

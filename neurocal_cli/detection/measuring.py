@@ -27,7 +27,7 @@ from neurocal_cli.detection.fitting.grid_fit import (
 )
 from neurocal_cli.detection.fitting.pixel_box import sharp_profile
 from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND
-from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured, joined
+from neurocal_cli.detection.grid import EDGE_H, EDGE_V, VERTEX, Grid, Measured
 from neurocal_cli.detection.medians import upper_median
 from neurocal_cli.geometry import Array
 
@@ -78,7 +78,7 @@ def measure(
     inner = _midpoints(grid_image.edges, fitted, fitted.unevenness, vertices)
     if points == "midpoints":
         return inner
-    return joined(inner, _midpoints(*fit_rim(grid_image, fitted), fitted.unevenness, vertices))
+    return inner.joined_with(_midpoints(*fit_rim(grid_image, fitted), fitted.unevenness, vertices))
 
 
 def _nothing(grid: Grid) -> Measured:
@@ -91,7 +91,7 @@ def _nothing(grid: Grid) -> Measured:
 def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: Array) -> Measured:
     """Mid-points: along the edges from the map, across from the edges; unevenness in px^2."""
     lines, fit, mapped = fitted.lines, fitted.fit, fitted.map
-    centre, good = edges.centre, fitted.good
+    centre = edges.centre
     s = ((mapped.map.at(centre) - lines.middle) * lines.tangent).sum(axis=1)
     d = fit.values[:, OFFSET] + fit.values[:, TILT] * s / (0.5 * lines.length)
     d += 0.5 * lines.curvature * s * s - mapped.shift[0]
@@ -109,24 +109,25 @@ def _midpoints(edges: GridEdges, fitted: GridFit, unevenness: float, vertices: A
         axis=-1,
     )
     return Measured(
-        kind=np.where(edges.vertical, EDGE_V, EDGE_H)[good].astype(np.int64),
-        index=edges.index[good],
-        pixels=pixels[good],
-        covariance=covariance[good],
-        across=lines.normal[good],
+        kind=np.where(edges.vertical, EDGE_V, EDGE_H).astype(np.int64),
+        index=edges.index,
+        pixels=pixels,
+        covariance=covariance,
+        across=lines.normal,
         vertices=vertices,
-        rejected=int((~good).sum()),
+        rejected=0,
         polarity=_polarity(fitted),
-    )
+    ).only(fitted.good)
 
 
 def _polarity(fitted: GridFit) -> float:
     """Displacement [px] of the middle between the levels from the true edge, towards the dark side."""
     z = np.linspace(-_FAR, _FAR, _PLACES)[None]
     sigma = upper_median(fitted.fit.values[:, BLUR])
-    half = None if fitted.shape.half is None else fitted.shape.half[:1]
-    edge = sharp_profile(z, np.array([[sigma]]), fitted.shape.tails[:1], half)[0]
-    light = response(edge, fitted.shape.nonlinearity)[0][0]
+    shape = fitted.fit.shape
+    half = None if shape.half is None else shape.half[:1]
+    edge = sharp_profile(z, np.array([[sigma]]), shape.tails[:1], half)[0]
+    light = response(edge, shape.nonlinearity)[0][0]
     after = max(int(np.argmax(light > 0)), 1)
     share = light[after] / (light[after] - light[after - 1])
     zero = z[0, after] - share * (z[0, 1] - z[0, 0])
@@ -146,15 +147,15 @@ def _vertices(grid_image: GridImage, fitted: GridFit, vertices: Array) -> Measur
     index = np.argwhere(grid_image.grid.seen)[:, ::-1]
     vertices[tuple(index[:, ::-1].T)] = np.where(good[:, None], pixels, np.nan)
     return Measured(
-        kind=np.full(int(good.sum()), VERTEX, dtype=np.int64),
-        index=index[good].astype(np.int64),
-        pixels=pixels[good],
-        covariance=covariance[good],
+        kind=np.full(len(index), VERTEX, dtype=np.int64),
+        index=index.astype(np.int64),
+        pixels=pixels,
+        covariance=covariance,
         across=None,
         vertices=vertices,
-        rejected=int((~good).sum()),
+        rejected=0,
         polarity=_polarity(fitted),
-    )
+    ).only(good)
 
 
 def _linear(image: NDArray[np.generic], gamma: float) -> NDArray[np.float32]:

@@ -16,16 +16,14 @@ from typing import Any
 import numpy as np
 
 from neurocal_cli import __version__
+from neurocal_cli.detection.batch import Outcome
 from neurocal_cli.detection.detect import Detection
-from neurocal_cli.detection.grid import Measured
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.files import read_bytes
 from neurocal_cli.io.writing import write_whole
 
 _FORMAT = 1
-
-Remembered = dict[str, Any]  # fields of `batch.Outcome`, its problem without the image's name
 
 
 class Memory:
@@ -42,25 +40,25 @@ class Memory:
     def __init__(self, folder: str, asked: str) -> None:
         self._folder, self._asked = folder, f"{_FORMAT} {__version__} {asked}".encode()
 
-    def recall(self, image: bytes) -> Remembered | None:
+    def recall(self, image: bytes) -> Outcome | None:
         """What was found in an image, by the bytes of its file; None if nobody has looked."""
         path = self._place(image)
         if not os.path.exists(path):
             return None
         try:
             tree = json.loads(read_bytes(path)[0])
-            found = tree["detection"]
-            return {
-                "detection": None if found is None else _detection(found),
-                "problem": str(tree["problem"]),
-                "notes": tuple(map(str, tree["notes"])),
-                "overlay": None if tree["overlay"] is None else b64decode(tree["overlay"]),
-                "shown": None if tree["shown"] is None else (int(tree["shown"][0]), int(tree["shown"][1])),
-            }
+            return Outcome(
+                path="",
+                detection=None if tree["detection"] is None else _detection(tree["detection"]),
+                problem=str(tree["problem"]),
+                notes=tuple(map(str, tree["notes"])),
+                overlay=None if tree["overlay"] is None else b64decode(tree["overlay"]),
+                shown=None if tree["shown"] is None else (int(tree["shown"][0]), int(tree["shown"][1])),
+            )
         except (NeurocalError, ValueError, KeyError, TypeError, IndexError):  # damaged: look again
             return None
 
-    def keep(self, image: bytes, outcome: Remembered) -> None:
+    def keep(self, image: bytes, outcome: Outcome) -> None:
         """Write what was found, at once: outputs that a command holds back would be lost with it.
 
         Raises
@@ -68,13 +66,13 @@ class Memory:
         NeurocalError
             The folder cannot be written to.
         """
-        found, overlay = outcome["detection"], outcome["overlay"]
+        found, overlay = outcome.detection, outcome.overlay
         tree = {
             "detection": None if found is None else _tree(found),
-            "problem": outcome["problem"],
-            "notes": outcome["notes"],
+            "problem": outcome.problem,
+            "notes": outcome.notes,
             "overlay": None if overlay is None else b64encode(overlay).decode(),
-            "shown": outcome["shown"],
+            "shown": outcome.shown,
         }
         os.makedirs(self._folder, exist_ok=True)
         Context().run(write_whole, self._place(image), json.dumps(tree) + "\n")
@@ -100,17 +98,6 @@ def _detection(tree: dict[str, Any]) -> Detection:
     """A detection without the grids that it was found on, which only its picture needs."""
     ids = tuple(map(str, tree["ids"]))
     width, height = tree["image_size"]
-    none = np.zeros(0, dtype=np.int64)
-    counted = Measured(
-        kind=none,
-        index=none.reshape(0, 2),
-        pixels=np.zeros((0, 2)),
-        covariance=np.zeros((0, 3)),
-        across=None,
-        vertices=np.zeros((0, 0, 2)),
-        rejected=int(tree["rejected"]),
-        polarity=0.0,
-    )
     return Detection(
         ids=ids,
         world=_array(tree["world"], len(ids), 3),
@@ -118,8 +105,7 @@ def _detection(tree: dict[str, Any]) -> Detection:
         covariance=_array(tree["covariance"], len(ids), 3),
         across=None if tree["across"] is None else _array(tree["across"], len(ids), 2),
         image_size=(int(width), int(height)),
-        located=(),
-        measured=(counted,),
+        rejected=int(tree["rejected"]),
         warnings=tuple(map(str, tree["warnings"])),
     )
 

@@ -55,7 +55,7 @@ def draw_detection(grey: NDArray[np.generic], detection: Detection) -> Picture:
     """
     residuals = [plane_residuals(measured, detection.image_size) for measured in detection.measured]
     lengths = np.concatenate([np.hypot(*residual.T) for residual in residuals])
-    square = min(_square(one.grid) for one in detection.located)
+    square = min(one.grid.square for one in detection.located)
     scale = _enlargement(lengths, square)
     lines = [
         f"{len(detection.ids)} points, {detection.rejected} rejected; residuals x {scale}: rms "
@@ -123,11 +123,6 @@ def _legend(detection: Detection) -> str:
 def _enlargement(lengths: Array, square: float) -> int:
     typical = max(float(np.median(lengths)), 1e-9)
     return max((scale for scale in _SCALES if scale * typical <= _ARROW * square), default=1)
-
-
-def _square(grid: Grid) -> float:
-    steps = [np.hypot(*np.moveaxis(np.diff(grid.pixels, axis=k), -1, 0)) for k in (0, 1)]
-    return float(min(np.nanmedian(step) for step in steps))
 
 
 class _Canvas:

@@ -21,7 +21,7 @@ from neurocal_cli.bundle_adjustment.view_covariance import counting_views
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import NOT_RADIAL, coefficient_names, distort, pinhole_coefficients
-from neurocal_cli.distortion.monotonic_fit import fit_monotonic, normal_part, where_not_monotonic
+from neurocal_cli.distortion.monotonic_fit import fit_monotonic, folds_back, normal_part
 from neurocal_cli.distortion.similar_lens import similar_states
 from neurocal_cli.errors import DegenerateGeometryError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
@@ -299,8 +299,7 @@ class _Chain:
         if self.repeated is not None:
             cov = counting_views(cov, *given, self.repeated)
         noise = _noise(problem.distortion.model, state, self.reach, cov.entries)
-        A = problem.matrix(state.entries[0])
-        bad = where_not_monotonic(state.distortion, A, problem.points)
+        bad = folds_back(problem, state)
         determined = _determined(problem, state, cov)
         return Candidate(problem, adjusted, lost, noise, bad, determined, is_weak(problem, state, cov))
 

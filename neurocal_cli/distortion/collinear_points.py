@@ -26,6 +26,8 @@ _OF_EDGES = 8  # the same where only lines along edges are used
 _ALONG = 0.25  # largest sine of the angle between an edge and the line along it
 _ALL_PAIRS = 700  # largest target of which all pairs are compared
 _MOST_PAIRS = 500_000  # pairs of some points with all others, for larger targets
+# Numbers without a relation: two directions, or two places, have the same product only if they are the same.
+_OF_DIRECTION, _OF_PLACE = np.array([0.618, 0.4142, 0.2361]), np.array([0.7321, 0.2361, 0.6458])
 _MOST_PLACES = 200_000  # points on lines; more of them do not change the result but cost time
 
 Index = NDArray[np.intp]
@@ -59,6 +61,11 @@ class CollinearPoints:
         """(M,) line of each entry of `row`."""
         return np.repeat(np.arange(len(self.first)), self.counts)
 
+    def only(self, which: NDArray[np.bool_]) -> CollinearPoints:
+        """Some of the lines; which is a mask (L,)."""
+        kept = self.counts[which]
+        return CollinearPoints(self.row[which[self.line]], np.cumsum(kept) - kept)
+
 
 def find_lines(points: Correspondences) -> CollinearPoints:
     """Find the lines of at least `FEWEST_ON_LINE` known points in each view, or of three along edges.
@@ -81,16 +88,18 @@ def find_lines(points: Correspondences) -> CollinearPoints:
     label = line[np.repeat(begins[ids], copies) + rank].astype(np.int64)
     label = label * points.n_views + points.view_index[row]
     order = np.argsort(label, kind="stable")
-    row, first = row[order], _run_starts(label[order])
-    return _thinned(*_along_edges(points, *_enough(row, first, fewest)))
+    changes = np.diff(label[order], prepend=-1) != 0
+    lines = CollinearPoints(row[order], np.flatnonzero(changes))
+    lines = lines.only(lines.counts >= fewest)
+    if points.across is not None and len(lines):
+        lines = _along_edges(lines, points.pixels, points.across)
+    every = -(-len(lines.row) // _MOST_PLACES)
+    return lines.only(np.arange(len(lines)) % every == 0) if every > 1 else lines
 
 
-def _along_edges(points: Correspondences, row: Index, first: Index) -> tuple[Index, Index]:
+def _along_edges(lines: CollinearPoints, pixels: Array, across: Array) -> CollinearPoints:
     """Drop lines across the edges of their points: a position along an edge is not measured."""
-    if points.across is None or not first.size:
-        return row, first
-    counts = np.diff(first, append=len(row))
-    pixels, line = points.pixels, np.repeat(np.arange(len(first)), counts)
+    row, first, counts, line = lines.row, lines.first, lines.counts, lines.line
     chord = pixels[row[first + counts - 1]] - pixels[row[first]]
     order = np.lexsort(((pixels[row] * chord[line]).sum(axis=1), line))
     row = row[order]
@@ -98,35 +107,9 @@ def _along_edges(points: Correspondences, row: Index, first: Index) -> tuple[Ind
     place = np.arange(len(row))
     before = np.maximum(place - 1, first[line])
     after = np.minimum(place + 1, (first + counts - 1)[line])
-    n = unit(points.across)[row]
+    n = unit(across)[row]
     slant = np.abs((n * unit(pixels[row[after]] - pixels[row[before]])).sum(axis=1))
-    return _kept(row, counts, ~np.logical_or.reduceat(slant > _ALONG, first))
-
-
-def _run_starts(sorted_labels: NDArray[np.int64]) -> Index:
-    if not sorted_labels.size:
-        return np.zeros(0, dtype=np.intp)
-    return np.flatnonzero(np.concatenate([[True], sorted_labels[1:] != sorted_labels[:-1]]))
-
-
-def _enough(row: Index, first: Index, fewest: int) -> tuple[Index, Index]:
-    """Drop lines with too few points."""
-    counts = np.diff(first, append=len(row))
-    return _kept(row, counts, counts >= fewest)
-
-
-def _kept(row: Index, counts: Index, keep: NDArray[np.bool_]) -> tuple[Index, Index]:
-    """Rows and first entries of the lines to keep."""
-    kept = counts[keep]
-    return row[np.repeat(keep, counts)], np.cumsum(kept) - kept
-
-
-def _thinned(row: Index, first: Index) -> CollinearPoints:
-    """An even choice of the lines where there are very many."""
-    every = -(-len(row) // _MOST_PLACES)
-    if every > 1:
-        row, first = _kept(row, np.diff(first, append=len(row)), np.arange(len(first)) % every == 0)
-    return CollinearPoints(row, first)
+    return CollinearPoints(row, first).only(~np.logical_or.reduceat(slant > _ALONG, first))
 
 
 def _distinct(world: Array) -> tuple[Index, Array]:
@@ -167,8 +150,8 @@ def _through_pairs(target: Array, a: Index, b: Index, fewest: int) -> tuple[Inde
     along /= np.linalg.norm(along, axis=1)[:, None]
     along *= _sign(along)[:, None]
     offset = target[a] - (target[a] * along).sum(axis=1)[:, None] * along
-    by_direction = _clusters(along @ np.array([0.618, 0.4142, 0.2361]), _TOLERANCE)
-    place = offset @ np.array([0.7321, 0.2361, 0.6458])
+    by_direction = _clusters(along @ _OF_DIRECTION, _TOLERANCE)
+    place = offset @ _OF_PLACE
     # Offsets are compared only between pairs of one direction.
     labels = _clusters(4.0 * by_direction + place, _TOLERANCE)
     counts = np.bincount(labels)
@@ -207,7 +190,7 @@ def _checked(
 
 def _commonest(directions: Array, members: Index, most: int) -> Array:
     """Directions of the lines with the most points."""
-    labels = _clusters(directions @ np.array([0.618, 0.4142, 0.2361]), _TOLERANCE)
+    labels = _clusters(directions @ _OF_DIRECTION, _TOLERANCE)
     _, first = np.unique(labels, return_index=True)
     weight = np.bincount(labels, members)
     return directions[first[np.argsort(-weight, kind="stable")[:most]]]
@@ -218,7 +201,7 @@ def _parallels(target: Array, directions: Array, fewest: int) -> tuple[Index, In
     lines, members, total = [], [], 0
     for direction in directions:
         offset = target - (target @ direction)[:, None] * direction
-        labels = _clusters(offset @ np.array([0.7321, 0.2361, 0.6458]), _TOLERANCE)
+        labels = _clusters(offset @ _OF_PLACE, _TOLERANCE)
         order = np.argsort(labels, kind="stable")
         along = np.broadcast_to(direction, (len(target), 3))
         line, member, kept = _checked(labels[order], order, target, labels, along, fewest)

@@ -10,11 +10,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, effective_number, point_residuals
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.distortion.monotonic_fit import where_not_monotonic
+from neurocal_cli.distortion.monotonic_fit import folds_back
 
 DENOMINATOR = frozenset({"k4", "k5", "k6"})
 _STEPS = 150  # the coefficients all but compensate each other
@@ -33,10 +31,7 @@ def with_denominator_if_told(solution: Solution) -> Solution:
     n = effective_number(views.n_equations, alike)
     before, after = (max(float(a.cost.sum()), 1e-300) for a in (solution.adjusted, found))
     told = n * np.log(before / after) > len(DENOMINATOR) * np.log(n) + _DECISIVE
-    if _is_monotonic(problem, solution.state) and not (told and _is_monotonic(problem, found.state)):
+    better = told and folds_back(problem, found.state) is None
+    if not better and folds_back(problem, solution.state) is None:
         return solution
     return replace(solution, problem=richer, adjusted=found)
-
-
-def _is_monotonic(problem: Problem, state: CameraState) -> bool:
-    return where_not_monotonic(state.distortion, problem.matrix(state.entries[0]), problem.points) is None

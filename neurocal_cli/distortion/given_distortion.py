@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from neurocal_cli.bundle_adjustment.solution import Solution
-from neurocal_cli.distortion.monotonic_fit import fit_monotonic, where_not_monotonic
+from neurocal_cli.distortion.monotonic_fit import fit_monotonic, folds_back
 from neurocal_cli.errors import DegenerateGeometryError
 
 
@@ -35,8 +35,7 @@ def check_distortion(solution: Solution) -> Solution:
         problem, start = problem.as_seen(solution.state)
         adjusted = problem.adjust(replace(solution.adjusted, state=start))
         return replace(solution, problem=problem, adjusted=adjusted)
-    state = solution.state
-    where = where_not_monotonic(state.distortion, problem.matrix(state.entries[0]), problem.points)
+    where = folds_back(problem, solution.state)
     if where is None:
         return solution
     if where == "image" and solution.shared is None:

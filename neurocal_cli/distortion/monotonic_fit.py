@@ -109,6 +109,11 @@ def where_not_monotonic(distortion: Distortion, A: Array, points: Correspondence
     return "image" if len(border) and _sees(distortion, A, farthest) else "points"
 
 
+def folds_back(problem: Problem, state: CameraState) -> str | None:
+    """Where the distortion of a state is not monotonic; see `where_not_monotonic`."""
+    return where_not_monotonic(state.distortion, problem.matrix(state.entries[0]), problem.points)
+
+
 def _border(image_size: tuple[int, int], distortion: Distortion) -> Array:
     """Pixels along the image's border, or its corners; (N, 2)."""
     tangential = "p1" in coefficient_names(distortion.model)
@@ -174,19 +179,13 @@ def _with_slope(
         state = adjusted.state
         if not adjusted.cost.sum() <= most:
             return None
-        A = problem.matrix(state.entries[0])
-        if where_not_monotonic(state.distortion, A, problem.points) is None:
-            return _settled(restrained, adjusted)
+        if folds_back(problem, state) is None:
+            # The descent creeps along the condition's edge where several coefficients share it.
+            adjusted = adjusted if adjusted.converged else restrained.adjust(adjusted, _MORE_STEPS)
+            return (restrained, adjusted) if adjusted.converged else None
         corner = beyond * _farthest(problem, state)
         last += max(corner - _distorted(state, last), 0.01 * corner) / _GUESS
     return None
-
-
-def _settled(problem: Problem, adjusted: Adjusted) -> tuple[Problem, Adjusted] | None:
-    """The end of the descent, which creeps along the condition's edge where several coefficients share it."""
-    if not adjusted.converged:
-        adjusted = problem.adjust(adjusted, _MORE_STEPS)
-    return (problem, adjusted) if adjusted.converged else None
 
 
 def _turn(state: CameraState) -> float:

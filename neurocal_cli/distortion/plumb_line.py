@@ -138,7 +138,9 @@ def fit_plumb_line(points: Correspondences, centre: Array | None = None) -> Plum
     free = _COEFFICIENTS if centre is not None else _CENTRE + _COEFFICIENTS
     spare = equations - len(free)
     _check_lines(curves)
-    found = _fit(distorted_lines(images, curves.entries, _start(curves)), np.array(free), spare)
+    problem = _LineDistances(distorted_lines(images, curves.entries, _start(curves)), np.array(free), spare)
+    minimise(problem, _OPTIONS, len(curves.feet) * _FLOOR**2)
+    found = problem.curves
     before, after = _rms(curves, equations) * scale, _rms(found, spare) * scale
     return PlumbLine(lines, found.entries[3:] * scale + middle, scale, found.distortion, before, after)
 
@@ -150,16 +152,9 @@ def lines_in_pixels(
     scale: float,
     whitening: Array | None = None,
 ) -> LineImages:
-    """Images of the points on lines, relative to a centre and in units of a scale.
+    """Images of the points on lines, relative to a centre (2,) [px] and in units of a scale [px].
 
-    Parameters
-    ----------
-    points : Correspondences
-    lines : CollinearPoints
-    centre : (2,) array [px]
-    scale : float [px]
-    whitening : (N, 3) array, optional
-        Whitening factors of the points, as from `views.noise_model`.
+    The points have whitening factors (N, 3), as from `views.noise_model`, or none.
     """
     pixels = (points.pixels[lines.row] - centre) / scale
     return LineImages(lines, pixels, None if whitening is None else whitening[lines.row])
@@ -186,28 +181,6 @@ def _frame(points: Correspondences) -> tuple[Array, float]:
     return (low + high) / 2, float((high - low).max()) or 1.0
 
 
-def _fit(curves: DistortedLines, free: NDArray[np.intp], spare: int) -> DistortedLines:
-    """Least squares over some columns of the derivatives.
-
-    Parameters
-    ----------
-    curves : DistortedLines
-        All of them `valid`.
-    free : (n,) int array
-        Free columns of A's entries and the coefficients. The centre has its prior.
-    spare : int
-        Equations less unknowns.
-
-    Raises
-    ------
-    DegenerateGeometryError
-        The lines do not determine the free parameters.
-    """
-    problem = _LineDistances(curves, free, spare)
-    minimise(problem, _OPTIONS, len(curves.feet) * _FLOOR**2)
-    return problem.curves
-
-
 class _LineDistances:
     """The distances from straight lines as a problem of `least_squares` with one group.
 
@@ -218,6 +191,15 @@ class _LineDistances:
         E = r.r exp(|c|^2 / (n prior^2))
 
     The gradient of E is that of r.r + |c|^2 (r.r / n) / prior^2, up to a factor.
+
+    Parameters
+    ----------
+    curves : DistortedLines
+        All of them `valid`.
+    free : (n,) int array
+        Free columns of A's entries and the coefficients.
+    spare : int
+        Equations less unknowns.
     """
 
     def __init__(self, curves: DistortedLines, free: NDArray[np.intp], spare: int) -> None:

@@ -8,6 +8,7 @@ may have several that are about as similar; each is a start of its own.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -106,12 +107,18 @@ def _radius(model: str, k: Array, theta: Array) -> Array:
     names = coefficient_names(model)
     radial = [0.0 if name in NOT_RADIAL else value for name, value in zip(names, k, strict=True)]
     with np.errstate(all="ignore"):
-        x, _, seen = project_points(
-            (1.0, 0.0, 1.0, 0.0, 0.0), model, radial, np.sin(theta), np.zeros_like(theta), np.cos(theta)
-        )
+        x, seen = _projected(model, radial, np.sin(theta), np.cos(theta))
         # The image ends where it first ceases to grow.
         grows = seen & (np.diff(x, prepend=0.0) > 0)
     return np.where(np.logical_and.accumulate(grows), x, np.nan)
+
+
+def _projected(
+    model: str, k: Sequence[float | Array], sine: Array, cosine: Array
+) -> tuple[Array, NDArray[np.bool_]]:
+    """Normalised x of directions (sine, 0, cosine), and whether the lens shows them."""
+    x, _, seen = project_points((1.0, 0.0, 1.0, 0.0, 0.0), model, k, sine, np.zeros_like(sine), cosine)
+    return x, seen
 
 
 def _grid(model: str, xi: Array) -> Array:
@@ -131,10 +138,7 @@ def _columns(model: str, grid: Array, theta: Array) -> Array:
         k = [*grid.T[:, :, None], *([0.0] * (4 if n_linear else 0))]
         sine = np.broadcast_to(np.sin(theta), (len(grid), len(theta)))
         with np.errstate(all="ignore"):
-            x, _, seen = project_points(
-                (1.0, 0.0, 1.0, 0.0, 0.0), model, k, sine, np.zeros_like(sine),
-                np.broadcast_to(np.cos(theta), sine.shape),
-            )  # fmt: skip
+            x, seen = _projected(model, k, sine, np.broadcast_to(np.cos(theta), sine.shape))
         m = np.where(seen, x, np.nan)
         return m[..., None] ** np.arange(1, 2 * n_linear + 2, 2)
     m = theta if model == "fisheye" else np.where(theta < 0.5 * np.pi - _SPARE, np.tan(theta), np.nan)

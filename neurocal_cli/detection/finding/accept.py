@@ -34,11 +34,6 @@ def has_block(lattice: Lattice) -> bool:
 
 def is_smooth(level: Level, lattice: Lattice) -> bool:
     """Whether the vertices lie where their neighbours predict them, within what noise explains."""
-    return roughness(level, lattice) < (1 if lattice.seen.sum() >= _MANY else _FEW_SMOOTH)
-
-
-def roughness(level: Level, lattice: Lattice) -> float:
-    """Root mean square distance of the vertices from their predictions, relative to the tolerance."""
     row, col, predicted = lattice.predicted
     off = (
         predicted.in_squares(lattice.pixels[row, col] - predicted.points)
@@ -46,7 +41,8 @@ def roughness(level: Level, lattice: Lattice) -> float:
     )
     contrast = max(median(lattice.contrast), 1e-3)
     tolerated = _OFF + (_OFF_PX + _OFF_NOISE * level.noise / contrast) / max(median(predicted.width), 1.0)
-    return float(np.sqrt((off**2).mean())) / tolerated
+    most = 1 if len(row) >= _MANY else _FEW_SMOOTH
+    return float(np.sqrt((off**2).mean())) / tolerated < most
 
 
 def edges_visible(level: Level, lattice: Lattice) -> bool:

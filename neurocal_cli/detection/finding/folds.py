@@ -34,7 +34,8 @@ def split_at_folds(lattice: Lattice) -> list[Lattice]:
     if len(whole) != 1:
         return [part for piece in whole for part in split_at_folds(piece)]
     lattice = whole[0]
-    row, col = _sharpest_folds(lattice)
+    width = max(median(lattice.predicted[2].width), 1.0)
+    row, col = (_sharpest_fold(second, width) for second in _second_differences(lattice))
     if row[1] == 0 and col[1] == 0:
         return [lattice]
     pixels = lattice.pixels if row[1] >= col[1] else lattice.pixels.transpose(1, 0, 2)
@@ -51,13 +52,6 @@ def split_at_folds(lattice: Lattice) -> list[Lattice]:
         part = lattice.subset(np.isfinite(kept[..., 0]))
         parts += split_at_folds(part) if part.seen.any() else []
     return parts
-
-
-def _sharpest_folds(lattice: Lattice) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The sharpest folds along a row and along a column; see `_fold`."""
-    width = max(median(lattice.predicted[2].width), 1.0)
-    along_columns, along_rows = _second_differences(lattice)
-    return _fold(along_columns, width), _fold(along_rows, width)
 
 
 def largest_second_difference(lattice: Lattice) -> float:
@@ -78,27 +72,20 @@ def _second_differences(lattice: Lattice) -> tuple[Array, Array]:
     return along[0], along[1]
 
 
-def _fold(second: Array, width: float) -> tuple[float, float]:
-    """Find the sharpest fold.
+def _sharpest_fold(second: Array, width: float) -> tuple[float, float]:
+    """Place among the rows and size [squares] of the sharpest fold along columns; (0, 0) without one.
 
-    Parameters
-    ----------
-    second : (rows, cols, 2) array [squares]
-        Second differences along the columns, NaN where unknown.
-    width : float [px]
-        Of the squares.
-
-    Returns
-    -------
-    position, size : float
-        Among the rows, and in squares; (0, 0) without a fold.
+    Of second differences (rows, cols, 2) [squares], NaN where unknown, of squares of a width [px].
     """
     rows = len(second)
     if rows < _LEAST_ROWS:
         return 0.0, 0.0
     before, after, far = (np.full_like(second, np.nan) for _ in range(3))
     before[1:], after[:-1], far[:-2] = second[:-1], second[1:], second[2:]
-    at = _jump(_against_one_or_both(second, before, after))
+    # Against both sides, or with less weight against one where the other is unknown.
+    one = _ONE_SIDED * (second - np.where(np.isnan(before), after, before))
+    both = second - 0.5 * (before + after)
+    at = _jump(np.where(np.isnan(both), one, both))
     # Between row i and i + 1.
     between = _BETWEEN * _jump(0.5 * (second + after - before - far))
     size = np.empty(2 * rows)
@@ -111,13 +98,6 @@ def _fold(second: Array, width: float) -> tuple[float, float]:
     if size[best] < least:
         return 0.0, 0.0
     return 0.5 * best, float(size[best])
-
-
-def _against_one_or_both(values: Array, first: Array, second: Array) -> Array:
-    """Differences from the mean of two arrays, with less weight where one of them is unknown."""
-    both = values - 0.5 * (first + second)
-    one = _ONE_SIDED * (values - np.where(np.isnan(first), second, first))
-    return np.where(np.isnan(both), one, both)
 
 
 def _jump(values: Array) -> Array:

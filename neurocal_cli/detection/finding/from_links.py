@@ -1,6 +1,6 @@
 """A short cut for growth: most of a grid at once, by following links from vertex to vertex.
 
-In: saddles, their links, and the middle of a seed. Out: a lattice, or None. The lattice is only accepted
+In: linked saddles, and the middle of a seed. Out: a lattice, or None. The lattice is only accepted
 where every vertex passes the tests that `grow` applies; growing layer by layer gives the same, more slowly.
 """
 
@@ -31,15 +31,12 @@ _MOST_CURVED = 0.16  # squares; a larger second difference may be a fold
 _WHOLE = 0.5  # least share of an outer line that is linked; beyond the board, links lead astray
 
 
-def lattice_from_links(
-    level: Level, saddles: Saddles, links: Links, middle: int, taken: NDArray[np.bool_]
-) -> Lattice | None:
+def lattice_from_links(level: Level, links: Links, middle: int, taken: NDArray[np.bool_]) -> Lattice | None:
     """Follow the links that start at a vertex, and test what they lead to.
 
     Parameters
     ----------
     level : Level
-    saddles : Saddles
     links : Links
     middle : int
         The vertex; its port 0 leads along c.
@@ -54,6 +51,7 @@ def lattice_from_links(
     places = _follow(links, middle, taken.tolist())
     if len(places) < _FEWEST:
         return None
+    saddles = links.saddles
     lattice = _lattice(saddles, places)
     row, col = np.nonzero(lattice.seen)
     refined = refine_saddles(level.image, lattice.pixels[row, col], lattice.derivative_sigma)

@@ -25,7 +25,6 @@ from neurocal_cli.detection.finding.levels import Level, levels_of, pyramid
 from neurocal_cli.detection.finding.links import Links, find_links
 from neurocal_cli.detection.finding.merge import merge_lattices
 from neurocal_cli.detection.finding.overlaps import any_overlap, drop_duplicates, trim_overlaps
-from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
 from neurocal_cli.detection.finding.seeds import find_seeds_2x3, find_seeds_3x3
 from neurocal_cli.detection.finding.straighten import any_left, find_bent, refined_locally
 from neurocal_cli.detection.finding.stretch import stretch
@@ -74,7 +73,7 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
     """Lattices on the finest level of a pyramid; `straight` where no lens is left to bend them."""
     lattices: list[Lattice] = []
     bent: list[Lattice] = []
-    saddles: Saddles
+    links: Links | None = None
     small = [level for level in levels if level.image.size <= _SEARCHED] or levels[-1:]
     for level in reversed(levels):
         lattices = [_to_finer_level(level, x) for x in lattices]
@@ -83,23 +82,21 @@ def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) 
         if level in small or (none and level.image.size <= _MOST_SEARCHED):
             if level is small[0]:
                 lattices = [y for x in lattices for y in _boards(remove_outliers(level, grow(level, x)))]
-            saddles = find_saddles(level, _mask(level, lattices) if lattices else None)
-            links = find_links(level, saddles) if len(saddles) >= 9 else None
+            links = find_links(level, _mask(level, lattices) if lattices else None)
             masked = sum(int(x.seen.sum()) for x in lattices)
             if links is not None:
-                lattices += _find_new(level, saddles, links, lattices, wanted)
+                lattices += _find_new(level, links, lattices, wanted)
             if level not in small[1:]:
                 lattices = _split_planes(level, lattices)
             if level is small[0] and not (straight or _nearest_whole(lattices, wanted)):
-                lattices, bent = _find_bent(level, saddles, links, masked, lattices, wanted)
-    if not lattices and not bent and levels and levels[0] in small:
-        lattices = _split_planes(levels[0], _find_slivers(levels[0], saddles))
+                lattices, bent = _find_bent(level, links, masked, lattices, wanted)
+    if links is not None and not lattices and not bent and levels[0] in small:
+        lattices = _split_planes(levels[0], _find_slivers(levels[0], links))
     return lattices + bent
 
 
 def _find_bent(
     level: Level,
-    saddles: Saddles,
     links: Links | None,
     masked: int,
     known: list[Lattice],
@@ -107,26 +104,24 @@ def _find_bent(
 ) -> tuple[list[Lattice], list[Lattice]]:
     """Known lattices without pieces of bent ones, and the bent ones.
 
-    Saddles are those besides lattices of so many masked vertices.
+    Linked saddles are those besides lattices of so many masked vertices.
     """
     lost = masked > sum(int(x.seen.sum()) for x in known)
     least = _UNFINISHED * min((cols * rows for cols, rows in wanted), default=np.inf)
     unfinished = [x for x in known if x.seen.sum() >= least]
-    if not (lost or unfinished or (links is not None and any_left(saddles, links, known))):
+    if not (lost or unfinished or (links is not None and any_left(links, known))):
         return known, []
     if masked:
-        saddles = find_saddles(level)
-        links = find_links(level, saddles) if len(saddles) >= 9 else None
+        links = find_links(level)
     if links is None:
         return known, []
 
     def search(view: NDArray[np.float32]) -> list[Lattice]:
         return _find(pyramid(view), wanted, straight=True)
 
-    found = find_bent(level, saddles, links, known, unfinished, search)
+    found = find_bent(level, links, known, unfinished, search)
     left = drop_duplicates(found + known) if found else known
-    bent = [x for x in left if any(x is y for y in found)]
-    return [x for x in left if not any(x is y for y in bent)], bent
+    return [x for x in left if x not in found], [x for x in left if x in found]
 
 
 def _split_planes(level: Level, lattices: list[Lattice]) -> list[Lattice]:
@@ -171,27 +166,19 @@ def _sides(points: Array) -> Array:
 
 
 def _find_new(
-    level: Level,
-    saddles: Saddles,
-    links: Links,
-    known: list[Lattice],
-    wanted: frozenset[Size] = frozenset(),
+    level: Level, links: Links, known: list[Lattice], wanted: frozenset[Size] = frozenset()
 ) -> list[Lattice]:
     """Grids of a level's saddles besides the known ones. The first grid of an image gets more effort."""
-    seeds = find_seeds_3x3(saddles, links)
-    found = _grow_from_seeds(
-        level, saddles, links, seeds, np.zeros(len(seeds), dtype=np.intp), _TRIES, known, wanted
-    )
+    seeds = find_seeds_3x3(links)
+    dark = np.zeros(len(seeds), dtype=np.intp)
+    found = _grow_from_seeds(level, links, seeds, dark, _TRIES, known, wanted)
     if not found and not known and level.scale == 1:
-        found = _grow_from_seeds(
-            level, saddles, links, *find_seeds_2x3(saddles, links), _TRIES_2X3, known, wanted
-        )
+        found = _grow_from_seeds(level, links, *find_seeds_2x3(links), _TRIES_2X3, known, wanted)
     return found
 
 
 def _grow_from_seeds(
     level: Level,
-    saddles: Saddles,
     links: Links,
     seeds: NDArray[np.intp],
     dark: NDArray[np.intp],
@@ -201,6 +188,7 @@ def _grow_from_seeds(
 ) -> list[Lattice]:
     """Grids that grow from seeds, until a number of seeds has failed."""
     found: list[Lattice] = []
+    saddles = links.saddles
     free, taken = np.ones(len(saddles), dtype=bool), np.zeros(len(saddles), dtype=bool)
     nearest = _nearest_whole(known, wanted)
     sides = _sides(saddles.points[seeds]) if wanted and len(seeds) else np.full(len(seeds), np.inf)
@@ -208,9 +196,7 @@ def _grow_from_seeds(
         if side * _BEHIND < nearest or not free[seed].all():
             continue
         free[seed] = False
-        lattice = (
-            lattice_from_links(level, saddles, links, int(seed[1, 1]), taken) if len(seed) == 3 else None
-        )
+        lattice = lattice_from_links(level, links, int(seed[1, 1]), taken) if len(seed) == 3 else None
         if lattice is not None and lattice.seen.all() and level.scale > 1:
             grid = lattice  # finer levels complete it
         else:
@@ -229,16 +215,14 @@ def _grow_from_seeds(
     return found
 
 
-def _find_slivers(level: Level, saddles: Saddles) -> list[Lattice]:
+def _find_slivers(level: Level, links: Links) -> list[Lattice]:
     """Grids of squares too narrow for the directions of their edges to be measured."""
-    part = stretch(level, saddles.points) if len(saddles) >= 9 else None
-    if part is None:
+    part = stretch(level, links.saddles.points)
+    links_of_part = None if part is None else find_links(part.level)
+    if part is None or links_of_part is None:
         return []
     found = []
-    saddles = find_saddles(part.level)
-    if len(saddles) < 9:
-        return []
-    for lattice in _find_new(part.level, saddles, find_links(part.level, saddles), []):
+    for lattice in _find_new(part.level, links_of_part, []):
         pixels = np.full_like(lattice.pixels, np.nan)
         pixels[lattice.seen] = part.back(lattice.pixels[lattice.seen])
         grid = grow(level, _refined(level, replace(lattice, pixels=pixels), LEAST_SIGMA, 1))

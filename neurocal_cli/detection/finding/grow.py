@@ -42,7 +42,7 @@ def grow(level: Level, lattice: Lattice, outwards: bool = True, reach: int = 1) 
         if outwards:
             lattice, shift = lattice.padded()
             top, left = top + shift[0], left + shift[1]
-        row, col, support = _frontier(lattice.seen, reach)
+        row, col, support = frontier(lattice.seen, reach)
         # A place is searched again only when it has more neighbours than before.
         keys = list(zip((row - top).tolist(), (col - left).tolist(), support.tolist(), strict=True))
         fresh = [k for k, key in enumerate(keys) if key not in tried]
@@ -61,11 +61,6 @@ def _around(values: NDArray[np.generic]) -> Array:
     return np.asarray(cv2.boxFilter(whole, -1, (3, 3), normalize=False, borderType=cv2.BORDER_CONSTANT))
 
 
-def frontier(lattice: Lattice) -> tuple[Index, Index]:
-    """Rows and columns of unknown places with a known neighbour along an edge and another one nearby."""
-    return _frontier(lattice.seen, 1)[:2]
-
-
 # One convolution counts all neighbours (modulo 16) and those along edges (in sixteens).
 _BESIDE = 16
 _COUNTS = np.array(
@@ -73,10 +68,11 @@ _COUNTS = np.array(
 )
 
 
-def _frontier(seen: NDArray[np.bool_], reach: int) -> tuple[Index, Index, NDArray[np.generic]]:
-    """See `frontier`; also the number of known places around each.
+def frontier(seen: NDArray[np.bool_], reach: int) -> tuple[Index, Index, NDArray[np.generic]]:
+    """Rows and columns of unknown places where growth goes on, and the number of known places around each.
 
-    With a reach of 2, all unknown places at most two away from a known one.
+    Those with a known neighbour along an edge and another one nearby; with a reach of 2, all that are at most
+    two away from a known one.
     """
     counts = cv2.filter2D(seen.view(np.uint8), -1, _COUNTS, borderType=cv2.BORDER_CONSTANT)
     around = counts % _BESIDE

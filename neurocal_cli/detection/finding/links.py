@@ -1,6 +1,6 @@
 """Links between neighbouring saddles, along the edges of the squares.
 
-In: the saddles of a level. Out: for every saddle its neighbour at each of its four ports. An edge leaves one
+In: a level. Out: its saddles, and for every one its neighbour at each of its four ports. An edge leaves one
 vertex through a port that a dark sector follows and enters the next through a port that a dark sector
 precedes: along a line of the board, even and odd ports meet.
 """
@@ -12,13 +12,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from neurocal_cli.detection.finding.lattice import Index
 from neurocal_cli.detection.finding.levels import Level, interpolate
-from neurocal_cli.detection.finding.saddles import Saddles
+from neurocal_cli.detection.finding.saddles import Saddles, find_saddles
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-Index = NDArray[np.intp]
-
+_FEWEST = 9  # saddles, of 3 x 3 vertices
 # Insensitive; tests/test_finding.py.
 _WIDEST = 0.26  # rad; between a port and the direction to the neighbour
 _SHARE = 0.45  # the same as a share of the vertex's narrower angle
@@ -28,16 +28,18 @@ _SIMILAR = 0.33  # least ratio of the contrasts of neighbours
 
 @frozen_dataclass(eq=False)
 class Links:
-    """Neighbours of saddles along their edges.
+    """Saddles and their neighbours along their edges.
 
     Attributes
     ----------
+    saddles : Saddles
     to : (N, 4) int array
         The neighbour at each port; -1 where there is none.
     port : (N, 4) int array
         The neighbour's port that the edge enters.
     """
 
+    saddles: Saddles
     to: Index
     port: Index
 
@@ -47,9 +49,24 @@ class Links:
         return self.to.tolist(), self.port.tolist()
 
 
-def find_links(level: Level, saddles: Saddles) -> Links:
-    """Link saddles that are each other's nearest suitable neighbour at their ports."""
+def find_links(level: Level, covered: NDArray[np.uint8] | None = None) -> Links | None:
+    """Find saddles and link those that are each other's nearest suitable neighbour at their ports.
+
+    Parameters
+    ----------
+    level : Level
+    covered : (height, width) uint8 array, optional
+        Non-zero where not to search.
+
+    Returns
+    -------
+    links : Links or None
+        None where there are fewer saddles than the smallest board has vertices.
+    """
+    saddles = find_saddles(level, covered)
     count = len(saddles)
+    if count < _FEWEST:
+        return None
     place = saddles.points.astype(np.float32)
     du, dv = (place[None, :, k] - place[:, None, k] for k in (0, 1))
     distance = du * du + dv * dv
@@ -72,7 +89,7 @@ def find_links(level: Level, saddles: Saddles) -> Links:
     to[~mutual], entry[~mutual] = -1, -1
     unseen = ~_edges_visible(level, saddles, to, entry)
     to[unseen], entry[unseen] = -1, -1
-    return Links(to, entry)
+    return Links(saddles, to, entry)
 
 
 def _port_towards(du: NDArray[np.float32], dv: NDArray[np.float32], ports: Array) -> NDArray[np.int8]:

@@ -6,9 +6,8 @@ In: the lattices of a level. Out: the same, with those joined that continue each
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.lattice import Lattice
+from neurocal_cli.detection.finding.lattice import Index, Lattice
 from neurocal_cli.geometry import Array
 
 # tests/test_finding.py divides a board into two halves with these limits, and expects one grid.
@@ -16,8 +15,6 @@ _NEAR = 4.0  # squares; of one lattice from the other, to be compared
 _WHOLE, _WHOLE_WORST = 0.12, 0.3  # squares; farthest from whole numbers, median and worst
 _LEAST = 4  # vertices compared
 _TURNS = ((1, 0, 0, 1), (0, -1, 1, 0), (-1, 0, 0, -1), (0, 1, -1, 0))
-
-Index = NDArray[np.intp]
 
 
 def merge_lattices(lattices: list[Lattice]) -> list[Lattice]:

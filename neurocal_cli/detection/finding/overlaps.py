@@ -73,7 +73,7 @@ def trim_overlaps(lattices: list[Lattice]) -> list[Lattice]:
 def _vertices_and_next(lattice: Lattice) -> tuple[Array, float]:
     """Vertices of a lattice and of its next rows (N, 2), and the width of its squares."""
     wider, _ = lattice.padded()
-    row, col = frontier(wider)
+    row, col, _ = frontier(wider.seen, 1)
     predicted = predict_vertices(wider.pixels, row, col)
     return np.concatenate([lattice.pixels[lattice.seen], predicted.points]), lattice.width
 

@@ -53,10 +53,6 @@ class Saddles:
         """Count them."""
         return len(self.points)
 
-    def __getitem__(self, which: NDArray[np.generic]) -> Saddles:
-        """Some of them."""
-        return Saddles(self.points[which], self.ports[which], self.contrast[which])
-
 
 def find_saddles(level: Level, covered: NDArray[np.uint8] | None = None) -> Saddles:
     """Find the crossings of edges in a level.
@@ -153,13 +149,7 @@ def _peaks(level: Level) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
 
 
 def _ring(profile: Array, noise: float) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Ports and contrast from the brightness on a ring around points, and whether it looks like a vertex.
-
-    Parameters
-    ----------
-    profile : (_RAYS, N) array [DN]
-    noise : float [DN]
-    """
+    """Ports, contrast, and whether it looks like a vertex, from the brightness (rays, N) [DN] on a ring."""
     count = profile.shape[1]
     ports, contrast = np.zeros((count, 4)), np.zeros(count)
     high, low = profile.max(axis=0), profile.min(axis=0)

@@ -1,6 +1,6 @@
 """Seeds of grids: blocks of 3 x 3 vertices linked by edges, or of 2 x 3 where there are none.
 
-In: saddles and their links. Out: blocks of saddles, the most regular ones first, for `grids` to grow.
+In: linked saddles. Out: blocks of saddles, the most regular ones first, for `grids` to grow.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.finding.links import Index, Links
-from neurocal_cli.detection.finding.saddles import Saddles
+from neurocal_cli.detection.finding.lattice import Index
+from neurocal_cli.detection.finding.links import Links
 from neurocal_cli.geometry import Array
 
 # Insensitive; tests/test_finding.py.
@@ -17,7 +17,7 @@ _IRREGULAR = 0.12  # squares; greatest variation of a seed's second differences 
 _SECOND = 0.4  # ... and the weight of these differences themselves
 
 
-def find_seeds_3x3(saddles: Saddles, links: Links) -> Index:
+def find_seeds_3x3(links: Links) -> Index:
     """Find blocks of four closed squares around a vertex, the most regular first.
 
     Returns
@@ -34,7 +34,7 @@ def find_seeds_3x3(saddles: Saddles, links: Links) -> Index:
         corner = links.to[links.to[centre, p], (links.port[centre, p] - 1) % 4]
         c2, r2 = ((1, 1), (-1, 1), (-1, -1), (1, -1))[p]
         block[:, 1 + r2, 1 + c2] = corner
-    grid = saddles.points[block]
+    grid = links.saddles.points[block]
     irregularity = _irregularity(grid)
     order = np.argsort(irregularity, kind="stable")
     return block[order[irregularity[order] < _IRREGULAR]]
@@ -45,7 +45,7 @@ def whole_blocks(links: Links) -> Index:
     return np.flatnonzero(_closed(links).all(axis=1))
 
 
-def find_seeds_2x3(saddles: Saddles, links: Links) -> tuple[Index, Index]:
+def find_seeds_2x3(links: Links) -> tuple[Index, Index]:
     """Find blocks of two closed squares side by side.
 
     Returns
@@ -62,7 +62,7 @@ def find_seeds_2x3(saddles: Saddles, links: Links) -> tuple[Index, Index]:
     corner = links.to[right, (links.port[middle, p] - 1) % 4]
     other = links.to[down, (links.port[middle, (p + 1) % 4] - 1) % 4]
     block = np.stack([np.stack([left, middle, right], -1), np.stack([other, down, corner], -1)], axis=1)
-    grid = saddles.points[block]
+    grid = links.saddles.points[block]
     c = 0.5 * (grid[:, 0, 2] - grid[:, 0, 0])
     second = np.abs(grid[:, :, 0] + grid[:, :, 2] - 2 * grid[:, :, 1]).max(axis=(1, 2))
     irregularity = second / np.maximum(np.hypot(*c.T), 1e-6)

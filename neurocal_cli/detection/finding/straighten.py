@@ -4,7 +4,7 @@ The squares of a board near a wide lens bend, and change from one to the next, m
 elsewhere. Their links are seen nevertheless, and tell the lens and the plane. In a view of that plane from
 straight above, lines are straight and squares are equal, so that growth finds the others.
 
-In: a level with its saddles and links, and the lattices already known. Out: the lattice of a linked group of
+In: a level with its linked saddles, and the lattices already known. Out: the lattice of a linked group of
 saddles as that view shows it, in the level's pixels.
 """
 
@@ -21,7 +21,6 @@ from neurocal_cli.detection.finding.from_links import linked_group
 from neurocal_cli.detection.finding.lattice import Index, Lattice
 from neurocal_cli.detection.finding.levels import Level
 from neurocal_cli.detection.finding.links import Links
-from neurocal_cli.detection.finding.saddles import Saddles
 from neurocal_cli.detection.finding.seeds import whole_blocks
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.detection.medians import median
@@ -86,8 +85,9 @@ class PlaneView:
         return np.asarray(view, dtype=np.float32)
 
 
-def any_left(saddles: Saddles, links: Links, known: list[Lattice]) -> bool:
+def any_left(links: Links, known: list[Lattice]) -> bool:
     """Whether linked saddles belong to no lattice: a block of their own, or a line beside a lattice."""
+    saddles = links.saddles
     linked = (links.to >= 0).any(axis=1)
     blocks = np.zeros(len(saddles), dtype=bool)
     blocks[whole_blocks(links)] = True
@@ -103,7 +103,6 @@ def any_left(saddles: Saddles, links: Links, known: list[Lattice]) -> bool:
 
 def find_bent(
     level: Level,
-    saddles: Saddles,
     links: Links,
     known: list[Lattice],
     unfinished: list[Lattice],
@@ -114,9 +113,8 @@ def find_bent(
     Parameters
     ----------
     level : Level
-    saddles : Saddles
-        Of the whole level, those of known lattices too.
     links : Links
+        Of the whole level, those of known lattices too.
     known : list of Lattice
     unfinished : list of Lattice
         Those known ones that are smaller than the board.
@@ -129,7 +127,7 @@ def find_bent(
         Each larger than the known ones at the same place.
     """
     found: list[Lattice] = []
-    groups = [(places, saddles.points[members], _MORE, 0.0) for places, members in _groups(saddles, links)]
+    groups = [(places, links.saddles.points[members], _MORE, 0.0) for places, members in _groups(links)]
     groups += [(np.argwhere(x.seen)[:, ::-1], x.pixels[x.seen], 1.0, _WIDE) for x in unfinished]
     for places, pixels, more, wide in groups:
         if len(pixels) < more * max((_shared(x, pixels) for x in (*known, *found)), default=0):
@@ -147,16 +145,16 @@ def find_bent(
     return found
 
 
-def _groups(saddles: Saddles, links: Links) -> Iterator[tuple[Index, Index]]:
+def _groups(links: Links) -> Iterator[tuple[Index, Index]]:
     """Places (N, 2) and saddles (N,) of linked groups of at least 3 x 3, from different middles."""
     middles = whole_blocks(links)
-    covered = np.zeros(len(saddles), dtype=bool)
+    covered = np.zeros(len(links.to), dtype=bool)
     for _ in range(_GROUPS):
         free = middles[~covered[middles]]
         if not len(free):
             return
         # The strongest vertex is the least likely to be clutter.
-        middle = int(free[np.argmax(saddles.contrast[free])])
+        middle = int(free[np.argmax(links.saddles.contrast[free])])
         places, members = linked_group(links, middle)
         covered[members] = covered[middle] = True
         if len(members) >= 9:

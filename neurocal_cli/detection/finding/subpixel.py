@@ -69,7 +69,7 @@ def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) ->
     step, saddle = _newton(image, centre, sigma)
     # Derivatives are those of the nearest pixel: only points that moved to another one go on.
     for _ in range(rounds - 1):
-        ahead = _within(centre + step, low, high)
+        ahead = np.minimum(np.maximum(np.rint(centre + step), low), high)
         moved = np.flatnonzero((ahead[0] != centre[0]) | (ahead[1] != centre[1]))
         if not len(moved):
             break
@@ -78,11 +78,6 @@ def refine_saddles(image: Image, start: Array, sigma: float, rounds: int = 3) ->
     close = np.abs(step) < 1
     good &= saddle & close[0] & close[1]
     return np.where(good, centre + step, np.nan).T
-
-
-def _within(point: Array, low: int, high: Array) -> Array:
-    """Nearest pixels (2, N) whose windows lie in the image."""
-    return np.minimum(np.maximum(np.rint(point), low), high)
 
 
 def _newton(image: Image, centre: Array, sigma: float) -> tuple[Array, NDArray[np.bool_]]:

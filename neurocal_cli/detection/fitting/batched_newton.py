@@ -5,14 +5,16 @@ independent fits to hundreds of pixels each. Arrays hold all fits side by side, 
 memory traffic, and fits that have not converged with the others go on by themselves. The small
 systems of normal equations are solved in float64.
 
-In: a model with derivatives, a start, a prior. Out: `BatchFit` with values, Fisher information and chi2.
+In: pixels, their model with derivatives, a start, a prior. Out: `BatchFit` with values, Fisher information
+and chi2.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +30,48 @@ MEAN, CONTRAST, BLUR = -3, -2, -1
 LEAST_BLUR = 0.2905  # px; a pixel's box alone has sqrt(1/12) = 0.2887
 # Insensitive.
 _MOST, _CONVERGED = 0.9, 0.5  # share of the fits whose last step is below so many standard deviations
-MORE_STEPS = 20  # at most, of fits that have not converged with the others
+_MORE_STEPS = 20  # at most, of fits that have not converged with the others
 _DAMPING, _LEAST_DAMPING = 1.0, 0.01  # first and last damping after a step that raised the cost
 _FLOAT32 = 1e-6  # relative error of float32 sums
 _NOTHING = 1e-9  # information that keeps fits without pixels regular
+
+
+@frozen_dataclass(eq=False)
+class FitPixels:
+    """The pixels of fits, (E, N) float32 arrays.
+
+    Attributes
+    ----------
+    value : array [DN]
+        Minus the slope of the mean level.
+    gain : array
+        Half contrast there, relative to that of the fit's middle.
+    Q : array
+        The effect of other lines on the light; see the models.
+    root : array [1/DN]
+        Inverse standard deviation of the noise; 0 for pixels that are not used.
+    beyond : (E,) array
+        Share of the pixels that lie outside the image.
+    """
+
+    value: Single
+    gain: Single
+    Q: Single
+    root: Single
+    beyond: Array
+
+    def part(self: Pixels, which: Part) -> Pixels:
+        """The pixels of some fits."""
+        return replace(self, **{field.name: getattr(self, field.name)[which] for field in fields(self)})
+
+    def weighed(self: Pixels, weight: Single) -> Pixels:
+        """The same pixels with other weights [1/DN^2]; unused ones stay unused."""
+        root = np.sqrt(weight)
+        root *= self.root > 0
+        return replace(self, root=root)
+
+
+Pixels = TypeVar("Pixels", bound=FitPixels)
 
 
 @frozen_dataclass(eq=False)
@@ -76,6 +116,11 @@ class ProfileShape:
         return ProfileShape(
             self.tails[which], self.nonlinearity, None if self.half is None else self.half[which]
         )
+
+    def elsewhere(self, half: Array) -> ProfileShape:
+        """That of other fits of the same image, with half widths of the pixel's box where they matter."""
+        tails = np.tile(self.tails.mean(axis=0), (len(half), 1))
+        return ProfileShape(tails, self.nonlinearity, None if self.half is None else half)
 
 
 @frozen_dataclass(eq=False)
@@ -135,8 +180,11 @@ class BatchFit:
     information : (E, P, P) array
         Fisher information of the pixels, without the prior.
     prior : LevelPrior
-    chi2, count : (E,) arrays
-        Weighted sum of squared residuals, and number of pixels.
+    chi2 : (E,) array
+        Weighted sum of squared residuals.
+    model : function of pixels, values and shape
+    pixels : FitPixels
+    shape : ProfileShape
     step : (E,) array
         The last step, in standard deviations.
     linear : Linearised
@@ -147,7 +195,9 @@ class BatchFit:
     information: Array
     prior: LevelPrior
     chi2: Array
-    count: NDArray[np.int64]
+    model: Callable[[Any, Array, ProfileShape], Linearised]
+    pixels: FitPixels
+    shape: ProfileShape
     step: Array
     linear: Linearised
 
@@ -162,6 +212,16 @@ class BatchFit:
         diagonal += _NOTHING
         return np.asarray(np.linalg.inv(total), dtype=float)
 
+    @cached_property
+    def count(self) -> NDArray[np.int64]:
+        """(E,) number of pixels used."""
+        return np.count_nonzero(self.pixels.root, axis=1)
+
+    @property
+    def roughness(self) -> Array:
+        """(E,) chi2 of each pixel."""
+        return self.chi2 / np.maximum(self.count, 1)
+
     @property
     def variance_growth(self) -> Array:
         """(E,) factor on variances for fits whose last step was longer than a standard deviation."""
@@ -171,40 +231,52 @@ class BatchFit:
         """The same fits for a variance of the pixels that is larger by a factor."""
         return replace(self, information=self.information / noise, chi2=self.chi2 / noise)
 
+    def continued(
+        self, shape: ProfileShape, steps: int, more: int = _MORE_STEPS, weight: Single | None = None
+    ) -> BatchFit:
+        """Further steps from these values, with another shape, and with other weights [1/DN^2] if given."""
+        pixels = self.pixels if weight is None else self.pixels.weighed(weight)
+        return fit_batch(self.model, pixels, self.values, self.prior, shape, steps, more)
+
 
 def fit_batch(
-    model_of: Callable[[Part], Callable[[Array], Linearised]],
+    model: Callable[[Pixels, Array, ProfileShape], Linearised],
+    pixels: Pixels,
     start: Array,
     prior: LevelPrior,
-    count: NDArray[np.int64],
+    shape: ProfileShape,
     steps: int,
-    more: int = MORE_STEPS,
+    more: int = _MORE_STEPS,
 ) -> BatchFit:
     """Fit all at once, and then those that have not converged by themselves.
 
     Parameters
     ----------
-    model_of : function of a part of the fits
-        Gives a function of their values.
+    model : function of pixels, values and shape
+    pixels : FitPixels
     start : (E, P) array
         Values to begin with.
     prior : LevelPrior
-    count : (E,) array
-        Of the pixels.
+    shape : ProfileShape
     steps, more : int
         Greatest number, of all fits and of those that have not converged.
     """
-    model = model_of(slice(None))
-    state = _State.of(model, start, prior)
+
+    def model_of(part: Part) -> Callable[[Array], Linearised]:
+        some, own = pixels.part(part), shape.part(part)
+        return lambda values: model(some, values, own)
+
+    whole = model_of(slice(None))
+    state = _State.of(whole, start, prior)
     # A few fits that cannot converge must not hold up the others.
-    state.iterate(model, prior, steps, _MOST)
+    state.iterate(whole, prior, steps, _MOST)
     unconverged = np.flatnonzero(state.size >= _CONVERGED)
     if len(unconverged) and more:
         part = state.part(unconverged)
         part.iterate(model_of(unconverged), prior.part(unconverged), more, 1.0)
         state.put(unconverged, part)
     information, chi2 = state.products[:, 1:, 1:], state.products[:, 0, 0]
-    return BatchFit(state.values, information, prior, chi2, count, state.size, state.linear)
+    return BatchFit(state.values, information, prior, chi2, model, pixels, shape, state.size, state.linear)
 
 
 @dataclass(eq=False)

@@ -18,9 +18,10 @@ from neurocal_cli.detection.fitting.batched_newton import (
     BatchFit,
     LevelPrior,
     ProfileShape,
+    Single,
     rows_for,
 )
-from neurocal_cli.detection.fitting.edge_fit import OFFSET, EdgeData
+from neurocal_cli.detection.fitting.edge_fit import OFFSET
 from neurocal_cli.detection.fitting.edge_profile import (
     RESPONSE_TERMS,
     erf_and_density,
@@ -34,8 +35,6 @@ from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import CHI2_MEDIAN, upper_median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
-
-Single = NDArray[np.float32]
 
 # Insensitive, apart from _FLAT: doubled, no pixel counts as dark or light, and errors grow by 10 %.
 _FLAT = 0.95  # light, from -1 to 1, beyond which a pixel has the dark or the light level
@@ -62,18 +61,17 @@ class PixelNoise:
     light: float
 
     @classmethod
-    def of(cls, fit: BatchFit, root: Single, floor: float) -> PixelNoise:
+    def of(cls, fit: BatchFit, floor: float) -> PixelNoise:
         """From the residuals of fits.
 
         Parameters
         ----------
         fit : BatchFit
-        root : (E, N) array [1/DN]
-            Square root of the weights of the fits, 0 for unused pixels.
         floor : float [DN^2]
             Least variance, by rounding.
         """
-        x, used = fit.linear.x, root > 0
+        x, root = fit.linear.x, fit.pixels.root
+        used = root > 0
         square = np.square(fit.linear.residual / np.maximum(root, _TINY))
         variances = []
         for part in (x < -_FLAT, np.abs(x) <= _FLAT, x > _FLAT):
@@ -97,24 +95,20 @@ class PixelNoise:
         return np.reciprocal(variance, out=variance)
 
 
-def profile_shape(
-    data: EdgeData, fit: BatchFit, shape: ProfileShape, good: NDArray[np.bool_]
-) -> ProfileShape:
+def profile_shape(fit: BatchFit, good: NDArray[np.bool_]) -> ProfileShape:
     """Improve the shape of the profile by linear least squares on the residuals of all fits.
 
     Shift, blur and levels are unknowns too, because the fits have absorbed part of the shape in them.
 
     Parameters
     ----------
-    data : EdgeData
     fit : BatchFit
-    shape : ProfileShape
-        The shape used in these fits.
     good : (E,) bool array
         Edges to use.
     """
     # A part of the pixels is enough for a dozen numbers.
-    step = max(1, int(data.count[good].sum()) // _ENOUGH)
+    data, shape = fit.pixels, fit.shape
+    step = max(1, int(fit.count[good].sum()) // _ENOUGH)
     edges, (_, width, length) = np.flatnonzero(good)[:, None], fit.linear.rows.shape
     # Each edge with another offset, or all pixels would lie at the same distances from the edges.
     some = np.arange(0, length - step + 1, step) + 7 * edges % step

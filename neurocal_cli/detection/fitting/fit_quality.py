@@ -30,15 +30,13 @@ _MOST_STEP, _MOST_MOVE = 1.0, 0.03
 def is_typical(fit: BatchFit) -> NDArray[np.bool_]:
     """(E,) mask of fits with the contrast and chi2 of most fits of the board."""
     contrast = fit.values[:, CONTRAST] / upper_median(fit.values[:, CONTRAST])
-    rough = fit.chi2 / np.maximum(fit.count, 1)
+    rough = fit.roughness
     usual = upper_median(rough)
     scatter = MAD_TO_SIGMA * upper_median(np.abs(rough - usual)) + 0.2 * usual
     return (contrast > _LEAST_CONTRAST**2) & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
 
 
-def is_reliable(
-    fit: BatchFit, departure: Array, beyond: Array, known: Array | None = None
-) -> NDArray[np.bool_]:
+def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> NDArray[np.bool_]:
     """(E,) mask of fits that agree with their pixels, the rest of the board, and the map.
 
     Parameters
@@ -46,8 +44,6 @@ def is_reliable(
     fit : BatchFit
     departure : (E,) array
         Distance from the map, in standard deviations.
-    beyond : (E,) array
-        Share of the pixels that lie outside the image.
     known : array, optional
         chi2 of each pixel in fits that are known to be reliable; without it, the fits are compared with
         each other.
@@ -56,7 +52,7 @@ def is_reliable(
     blur = fit.values[:, BLUR] / fit.prior.mean[:, BLUR]
     good = (contrast > _LEAST_CONTRAST) & (contrast < _MOST_CONTRAST)
     good &= (blur < _MOST_BLUR) & (blur > 1 / _MOST_BLUR)
-    good &= (beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
+    good &= (fit.pixels.beyond <= _MOST_BEYOND) & (fit.count >= _LEAST_COUNT)
     # The values before the levels are offset and tilt of each line in turn.
     offsets = range(0, fit.values.shape[1] + MEAN, 2)
     spread = fit.covariance[:, offsets, offsets]
@@ -65,7 +61,7 @@ def is_reliable(
     good &= (fit.step < _MOST_STEP) | (moved < _MOST_MOVE)
     good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
     good &= np.abs(departure) < _LIMIT
-    rough = fit.chi2 / np.maximum(fit.count, 1)
+    rough = fit.roughness
     among = rough[good] if known is None else known
     usual = upper_median(among) if len(among) else 1.0
     scatter = MAD_TO_SIGMA * upper_median(np.abs(among - usual)) if len(among) else 0.0

@@ -11,7 +11,13 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import CONTRAST, MEAN, BatchFit, ProfileShape
+from neurocal_cli.detection.fitting.batched_newton import (
+    CONTRAST,
+    MEAN,
+    BatchFit,
+    ProfileShape,
+    fit_batch,
+)
 from neurocal_cli.detection.fitting.common_parameters import (
     BoardBlur,
     FieldBlur,
@@ -19,24 +25,22 @@ from neurocal_cli.detection.fitting.common_parameters import (
     level_prior,
     profile_shape,
 )
-from neurocal_cli.detection.fitting.edge_fit import (
-    OFFSET,
-    EdgeData,
-    fit_edges,
-    light_at,
-    moments,
-    with_weight,
-)
+from neurocal_cli.detection.fitting.edge_fit import OFFSET, edge_model, light_at, moments
 from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
 from neurocal_cli.detection.fitting.fit_quality import is_reliable, is_typical
 from neurocal_cli.detection.fitting.initial_fit import fit_initial
-from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of
-from neurocal_cli.detection.fitting.map_selection import select_map
+from neurocal_cli.detection.fitting.map_fit import MapFit, Observations, fit_map, loss_of, select_map
 from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Levels, LocalShading, Shading, fit_shading, square_levels
 from neurocal_cli.detection.fitting.smooth_map import Frame, SmoothMap, homography_start
 from neurocal_cli.detection.fitting.strips import Lines, grid_lines, strip_pixels
-from neurocal_cli.detection.fitting.vertex_fit import FIRST, SECOND, fit_vertices, vertex_data, vertex_lines
+from neurocal_cli.detection.fitting.vertex_fit import (
+    FIRST,
+    SECOND,
+    vertex_lines,
+    vertex_model,
+    vertex_pixels,
+)
 from neurocal_cli.detection.fitting.wide_map import WideMap, wide_start
 from neurocal_cli.detection.grid import Grid
 from neurocal_cli.detection.medians import MAD_TO_SIGMA, upper_median
@@ -147,9 +151,20 @@ class GridImage:
         anchors = Observations.of_points(vertices, grid.pixels[grid.seen], _START_SIGMA, 1)
         return cls(image, grid, GridEdges.of(grid), anchors, floor)
 
-    def lines(self, at: SmoothMap) -> Lines:
-        """The edges in the image, by a map."""
-        return self.edges.lines(at)
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height) of the image [px]."""
+        return self.image.shape[1], self.image.shape[0]
+
+    @property
+    def vertices(self) -> Array:
+        """(V, 2) grid coordinates of the found vertices."""
+        return np.argwhere(self.grid.seen)[:, ::-1].astype(float)
+
+    @property
+    def pixels(self) -> Array:
+        """(V, 2) pixels of the found vertices."""
+        return self.grid.pixels[self.grid.seen]
 
     def observations(self, lines: Lines, offset: Array, variance: Array) -> Observations:
         """Edges as observations of a map, with an unknown common shift to the light side."""
@@ -169,10 +184,8 @@ class GridFit:
     ----------
     lines : Lines
     fit : BatchFit
-    data : EdgeData
     map : MapFit
     shading : Shading
-    shape : ProfileShape
     noise : PixelNoise
     good : (E,) bool array
         Edges that passed the quality tests.
@@ -180,10 +193,8 @@ class GridFit:
 
     lines: Lines
     fit: BatchFit
-    data: EdgeData
     map: MapFit
     shading: Shading
-    shape: ProfileShape
     noise: PixelNoise
     good: NDArray[np.bool_]
 
@@ -201,12 +212,10 @@ class GridFit:
 
 def fit_grid(grid_image: GridImage) -> GridFit:
     """All stages: map of the found vertices, moments, first fit, common parameters, last fit."""
-    frame = Frame.of(grid_image.anchors.grid, (grid_image.image.shape[1], grid_image.image.shape[0]))
-    n = len(grid_image.anchors.grid) // 2
-    points = grid_image.anchors.value.reshape(2, n).T
-    start = homography_start(frame, grid_image.anchors.grid[:n], points)
+    vertices = grid_image.vertices
+    start = homography_start(Frame.of(vertices, grid_image.size), vertices, grid_image.pixels)
     found = select_map(start, grid_image.anchors, np.zeros(1), _GOOD_START)
-    if found.model_index > found.map.richest_lens or _bend(grid_image, found) > _STRONGLY_BENT:
+    if found.model_index > found.map.richest_lens or found.map.bend(vertices) > _STRONGLY_BENT:
         found = _wide_if_better(grid_image, found, grid_image.anchors, _GOOD_START)
     dark, light = square_levels(grid_image.image, grid_image.grid, found.map)
     shading = _shading_of(found.map, dark, light)
@@ -216,19 +225,11 @@ def fit_grid(grid_image: GridImage) -> GridFit:
     return _last_fit(grid_image, first)
 
 
-def _bend(grid_image: GridImage, mapped: MapFit) -> float:
-    """Greatest displacement of a vertex by the lens, relative to its distance from the lens's centre."""
-    return mapped.map.bend(grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2])
-
-
 def _wide_if_better(
     grid_image: GridImage, found: MapFit, observations: Observations, enough: float = 0.0
 ) -> MapFit:
     """The map of a wide lens, where that fits better than a lens that displaces slopes."""
-    grid = grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2]
-    size = grid_image.image.shape[1], grid_image.image.shape[0]
-    points = grid_image.anchors.value.reshape(2, -1).T
-    start = wide_start(found.map.frame, grid, points, size)
+    start = wide_start(found.map.frame, grid_image.vertices, grid_image.pixels, grid_image.size)
     if start is None:
         return found
     wide = select_map(start, observations, found.shift, enough, most=start.richest_lens)
@@ -239,17 +240,20 @@ def _wide_if_better(
     return wide if costs[1] < costs[0] else found
 
 
-def _may_be_wide(bend: float, excess: float) -> bool:
-    """Whether a lens that bends so much can be what is left of the variance.
+def _may_be_wide(found: MapFit, vertices: Array) -> bool:
+    """Whether a wide lens, of which the map knows nothing, can be what is left of the variance.
 
     A weak bend follows slopes up to hundredths of a pixel, and what is more comes from an uneven board.
     """
-    return excess > _NOT_NOISE and (bend > _BENT or (bend > _WEAKLY_BENT and excess < _UNEVEN))
+    if isinstance(found.map, WideMap) or not found.excess > _NOT_NOISE:
+        return False
+    bend = found.map.bend(vertices)
+    return bend > _BENT or (bend > _WEAKLY_BENT and found.excess < _UNEVEN)
 
 
 def _by_moments(grid_image: GridImage, found: MapFit, shading: Shading) -> tuple[MapFit, float]:
     """The map through offsets from moments, and the blur [px]."""
-    lines = grid_image.lines(found.map)
+    lines = grid_image.edges.lines(found.map)
     # Oblique crossing lines enter wide strips from the side.
     slant = np.abs(np.einsum("eki,ei->ek", lines.crossing, lines.normal)).max(axis=1)
     half = 0.35 * np.minimum(lines.width, lines.length / (1 + 3 * slant))
@@ -265,10 +269,9 @@ def _first_fit(
     grid_image: GridImage, mapped: MapFit, sigma: float, shading: Shading, noise: float
 ) -> GridFit:
     """Edges fitted with independent levels, and the map through them."""
-    lines = grid_image.lines(mapped.map)
+    lines = grid_image.edges.lines(mapped.map)
     offset = mapped.residual[: len(lines.length)] + mapped.shift[0]
-    free = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
-    data, fit, shape = free.data, free.fit, free.shape
+    fit = fit_initial(grid_image.image, lines, offset, sigma, shading, noise)
     good = is_typical(fit)
     variance = fit.covariance[:, OFFSET, OFFSET]
     good &= variance > 0
@@ -282,21 +285,21 @@ def _first_fit(
         least=mapped.model_index,
         most=max(mapped.model_index, mapped.map.richest_lens),
     )
-    if not isinstance(chosen.map, WideMap) and _may_be_wide(_bend(grid_image, chosen), chosen.excess):
+    if _may_be_wide(chosen, grid_image.vertices):
         wide = _wide_if_better(grid_image, chosen, observations)
         # An uneven board departs from both.
         chosen = wide if wide.excess < _CLEARLY * chosen.excess else chosen
     good &= chosen.weight[: len(good)] > 0
-    return GridFit(lines, fit, data, chosen, shading, shape, PixelNoise(noise, noise, noise), good)
+    return GridFit(lines, fit, chosen, shading, PixelNoise(noise, noise, noise), good)
 
 
 def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     """Edges fitted with common parameters, and the map through them."""
     good, n = first.good, len(first.good)
-    lines = grid_image.lines(first.map.map)
+    lines = grid_image.edges.lines(first.map.map)
     shading = _shading(first)
-    fit, data, shape, noise = _fine_fit(grid_image, first, lines, shading)
-    scale = max(upper_median(fit.chi2[good] / fit.count[good]) if good.any() else 1.0, _LEAST_SCALE)
+    fit, noise = _fine_fit(grid_image, first, lines, shading)
+    scale = max(upper_median(fit.roughness[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
@@ -309,92 +312,96 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     # of them are less certain.
     uneven = max(MAD_TO_SIGMA * upper_median(np.abs(departure)), 1.0)
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
-    good = is_reliable(fit, departure, data.beyond)
-    return GridFit(lines, fit, data, mapped, shading, shape, noise, good)
+    return GridFit(lines, fit, mapped, shading, noise, is_reliable(fit, departure))
 
 
 def _fine_fit(
     grid_image: GridImage, first: GridFit, lines: Lines, shading: Shading
-) -> tuple[BatchFit, EdgeData, ProfileShape, PixelNoise]:
+) -> tuple[BatchFit, PixelNoise]:
     """Fits to all pixels, with levels, blur, profile and noise of the whole board."""
-    n, half_length = len(first.good), 0.5 * lines.length
-    shape = profile_shape(first.data, first.fit, first.shape, first.good)
-    noise = PixelNoise.of(first.fit, first.data.root, grid_image.floor)
-    sigma, spread = _blur(first, lines, lines)
-    data = edge_pixels(grid_image.image, lines, sigma, shading, REACH * sigma, 1)
-    prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
+    n = len(first.good)
+    shape = profile_shape(first.fit, first.good)
+    noise = PixelNoise.of(first.fit, grid_image.floor)
+    blur = _blur(first, lines, lines)
     offset = first.map.residual[:n] + first.map.shift[0]
     if isinstance(first.map.map, WideMap):
         # A fit that went astray in the dark of the rim starts at the map again.
         offset = np.where(first.good, offset, first.map.shift[0])
-    start = np.concatenate([offset[:, None], np.zeros((n, 1)), prior.mean], axis=1)
-    data = with_weight(data, noise.weights(light_at(data, start)))
-    fit = fit_edges(data, start, prior, half_length, shape, _STEPS)
-    usual = upper_median(sigma)
+    fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise)
+    usual = upper_median(blur[0])
     if usual < SHARP or upper_median(fit.covariance[:, OFFSET, OFFSET]) < (_PRECISE * usual) ** 2:
         # The profile, estimated from a part of the pixels, is now the largest error: estimate it again.
-        shape = profile_shape(data, fit, shape, first.good)
-        noise = PixelNoise.of(fit, data.root, grid_image.floor)
-        data = with_weight(data, noise.weights(fit.linear.x))
-        fit = fit_edges(data, fit.values, prior, half_length, shape, _STEPS)
-    return fit, data, shape, noise
+        shape = profile_shape(fit, first.good)
+        noise = PixelNoise.of(fit, grid_image.floor)
+        fit = fit.continued(shape, _STEPS, weight=noise.weights(fit.linear.x))
+    return fit, noise
+
+
+def _fitted(
+    image: Image,
+    lines: Lines,
+    offset: Array,
+    blur: tuple[Array, Array | float],
+    shading: Shading,
+    shape: ProfileShape,
+    noise: PixelNoise,
+    crossed: NDArray[np.bool_] | None = None,
+) -> BatchFit:
+    """Fits of edges to all their pixels, begun at offsets (E,), with what the whole board has in common."""
+    sigma, spread = blur
+    data = edge_pixels(image, lines, sigma, shading, REACH * sigma, 1, crossed)
+    prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
+    start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), prior.mean], axis=1)
+    data = data.weighed(noise.weights(light_at(data, start)))
+    return fit_batch(edge_model, data, start, prior, shape, _STEPS)
 
 
 def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]:
     """Fits of the edges to the board's rim, after those of all others, whose common parameters they have."""
     edges = GridEdges.to_rim(grid_image.grid)
     lines = edges.lines(fitted.map.map)
-    sigma, spread = _blur(fitted, fitted.lines, lines)
     shift = fitted.map.shift[0]
-    data = edge_pixels(grid_image.image, lines, sigma, fitted.shading, REACH * sigma, 1, crossed=edges.known)
-    prior = level_prior(fitted.shading, lines.middle, sigma, spread, fitted.noise.edge)
-    n = len(sigma)
-    shape = ProfileShape(np.tile(fitted.shape.tails.mean(axis=0), (n, 1)), fitted.shape.nonlinearity)
-    if fitted.shape.half is not None:
-        shape = replace(shape, half=half_widths(lines.normal))
-    start = np.concatenate([np.full((n, 1), shift), np.zeros((n, 1)), prior.mean], axis=1)
-    data = with_weight(data, fitted.noise.weights(light_at(data, start)))
-    fit = fit_edges(data, start, prior, 0.5 * lines.length, shape, _STEPS)
+    fit = _fitted(
+        grid_image.image,
+        lines,
+        np.full(len(edges.index), shift),
+        _blur(fitted, fitted.lines, lines),
+        fitted.shading,
+        fitted.fit.shape.elsewhere(half_widths(lines.normal)),
+        fitted.noise,
+        crossed=edges.known,
+    )
     variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
     departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
     # A rim that is bad all around would agree with itself.
-    good = is_reliable(fit, departure, data.beyond, known=(fitted.fit.chi2 / fitted.fit.count)[fitted.good])
-    return edges, replace(fitted, lines=lines, fit=fit, data=data, shape=shape, good=good)
+    good = is_reliable(fit, departure, known=fitted.fit.roughness[fitted.good])
+    return edges, replace(fitted, lines=lines, fit=fit, good=good)
 
 
 def fit_grid_vertices(
     grid_image: GridImage, fitted: GridFit
 ) -> tuple[BatchFit, tuple[Lines, Lines], NDArray[np.bool_]]:
     """Fits of all known vertices after those of the edges, with their lines and a mask of reliable ones."""
-    grid = grid_image.anchors.grid[: len(grid_image.anchors.grid) // 2]
+    grid = grid_image.vertices
     lines = vertex_lines(fitted.map.map, grid)
     light = np.where((grid.sum(axis=1) + grid_image.grid.dark) % 2 == 1, 1.0, -1.0)
     place = lines[0].middle
     (first, spread), (second, _) = (_blur(fitted, fitted.lines, line) for line in lines)
     sigma = 0.5 * (first + second)
-    contrast = fitted.shading.at(place)[1]
-    slopes = fitted.shading.slopes(place)
-    data = vertex_data(
-        grid_image.image, lines, light, sigma, REACH, slopes, contrast, _ends(grid_image.grid.seen)
-    )
-    tails = np.tile(fitted.shape.tails.mean(axis=0), (len(grid), 1))
-    shape = ProfileShape(tails, fitted.shape.nonlinearity)
-    if fitted.shape.half is not None:
-        shape = replace(shape, half=np.stack([half_widths(line.normal) for line in lines], axis=1))
+    data = vertex_pixels(grid_image.image, lines, light, sigma, fitted.shading, _ends(grid_image.grid.seen))
+    shape = fitted.fit.shape.elsewhere(np.stack([half_widths(line.normal) for line in lines], axis=1))
     prior = level_prior(fitted.shading, place, sigma, spread, fitted.noise.edge)
     start = np.concatenate([np.zeros((len(grid), 4)), prior.mean], axis=1)
-    half = (0.5 * lines[0].length, 0.5 * lines[1].length)
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
-    fit = fit_vertices(unit, start, prior, half, shape, _STEPS)
-    root = np.sqrt(fitted.noise.weights(fit.linear.x)) * (data.root > 0)
-    fit = fit_vertices(replace(data, root=root), fit.values, prior, half, shape, _STEPS)
-    fit = fit.scaled(max(upper_median(fit.chi2 / np.maximum(fit.count, 1)), _LEAST_SCALE))
+    fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
+    fit = fit.continued(shape, _STEPS, weight=fitted.noise.weights(fit.linear.x))
+    fit = fit.scaled(max(upper_median(fit.roughness), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
         variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)
         variance *= fitted.map.excess
         departure = np.maximum(departure, np.abs(fit.values[:, which]) / np.sqrt(variance))
-    return fit, lines, is_reliable(fit, departure, data.beyond)
+    return fit, lines, is_reliable(fit, departure)
 
 
 def _blur(fitted: GridFit, edges: Lines, lines: Lines) -> tuple[Array, Array | float]:

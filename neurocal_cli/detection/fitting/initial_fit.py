@@ -1,6 +1,6 @@
 """The first fits of a board's edges, each with its own levels, to estimate blur and profile.
 
-In: lines from the map, rough offsets and blur. Out: `InitialFit`, from which `grid_fit` estimates what all
+In: lines from the map, rough offsets and blur. Out: `BatchFit`, from which `grid_fit` estimates what all
 edges have in common.
 """
 
@@ -9,17 +9,27 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.detection.fitting.batched_newton import BLUR, BatchFit, LevelPrior, ProfileShape
+from neurocal_cli.detection.fitting.batched_newton import (
+    BLUR,
+    BatchFit,
+    LevelPrior,
+    ProfileShape,
+    fit_batch,
+)
 from neurocal_cli.detection.fitting.common_parameters import profile_shape
-from neurocal_cli.detection.fitting.edge_fit import EdgeData, fit_edges, with_weight
-from neurocal_cli.detection.fitting.edge_pixels import REACH, SHARP, edge_pixels, usual_stride
+from neurocal_cli.detection.fitting.edge_fit import edge_model
+from neurocal_cli.detection.fitting.edge_pixels import (
+    REACH,
+    SHARP,
+    edge_pixels,
+    usual_stride,
+)
 from neurocal_cli.detection.fitting.edge_profile import RESPONSE_TERMS, box_kurtosis
 from neurocal_cli.detection.fitting.fit_quality import is_typical
 from neurocal_cli.detection.fitting.pixel_box import half_widths
 from neurocal_cli.detection.fitting.shading import Shading
 from neurocal_cli.detection.fitting.strips import Lines
 from neurocal_cli.detection.medians import upper_median
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 # Insensitive, apart from edges sharper than a pixel ("straight, psf 0.15" in tests/rendered.py). There, half
@@ -32,36 +42,9 @@ _BLUR_OFF = 0.2  # relative error of the blur that makes the fits start again
 _LOOSE_LEVEL, _LOOSE_BLUR = 0.2, 0.3  # relative standard deviations of the prior
 
 
-@frozen_dataclass(eq=False)
-class InitialFit:
-    """Fits of edges with independent levels.
-
-    Attributes
-    ----------
-    data : EdgeData
-        The pixels used.
-    fit : BatchFit
-    shape : ProfileShape
-    """
-
-    data: EdgeData
-    fit: BatchFit
-    shape: ProfileShape
-
-    @property
-    def rough(self) -> float:
-        """Typical chi2 per pixel."""
-        return upper_median(self.fit.chi2 / np.maximum(self.fit.count, 1))
-
-    def blur(self, otherwise: float) -> float:
-        """Typical blur [px]."""
-        good = is_typical(self.fit)
-        return upper_median(self.fit.values[good, BLUR]) if good.any() else otherwise
-
-
 def fit_initial(
     image: NDArray[np.generic], lines: Lines, offset: Array, sigma: float, shading: Shading, noise: float
-) -> InitialFit:
+) -> BatchFit:
     """Fit edges with independent levels.
 
     Parameters
@@ -79,44 +62,44 @@ def fit_initial(
     known = np.stack([*shading.at(lines.middle), np.full(len(offset), sigma)], axis=-1)
     start = np.concatenate([offset[:, None], np.zeros((len(offset), 1)), known], axis=1)
     started = _few_steps(image, lines, start, known, shading, noise)
-    found = started.blur(sigma)
+    typical = is_typical(started)
+    found = upper_median(started.values[typical, BLUR]) if typical.any() else sigma
     # The effect of crossing lines on the pixels depends on the blur.
     if abs(found - sigma) > _BLUR_OFF * sigma or (found < SHARP) != (sigma < SHARP):
         known[:, 2] = found
-        start = np.where(is_typical(started.fit)[:, None], started.fit.values, start)
+        start = np.where(typical[:, None], started.values, start)
         start[:, BLUR] = found
         again = _with_best_profile(_few_steps(image, lines, start, known, shading, noise), lines, found)
-        if again.rough < _WORSE * started.rough:
+        if upper_median(again.roughness) < _WORSE * upper_median(started.roughness):
             return again
     return _with_best_profile(started, lines, sigma)
 
 
 def _few_steps(
     image: NDArray[np.generic], lines: Lines, start: Array, known: Array, shading: Shading, noise: float
-) -> InitialFit:
+) -> BatchFit:
     """A few steps, to estimate the blur; known (E, 3) are mean level, contrast and blur."""
-    blur, half_length = known[:, 2], 0.5 * lines.length
+    blur = known[:, 2]
     data = edge_pixels(image, lines, blur, shading, REACH * blur + _SLACK, usual_stride(lines))
-    data = with_weight(data, np.full_like(data.root, 1 / noise))
+    data = data.weighed(np.full_like(data.root, 1 / noise))
     spread = known * [0.0, 0.0, _LOOSE_BLUR] + known[:, 1:2] * [_LOOSE_LEVEL, _LOOSE_LEVEL, 0.0]
     prior = LevelPrior(known.copy(), (1 / spread**2)[:, :, None] * np.eye(3))
     shape = _blur_profiles(lines, float(blur[0]))[-1]
-    return InitialFit(data, fit_edges(data, start, prior, half_length, shape, _FEW_STEPS, 0), shape)
+    return fit_batch(edge_model, data, start, prior, shape, _FEW_STEPS, 0)
 
 
-def _with_best_profile(started: InitialFit, lines: Lines, sigma: float) -> InitialFit:
+def _with_best_profile(started: BatchFit, lines: Lines, sigma: float) -> BatchFit:
     """Continue the fits with the blur profile that gives the lower chi2."""
-    results = [_converged(started, lines, shape) for shape in _blur_profiles(lines, sigma)]
+    results = [_converged(started, shape) for shape in _blur_profiles(lines, sigma)]
+    smooth, box = (upper_median(results[k].roughness) for k in (0, -1))
     # Prefer the pixel's box: both agree where all edges run along the pixels.
-    return results[0] if results[0].rough < _CLEARLY * results[-1].rough else results[-1]
+    return results[0] if smooth < _CLEARLY * box else results[-1]
 
 
-def _converged(started: InitialFit, lines: Lines, shape: ProfileShape) -> InitialFit:
-    data, fit, half_length = started.data, started.fit, 0.5 * lines.length
-    if (shape.half is None) != (started.shape.half is None):
-        fit = fit_edges(data, fit.values, fit.prior, half_length, shape, _FEW_STEPS, 0)
-    shape = profile_shape(data, fit, shape, is_typical(fit))
-    return InitialFit(data, fit_edges(data, fit.values, fit.prior, half_length, shape, _STEPS), shape)
+def _converged(fit: BatchFit, shape: ProfileShape) -> BatchFit:
+    if (shape.half is None) != (fit.shape.half is None):
+        fit = fit.continued(shape, _FEW_STEPS, 0)
+    return fit.continued(profile_shape(fit, is_typical(fit)), _STEPS)
 
 
 def _blur_profiles(lines: Lines, sigma: float) -> list[ProfileShape]:

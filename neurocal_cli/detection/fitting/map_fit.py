@@ -1,15 +1,17 @@
-"""Robust dense fit of the smooth map, apart from the least-squares core: weights change with each step.
+"""Robust dense fit of the smooth map, and the choice of its model.
 
 This is not the package's least-squares core, because its problem is different: a dense fit of 8 to 64
 parameters to about a hundred observations, 0.5 ms each and eight times for each grid. It has no blocks to
 eliminate, Tukey's weights change from step to step, and fits end early when a model gains too little.
+
+The model is the simplest one of the start's `models` that the observations do not contradict.
 
 In: a start, observations. Out: the map with its covariance, residuals, weights of outliers, excess variance.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 # Insensitive.
-STEPS = 25  # at most
+_STEPS = 25  # at most
 _SHIFT_PRIOR = 1e-2  # 1/px^2, of the shifts: 10 px
 _TINY = 1e-300
 _BELIEF = 20  # weight, in observations, of the prior that the given variances are true
@@ -29,6 +31,14 @@ _CONVERGED = 0.2  # of chi2
 _DAMPING = 1e-4  # to begin with, of the normal equations' scaled diagonal
 _ROBUST = 1.5  # standard deviation over the median absolute value, about 1.4826
 _TUKEY = 6.0  # standard deviations beyond which an observation is an outlier
+
+# A richer model must lower chi2 by this much for each of its parameters; chance alone gives 1. Residuals far
+# above the noise come from an uneven board, which a polynomial must not follow: the price is higher then.
+# Insensitive, as all constants here; tests/test_fit_parts.py selects known models.
+_PRICE, _UNEVEN_PRICE = 2.25, 3.0
+_FIRST_SHARE = 0.3  # of that price; what the first step must gain for a model to be fitted further
+_FUTILE = 2  # richer models without gain, of the lens or the polynomial, after which no more are tried
+_UNEVEN = 4.0  # residuals over noise from which a polynomial is tried although no lens model gained
 
 
 @frozen_dataclass(eq=False)
@@ -72,8 +82,8 @@ class Observations:
 
     def joined_with(self, other: Observations) -> Observations:
         """Both together."""
-        names = ("grid", "direction", "value", "variance", "shift")
-        return Observations(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
+        pairs = ((getattr(self, field.name), getattr(other, field.name)) for field in fields(self))
+        return Observations(*map(np.concatenate, pairs))
 
 
 @frozen_dataclass(eq=False)
@@ -90,8 +100,6 @@ class MapFit:
         Value minus map and shift.
     weight : (N,) array
         From 1 down to 0 for outliers.
-    chi2 : float
-        Of the good observations; about their number minus that of the parameters.
     excess : float
         Variance of the good and informative residuals relative to the given variances; 1 where the
         difference may be chance, less where they are smaller.
@@ -102,7 +110,6 @@ class MapFit:
     shift_variance: Array
     residual: Array
     weight: Array
-    chi2: float
     excess: float
 
     @property
@@ -122,11 +129,70 @@ def fit_map(start: SmoothMap, observations: Observations, shift: Array) -> MapFi
     shift : (K,) array [px]
         Start of the shifts.
     """
-    return with_covariance(solve_map(start, observations, shift, STEPS), observations)
+    return _with_covariance(_solved_map(start, observations, shift), observations)
+
+
+def select_map(
+    start: SmoothMap,
+    observations: Observations,
+    shift: Array,
+    enough: float = 0.0,
+    least: int = 0,
+    most: int | None = None,
+) -> MapFit:
+    """Fit the simplest model that the observations do not contradict.
+
+    Parameters
+    ----------
+    start : SmoothMap
+        Of any model.
+    observations : Observations
+    shift : (K,) array [px]
+    enough : float
+        Chi2 per observation at which no richer model is tried.
+    least, most : int
+        Indices of the simplest and the richest model that are tried; the richest of all by default.
+    """
+    best: _Solution | None = None
+    now, paid, futile = start, 0, [0, 0]  # futile: lens models, polynomials
+    informative, precision = observations.informative, 1 / np.sqrt(observations.variance)
+    n_telling, scale = int(informative.sum()), 0.0
+    for radial, degree in start.models[least : None if most is None else most + 1]:
+        if futile[degree > 0] >= _FUTILE:
+            continue
+        now = now.with_model(radial, degree)
+        if best is not None and len(now.free) + len(shift) > 0.5 * n_telling:
+            break
+        count = len(now.free)
+        worth = _FIRST_SHARE * _price(scale) * scale**2 * (count - paid)
+        fit = _solved_map(now, observations, shift, worth)
+        now, shift = fit.map, fit.shift
+        z = fit.residual * precision
+        scale = _robust_scale(z[informative])
+        loss = loss_of(z / scale)
+        excess = max(1.0, loss / max(n_telling - count, 1))
+        price = _price(scale) * excess * (count - paid)
+        if best is None or loss_of(best.residual * precision / scale) - loss > price:
+            best, paid, futile = fit, count, [0, 0]
+        else:
+            futile[degree > 0] += 1
+        if loss * scale**2 + _PRICE * count < enough * len(observations.value):
+            break
+        # A board may be curved although no lens model fits.
+        if futile[0] >= _FUTILE and scale < _UNEVEN:
+            break
+    assert best is not None
+    return _with_covariance(best, observations)
+
+
+def _price(scale: float) -> float:
+    """Chi2 that each parameter of a richer model must gain, in units of the squared scale."""
+    chance = _PRICE / max(scale, 1.0) ** 2
+    return max(chance, _UNEVEN_PRICE - chance)
 
 
 @frozen_dataclass(eq=False)
-class MapSolution:
+class _Solution:
     """A fitted map: shifts, residuals (N,) and derivatives (P, N) of the predictions."""
 
     map: SmoothMap
@@ -135,9 +201,7 @@ class MapSolution:
     jacobian: Array
 
 
-def solve_map(
-    start: SmoothMap, observations: Observations, shift: Array, steps: int, worth: float = 0.0
-) -> MapSolution:
+def _solved_map(start: SmoothMap, observations: Observations, shift: Array, worth: float = 0.0) -> _Solution:
     """Fit a map of the start's model; stop after the first step if it lowers chi2 by less than `worth`."""
     free, m = start.free, len(start.free)
     prior = np.concatenate([start.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
@@ -156,7 +220,7 @@ def solve_map(
     precision, informative = inverse_sigma * inverse_sigma, observations.informative
     weight, damping, least = precision, _DAMPING, 0.0
     square = residual * residual
-    for _ in range(steps):
+    for _ in range(_STEPS):
         weighted = jacobian * weight
         gradient = weighted @ residual - prior * values
         normal = weighted @ jacobian.T
@@ -177,11 +241,11 @@ def solve_map(
             break
         worth = 0.0
         z = residual * inverse_sigma
-        scale = robust_scale(z[informative])
+        scale = _robust_scale(z[informative])
         if before - after < max(_CONVERGED * scale**2, _CREEPING * after) and damping <= max(_DAMPING, least):
             break
         weight = _tukey(z / scale) * precision
-    return MapSolution(start, values[m:], residual, jacobian)
+    return _Solution(start, values[m:], residual, jacobian)
 
 
 def loss_of(z: Array) -> float:
@@ -194,7 +258,7 @@ def _tukey(z: Array) -> Array:
     return np.square(weight, out=weight)
 
 
-def robust_scale(z: Array) -> float:
+def _robust_scale(z: Array) -> float:
     """Robust standard deviation of normalised residuals; at least 1.
 
     Errors of the map that most observations share do not make them outliers.
@@ -210,12 +274,12 @@ def _solved(normal: Array, gradient: Array, damping: float) -> Array:
     return np.asarray(size * np.linalg.solve(scaled, gradient * size))
 
 
-def with_covariance(solution: MapSolution, observations: Observations) -> MapFit:
+def _with_covariance(solution: _Solution, observations: Observations) -> MapFit:
     """A solution with its covariance, weights and excess variance."""
     now, shift, residual, jacobian = solution.map, solution.shift, solution.residual, solution.jacobian
     free, informative = now.free, observations.informative
     z = residual / np.sqrt(observations.variance)
-    weight = _tukey(z / robust_scale(z[informative]))
+    weight = _tukey(z / _robust_scale(z[informative]))
     good = weight > 0
     normal = (jacobian * (good / observations.variance)) @ jacobian.T
     normal.ravel()[:: len(normal) + 1] += np.concatenate([now.prior[free], np.full(len(shift), _SHIFT_PRIOR)])
@@ -233,6 +297,5 @@ def with_covariance(solution: MapSolution, observations: Observations) -> MapFit
         shift_variance=np.diag(inverse)[len(free) :].copy(),
         residual=residual,
         weight=weight,
-        chi2=float((z[good] ** 2).sum()),
         excess=excess if excess > 1 + 3 * np.sqrt(2 / max(left, 1)) else shrunk,
     )

@@ -16,6 +16,8 @@ from neurocal_cli.detection.medians import CHI2_MEDIAN, MAD_TO_SIGMA, upper_medi
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
+Single = NDArray[np.float32]
+
 _x, _y = (x.ravel() for x in np.meshgrid(*[np.linspace(0.25, 0.75, 8)] * 2))
 # Weights of a square's corners in places (64, 4) of its interior, away from the blurred edges.
 _INTERIOR = np.stack([(1 - _x) * (1 - _y), _x * (1 - _y), (1 - _x) * _y, _x * _y], axis=-1)
@@ -81,6 +83,28 @@ class Shading:
         dark, light = (np.stack([du @ c, dv @ c], axis=-1) for c in (self.dark, self.light))
         return 0.5 * (light + dark), 0.5 * (light - dark)
 
+    def off(self, place: Array, u: Single, v: Single, value: Single) -> tuple[Single, Single]:
+        """Take the slopes of the levels at places (N, 2) off the pixels around them.
+
+        Parameters
+        ----------
+        place : (N, 2) array [px]
+        u, v : (N, M) arrays [px]
+            Of pixels, relative to the places.
+        value : (N, M) array [DN]
+
+        Returns
+        -------
+        value : (N, M) array [DN]
+            Without the slope of the mean level.
+        gain : (N, M) array
+            Half contrast relative to that at the places.
+        """
+        by_mean, by_contrast = (slope.astype(np.float32) for slope in self.slopes(place))
+        by_contrast /= self.at(place)[1].astype(np.float32)[:, None]
+        gain = 1 + u * by_contrast[:, :1] + v * by_contrast[:, 1:]
+        return value - u * by_mean[:, :1] - v * by_mean[:, 1:], gain
+
 
 @frozen_dataclass(eq=False)
 class LocalShading(Shading):
@@ -94,33 +118,31 @@ class LocalShading(Shading):
         What they are above the polynomials there.
     """
 
-    near: tuple[Array, Array] = field(default_factory=lambda: (np.zeros((0, 2)), np.zeros((0, 2))))
-    above: tuple[Array, Array] = field(default_factory=lambda: (np.zeros(0), np.zeros(0)))
+    near: tuple[Array, Array]
+    above: tuple[Array, Array]
 
     @classmethod
-    def of(cls, smooth: Shading, dark: Levels, light: Levels) -> LocalShading:
-        """From polynomials, and the levels that they were fitted to."""
-        near = dark.place, light.place
-        above = tuple(
-            levels.level - _terms(smooth.frame, levels.place) @ coefficients
-            for levels, coefficients in ((dark, smooth.dark), (light, smooth.light))
-        )
-        spread = []
-        for levels, rest, before in zip((dark, light), above, smooth.spread, strict=True):
-            if len(rest) <= _NEAREST:
-                return cls(
-                    smooth.frame, smooth.dark, smooth.light, smooth.spread, near, (0 * above[0], 0 * above[1])
-                )
+    def of(cls, smooth: Shading, dark: Levels, light: Levels) -> Shading:
+        """From polynomials, and the levels that they were fitted to; the polynomials where these are few."""
+        if min(len(dark.level), len(light.level)) <= _NEAREST:
+            return smooth
+        above, spread = [], []
+        for levels, coefficients, before in zip(
+            (dark, light), (smooth.dark, smooth.light), smooth.spread, strict=True
+        ):
+            rest = levels.level - _terms(smooth.frame, levels.place) @ coefficients
             left = rest - _nearby(levels.place, rest, levels.place, itself=False)
             chance = 2 * upper_median(levels.variance)
+            above.append(rest)
             spread.append(min(max(upper_median(left**2) / CHI2_MEDIAN - chance, 0.0), before))
+        near = dark.place, light.place
         return cls(smooth.frame, smooth.dark, smooth.light, np.array(spread), near, (above[0], above[1]))
 
     def at(self, place: Array) -> tuple[Array, Array]:
         """Mean level and half contrast at places (N, 2)."""
         terms = _terms(self.frame, place)
         dark, light = (
-            terms @ coefficients + (_nearby(near, above, place) if len(above) else 0.0)
+            terms @ coefficients + _nearby(near, above, place)
             for coefficients, near, above in zip((self.dark, self.light), self.near, self.above, strict=True)
         )
         return 0.5 * (light + dark), np.maximum(0.5 * (light - dark), _LEAST_CONTRAST)
@@ -131,8 +153,7 @@ def _nearby(near: Array, value: Array, place: Array, itself: bool = True) -> Arr
     away = ((place[:, None] - near) ** 2).sum(axis=-1)
     if not itself:
         np.fill_diagonal(away, np.inf)
-    rank = min(_NEAREST, len(near)) - 1
-    width = np.partition(away, rank, axis=1)[:, rank]
+    width = np.partition(away, _NEAREST - 1, axis=1)[:, _NEAREST - 1]
     weight = np.exp(-0.5 * away / np.maximum(width, 1.0)[:, None])
     return np.asarray(weight @ value / np.maximum(weight.sum(axis=1), 1e-12))
 

@@ -57,6 +57,12 @@ class Frame:
         centre = 0.5 * (np.array(size, dtype=float) - 1)
         return cls(0.5 * (low + high), half, centre, float(0.5 * np.hypot(*size)))
 
+    def ground(self, grid: Array) -> Array:
+        """(3, N) scaled coordinates x and y of grid points (N, 2), and 1."""
+        ground = np.ones((3, len(grid)))
+        ground[:2] = ((grid - self.origin) / self.half).T
+        return ground
+
 
 @frozen_dataclass(eq=False)
 class Places:
@@ -145,8 +151,7 @@ class SmoothMap:
     def at(self, grid: Array) -> Array:
         """Pixels of grid coordinates; (..., 2) -> (..., 2)."""
         frame = self.frame
-        ground = np.ones((3, grid.size // 2))
-        ground[:2] = ((grid - frame.origin) / frame.half).reshape(-1, 2).T
+        ground = frame.ground(grid.reshape(-1, 2))
         q = self._through_lens(ground)
         if self.degree:
             coefficients = self.parameters[self.rest :].reshape(2, -1)
@@ -155,27 +160,29 @@ class SmoothMap:
 
     def _through_lens(self, ground: Array) -> Array:
         """The map without its polynomial, of scaled coordinates (3, N); (2, N) [half diagonals]."""
-        values, homogeneous = self.parameters, self._homography @ ground
+        homogeneous = self._homography @ ground
         q = homogeneous[:2] / homogeneous[2]
         if self.radial:
-            e = q - values[8:10, None]
-            rho = (e * (self._metric @ e)).sum(axis=0)
-            q += e * (rho * (values[10] + values[11] * rho))
+            e, stretch = self._stretch(q)
+            q += e * stretch
         return np.asarray(q)
+
+    def _stretch(self, q: Array) -> tuple[Array, Array]:
+        """Points (2, N) relative to the lens's centre, and the share of that by which it displaces them."""
+        values = self.parameters
+        e = q - values[8:10, None]
+        rho = (e * (self._metric @ e)).sum(axis=0)
+        return e, rho * (values[10] + values[11] * rho)
 
     def bend(self, grid: Array) -> float:
         """Greatest displacement by the lens at grid points (N, 2), over the distance from its centre."""
-        ground = np.column_stack([(grid - self.frame.origin) / self.frame.half, np.ones(len(grid))])
-        homogeneous = ground @ self._homography.T
-        e = homogeneous[:, :2] / homogeneous[:, 2:] - self.parameters[8:10]
-        rho = (e * (e @ self._metric)).sum(axis=1)
-        return float(np.abs(rho * (self.parameters[10] + self.parameters[11] * rho)).max())
+        homogeneous = self._homography @ self.frame.ground(grid)
+        return float(np.abs(self._stretch(homogeneous[:2] / homogeneous[2])[1]).max())
 
     def places(self, grid: Array, direction: Array) -> Places:
         """Grid points (N, 2) and unit vectors (2, N), prepared for maps of this model."""
         frame = self.frame
-        ground = np.ones((3, len(grid)))
-        ground[:2] = ((grid - frame.origin) / frame.half).T
+        ground = frame.ground(grid)
         axis = frame.unit * direction
         rest = None
         if self.degree:
@@ -263,9 +270,9 @@ class SmoothMap:
 
 def homography_start(frame: Frame, grid: Array, pixels: Array) -> SmoothMap:
     """The homography through points by linear least squares; (N, 2) arrays, N >= 4 or else affine."""
-    x, y = ((grid - frame.origin) / frame.half).T
+    x, y, one = frame.ground(grid)
     u, v = ((pixels - frame.centre) / frame.unit).T
-    one, zero = np.ones_like(x), np.zeros_like(x)
+    zero = np.zeros_like(x)
     upper = np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=-1)
     lower = np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=-1)
     values = np.zeros(_HOMOGRAPHY + _LENS)

@@ -171,13 +171,19 @@ def strip_pixels(
     spread = half_width / np.abs(t[:, 0])
     rows = int(np.ceil(2 * spread.max() + 1))
     top = np.ceil(height - spread[:, None])
-    window = _Window(np.asarray(column, dtype=float), top, rows, a, top - middle[:, 1:])
-    s, d = window.coordinates_along(t), window.coordinates_along(n)
+    down = np.arange(rows, dtype=np.float32)
+
+    def along_axis(axis: Array) -> Single:
+        """(E, C rows) coordinates of the parallelograms' pixels along directions (E, 2) from the middles."""
+        first = (a * axis[:, :1] + (top - middle[:, 1:]) * axis[:, 1:]).astype(np.float32)
+        return (first[:, :, None] + (_column(axis[:, 1]) * down)[:, None]).reshape(len(axis), -1)
+
+    s, d = along_axis(t), along_axis(n)
     d -= _column(0.5 * lines.curvature) * s * s
     inside = np.abs(d) <= _column(half_width)
     inside &= (s >= _column(low)) & (s <= _column(high))
     used = total = np.count_nonzero(inside, axis=1)
-    framed = window.framed(steep, image.shape)
+    framed = _framed(column, top, rows, np.where(steep[:, None], image.shape, image.shape[::-1]))
     if framed is not None:
         inside &= framed
         used = np.count_nonzero(inside, axis=1)
@@ -222,38 +228,16 @@ def _column(x: Array) -> Single:
     return np.asarray(x[:, None], dtype=np.float32)
 
 
-@frozen_dataclass(eq=False)
-class _Window:
-    """Parallelograms of pixels: `rows` of them from `top` on in each column.
+def _framed(column: Array, top: Array, rows: int, size: Array) -> NDArray[np.bool_] | None:
+    """(E, C rows) which pixels, `rows` of them from `top` (E, C) in columns (E, C), lie in (E, 2) limits.
 
-    Attributes
-    ----------
-    column, top : (E, C) arrays [px]
-    rows : int
-    a, b : (E, C) arrays [px]
-        The same relative to the line's middle.
+    None if all do.
     """
-
-    column: Array
-    top: Array
-    rows: int
-    a: Array
-    b: Array
-
-    def coordinates_along(self, axis: Array) -> Single:
-        """(E, C rows) coordinates along directions (E, 2) from the middle."""
-        first = (self.a * axis[:, :1] + self.b * axis[:, 1:]).astype(np.float32)
-        down = _column(axis[:, 1]) * np.arange(self.rows, dtype=np.float32)
-        return np.asarray((first[:, :, None] + down[:, None]).reshape(len(axis), -1), dtype=np.float32)
-
-    def framed(self, steep: NDArray[np.bool_], size: tuple[int, ...]) -> NDArray[np.bool_] | None:
-        """(E, C rows) which pixels lie in an image of (height, width); None if all do."""
-        limits = np.where(steep[:, None], [size[0], size[1]], [size[1], size[0]])
-        column, last = self.column, self.top + (self.rows - 1)
-        wide, high = limits[:, :1], limits[:, 1:]
-        if (column >= 0).all() and (self.top >= 0).all() and (column < wide).all() and (last < high).all():
-            return None
-        row = self.top[:, :, None] + np.arange(self.rows)
-        inside = (row >= 0) & (row < high[:, :, None])
-        inside &= ((column >= 0) & (column < wide))[:, :, None]
-        return inside.reshape(len(column), -1)
+    wide, high = size[:, :1], size[:, 1:]
+    last = top + (rows - 1)
+    if (column >= 0).all() and (top >= 0).all() and (column < wide).all() and (last < high).all():
+        return None
+    row = top[:, :, None] + np.arange(rows)
+    inside = (row >= 0) & (row < high[:, :, None])
+    inside &= ((column >= 0) & (column < wide))[:, :, None]
+    return inside.reshape(len(column), -1)

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
 # Sides of a grid by the direction (c, r) that leads out of it.
@@ -37,22 +36,6 @@ class End(Enum):
     UNKNOWN = "hidden, blurred or outside the image"
 
 
-@frozen_dataclass(eq=False)
-class _Side:
-    """Profiles across the end of a grid, one for each square along it; 0 is dark and 1 light.
-
-    Attributes
-    ----------
-    light : (N,) bool array
-        Whether the square of the ring is light.
-    profile : (N, steps) array
-        NaN where it leaves the image or the vertices are missing.
-    """
-
-    light: NDArray[np.bool_]
-    profile: Array
-
-
 def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], End]:
     """Classify the sides of a grid, named by their directions.
 
@@ -64,16 +47,17 @@ def board_ends(grey: NDArray[np.generic], grid: Grid) -> dict[tuple[int, int], E
     with np.errstate(invalid="ignore"):  # unknown values are NaN
         sides = _opposite(grey, grid.pixels.transpose(1, 0, 2), grid.dark)
         sides += _opposite(grey, grid.pixels, grid.dark)
-        return {direction: _classify(side) for direction, side in zip(DIRECTIONS, sides, strict=True)}
+        return {direction: _classify(*side) for direction, side in zip(DIRECTIONS, sides, strict=True)}
 
 
-def _classify(side: _Side) -> End:
-    ring = side.profile[:, _RING].mean(axis=1)
-    valid = np.abs(ring - side.light) < _SAME
+def _classify(light: NDArray[np.bool_], profile: Array) -> End:
+    """What a side's squares (N,) of the ring, light or dark, and the profiles (N, steps) across it show."""
+    ring = profile[:, _RING].mean(axis=1)
+    valid = np.abs(ring - light) < _SAME
     count = np.count_nonzero(valid)
     if count < max(_FEWEST, 0.6 * len(valid)):
         return End.UNKNOWN
-    profile, ring, light = side.profile[valid], ring[valid], side.light[valid]
+    profile, ring, light = profile[valid], ring[valid], light[valid]
     if light.all() or not light.any():
         return End.UNKNOWN
     beyond = profile[:, _BEYOND].mean(axis=1)
@@ -99,16 +83,11 @@ def _crossings(profile: Array, ring: Array, beyond: Array) -> Array:
     return _STEPS[k] + share * (_STEPS[k + 1] - _STEPS[k])
 
 
-def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[_Side]:
-    """Profiles across two opposite sides, from the ring's squares outwards.
+def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[tuple[NDArray[np.bool_], Array]]:
+    """Of two opposite sides: whether each square of the ring is light, and the profiles from it outwards.
 
-    Parameters
-    ----------
-    grey : (height, width) array
-    rows : (rows, n, 2) array [px]
-        Of vertices parallel to the sides, those along each in image order.
-    dark : int
-        The grid's.
+    A profile is 0 where it is dark and 1 where it is light, NaN where it leaves the image or vertices are
+    missing. The vertices (rows, n, 2) [px] are parallel to the sides, those along each in image order.
     """
     few = min(len(rows), 3)
     ends = np.stack([rows[:few], rows[: -few - 1 : -1]])  # (2, few, n, 2), the outermost first
@@ -128,16 +107,11 @@ def _opposite(grey: NDArray[np.generic], rows: Array, dark: int) -> list[_Side]:
     darker = np.where(light, level, same)
     contrast[~(contrast > 0)] = np.nan
     profile = (values.mean(axis=-1).swapaxes(1, 2) - darker[..., None]) / contrast[..., None]
-    return [_Side(*side) for side in zip(light, profile, strict=True)]
+    return list(zip(light, profile, strict=True))
 
 
 def _beyond(ends: Array) -> Array:
-    """Points (2, steps, n, 2) beyond the outer rows at ``_STEPS``, by parabolas through three rows or lines.
-
-    Parameters
-    ----------
-    ends : (2, 2 or 3, n, 2) array
-    """
+    """Points (2, steps, n, 2) beyond rows (2, 2 or 3, n, 2), by parabolas through three of them, or lines."""
     t = -_STEPS[:, None, None]
     first, second = ends[:, :1], ends[:, 1:2]
     line = first + t * (second - first)

@@ -32,7 +32,6 @@ from neurocal_cli.detection.identity.messages import (
 )
 from neurocal_cli.detection.identity.placement import Placement, placements
 from neurocal_cli.detection.identity.trim import trimmed
-from neurocal_cli.detection.medians import median
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
@@ -144,7 +143,7 @@ def _may_be_a_piece(candidate: _Candidate, other: _Candidate) -> bool:
     """Whether a grid may be a piece of the board of another size that a larger grid belongs to."""
     ends_seen = candidate.whole and set(candidate.ends.values()) == {End.BOARD}
     smaller = candidate.grid.seen.sum() < other.grid.seen.sum()
-    behind = _square(candidate.grid) >= _NEARER * _square(other.grid)
+    behind = candidate.grid.square >= _NEARER * other.grid.square
     return bool(smaller and not ends_seen and not behind)
 
 
@@ -159,8 +158,8 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
         room = sum(tuple(sorted((plane.cols, plane.rows))) == size for plane in board.planes)
         alike = [c for c in candidates if c.whole and tuple(sorted(c.grid.shape)) == size]
         if len(alike) > 1:
-            alike.sort(key=lambda c: -_square(c.grid))
-        if len(alike) > room and _square(alike[room - 1].grid) < _NEARER * _square(alike[room].grid):
+            alike.sort(key=lambda c: -c.grid.square)
+        if len(alike) > room and alike[room - 1].grid.square < _NEARER * alike[room].grid.square:
             raise NoBoardError(
                 f"{len(alike)} boards of {size[1]} x {size[0]} inner vertices are detected; show only one of "
                 "them"
@@ -171,19 +170,20 @@ def _foremost(board: Board, candidates: Sequence[_Candidate]) -> list[_Candidate
 
 def _candidate(board: Board, grid: Grid, grey: NDArray[np.generic]) -> _Candidate:
     alone = len(board.planes) == 1
-    whole = any(sorted(grid.shape) == sorted((plane.cols, plane.rows)) for plane in board.planes)
-    ends = board_ends(grey, grid) if alone or not whole else {}
+    alike = [
+        k for k, plane in enumerate(board.planes) if sorted(grid.shape) == sorted((plane.cols, plane.rows))
+    ]
+    ends = board_ends(grey, grid) if alone or not alike else {}
     if not alone:  # beyond a fold lies the pattern of another plane
         ends = {direction: end for direction, end in ends.items() if end is End.BOARD}
     possible = [
         placement
-        for index, plane in enumerate(board.planes)
-        if not whole or sorted(grid.shape) == sorted((plane.cols, plane.rows))
-        for placement in placements(grid, plane, index, ends, mirrored=not alone)
+        for k in alike or range(len(board.planes))
+        for placement in placements(grid, board.planes[k], k, ends, mirrored=not alone)
     ]
     if alone and (board.planes[0].cols + board.planes[0].rows) % 2 == 1:
         possible = [placement for placement in possible if placement.first_square_is_dark(grid.dark)]
-    return _Candidate(grid, tuple(possible), whole, ends)
+    return _Candidate(grid, tuple(possible), bool(alike), ends)
 
 
 def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement]:
@@ -214,7 +214,7 @@ def _consistent(board: Board, chosen: Sequence[_Candidate]) -> list[_Arrangement
         # One that is poor with two planes may be the best with three.
         limit = (_CLEARLY if count == len(chosen) else _CLEARLY**2) * max(found[0].rms, _NOISE)
         found = [one for one in found if one.rms <= limit][: None if count == len(chosen) else _KEPT]
-    if len(chosen) > 1 and found[0].rms > _MISFIT * min(_square(c.grid) for c in chosen):
+    if len(chosen) > 1 and found[0].rms > _MISFIT * min(c.grid.square for c in chosen):
         raise NoBoardError(
             f"the planes are {found[0].rms:.3g} px off their places on the board; check its origins and axes"
         )
@@ -289,11 +289,3 @@ def _same_board(board: Board, grids: Sequence[Grid], first: _Arrangement, second
 def _corners(plane: Plane) -> Array:
     c, r = plane.cols - 1, plane.rows - 1
     return plane.at([[0, 0], [c, 0], [0, r], [c, r]])
-
-
-def _square(grid: Grid) -> float:
-    """Typical side of a square [px]."""
-    p = grid.pixels
-    return min(
-        median(np.hypot(step[..., 0], step[..., 1])) for step in (p[1:] - p[:-1], p[:, 1:] - p[:, :-1])
-    )

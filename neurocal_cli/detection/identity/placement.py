@@ -88,28 +88,18 @@ def placements(
         size = abs(corner[0]), abs(corner[1])
         for start in product(*(range(most - long + 1) for most, long in zip(last, size, strict=True))):
             stop = start[0] + size[0], start[1] + size[1]
-            if _allowed(matrix, (start, stop), last, ends):
+            if _allowed(matrix, start, stop, last, ends):
                 yield Placement(index, matrix, (start[0] - min(corner[0], 0), start[1] - min(corner[1], 0)))
 
 
 def _allowed(
     matrix: Matrix,
-    reach: tuple[tuple[int, ...], tuple[int, int]],
+    start: tuple[int, ...],
+    stop: tuple[int, ...],
     last: tuple[int, int],
     ends: Mapping[tuple[int, int], End],
 ) -> bool:
-    """Whether a grid's sides lie at the plane's ends exactly where the board ends.
-
-    Parameters
-    ----------
-    matrix : 2 x 2 ints
-    reach : pair of pairs of ints
-        Least and greatest coordinates of the grid on the plane.
-    last : pair of ints
-        Greatest coordinates of the plane.
-    ends : dict of End
-    """
-    start, stop = reach
+    """Whether a grid's sides lie at the plane's ends, 0 and `last`, exactly where the board ends."""
     for direction, end in ends.items():
         if end is End.UNKNOWN:
             continue

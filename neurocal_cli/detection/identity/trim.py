@@ -12,7 +12,10 @@ import numpy as np
 
 from neurocal_cli.board import Plane
 from neurocal_cli.detection.grid import Grid
-from neurocal_cli.geometry import Array
+
+Side = tuple[slice | int, ...]
+
+_SIDES: tuple[Side, ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :])
 
 # tests/test_identity.py removes such lines, and keeps them on larger boards.
 _FEW = 0.34  # greatest share of vertices of a line that may be removed
@@ -35,13 +38,10 @@ def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:
     left = grid
     few = _FEW if len(planes) == 1 else _FEW_AT_FOLDS
     while not _fits(left, planes):
-        seen = left.seen
-        lines = {0: seen[:, 0], 1: seen[:, -1], 2: seen[0], 3: seen[-1]}
-        shares = {side: float(line.mean()) for side, line in lines.items()}
-        side = min(shares, key=lambda k: shares[k])
-        if shares[side] > few or min(seen.shape) <= 3:
+        shares = [float(left.seen[side].mean()) for side in _SIDES]
+        if min(shares) > few or min(left.shape) <= 3:
             return grid
-        left = _cropped(left.pixels, left.dark, side)
+        left = _without(left, _SIDES[shares.index(min(shares))])
     return left
 
 
@@ -52,14 +52,10 @@ def _fits(grid: Grid, planes: Sequence[Plane]) -> bool:
     )
 
 
-def _cropped(pixels: Array, dark: int, side: int) -> Grid:
+def _without(grid: Grid, side: Side) -> Grid:
     """The grid without the line of a side, and without lines that are empty then."""
-    rows, cols = pixels.shape[:2]
-    window = [slice(0, rows), slice(0, cols)]
-    window[1 if side < 2 else 0] = slice(1, None) if side % 2 == 0 else slice(0, -1)
-    first = (window[0].start or 0, window[1].start or 0)
-    pixels = pixels[tuple(window)]
+    pixels = grid.pixels.copy()
+    pixels[side] = np.nan
     seen = np.isfinite(pixels[..., 0])
     (top, bottom), (west, east) = (np.flatnonzero(seen.any(axis=k))[[0, -1]] for k in (1, 0))
-    dark = (dark + sum(first) + int(top) + int(west)) % 2
-    return Grid(pixels[top : bottom + 1, west : east + 1], dark)
+    return Grid(pixels[top : bottom + 1, west : east + 1], int(grid.dark + top + west) % 2)
