@@ -82,6 +82,6 @@ def test_tables_break_no_word_on_a_narrow_terminal(width: int, monkeypatch: pyte
     monkeypatch.setattr(tables, "is_terminal", lambda stream: True)
     monkeypatch.setattr("rich.console.Console", lambda: Console(file=shown, width=width))
     words = ["correspondence", "reprojection", "cross-validation"]
-    tables.show("", [[words, ["1.2345", "0.0001", "12.000"]]])
+    tables.show([[words, ["1.2345", "0.0001", "12.000"]]], [])
     for word in words:
         assert word in shown.getvalue()

@@ -53,7 +53,7 @@ class WithoutPoses:
         flat = offsets.reshape(k, -1).T
         by_camera, left = self.rows[:, :f], self.rows[:, -1:] - self.rows[:, f:-1] @ flat
         by_point = (info.point @ offsets[..., None])[..., 0] - 2 * info.point_right
-        right = info.camera_right[:, None] - info.point_camera.reshape(-1, f).T @ flat
+        right = info.camera_right[:, None] - info.point_camera.reshape(len(flat), f).T @ flat
         return (
             info.camera - by_camera.T @ by_camera,
             right - by_camera.T @ left,
