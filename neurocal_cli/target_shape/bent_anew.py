@@ -6,11 +6,14 @@ alternatives are compared by their evidence: bends alone, and bends of a target 
 
 from __future__ import annotations
 
+import numpy as np
+
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.target import distinct_points, is_flat, planes_of
 from neurocal_cli.target_shape.bend_size import most_probable_precision
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, Search, searched
+from neurocal_cli.target_shape.information import of_views, without_points
 from neurocal_cli.target_shape.posterior import evidence_of_given
 
 _FEWEST = 4  # views
@@ -58,6 +61,7 @@ def _may_bend(problem: Problem) -> bool:
 
 def _promise(search: Search) -> tuple[float, float]:
     """Logarithms of the evidence without and with bends, the points that all views share being certain."""
-    info = search.information()
+    (sight,) = search.sights()
+    info = of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
     bent = info.held(most_probable_precision(info, search.prior.size, roughly=True))
     return evidence_of_given(info.straight()), evidence_of_given(bent)

@@ -218,7 +218,7 @@ class Search:
         return evidence_of_given(info.straight() if self.still else info)
 
     def _holds(self, found: Posterior) -> bool:
-        sights = self._sights()
+        sights = self.sights()
         if self.surface is not None and not bends_hold(sights[0], self.bends, self.precision):
             return False
         return self.still or holds_for_views_left_out(
@@ -232,7 +232,8 @@ class Search:
         self.precision = most_probable_precision(info, self.prior.size)
         return info.around_given(self.offsets).held(self.precision)
 
-    def _sights(self) -> list[Sight]:
+    def sights(self) -> list[Sight]:
+        """What each camera sees of the target as it is by now."""
         sights = [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
         if self.surface is None:
             return sights
@@ -241,7 +242,7 @@ class Search:
 
     def information(self) -> Information:
         """Around the target as it is by now."""
-        return information_of(self._sights(), len(self.given)).turned(self.prior.axes)
+        return information_of(self.sights(), len(self.given)).turned(self.prior.axes)
 
     def _common(self) -> Array:
         """(n, 3) the points that all views share."""
