@@ -153,10 +153,13 @@ def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
     assert covariance(normal, np.ones(5, dtype=bool), True, 180).smallest < 1e-13
 
 
-@pytest.mark.parametrize("trials", slow_but((40,), (40, 80, 400)))
-def test_the_std_is_the_spread_over_many_noises(trials: int) -> None:
+@pytest.mark.parametrize(
+    ("n_views", "trials", "least"), slow_but([(5, 40, 0.6)], [(5, 40, 0.6), (5, 400, 0.6), (20, 150, 0.8)])
+)
+def test_the_std_is_the_spread_over_many_noises(n_views: int, trials: int, least: float) -> None:
+    """Never less, and more by what it costs to count views: the variance between five of them is rough."""
     rng = np.random.default_rng(0)
-    scene = random_flat_set(np.random.default_rng(3), 5, True, cols=9, rows=6)
+    scene = random_flat_set(np.random.default_rng(3), n_views, True, cols=9, rows=6)
     results = [pinhole(noisy(scene, "suu,suv,svv", rng)) for _ in range(trials)]
     values = np.array([parameters(cal) for cal in results])
     std = np.array(
@@ -168,4 +171,7 @@ def test_the_std_is_the_spread_over_many_noises(trials: int) -> None:
     # The noise of each result is drawn anew with its covariances, which all have one distribution;
     # n draws know a standard deviation to 1 / sqrt(2 n), the largest of 35 to 4 times that.
     ratio = values.std(axis=0) / np.sqrt((std**2).mean(axis=0))
-    assert np.abs(ratio - 1).max() < 4 / np.sqrt(2 * trials)
+    unknown = 4 / np.sqrt(2 * trials)
+    assert ratio.max() < 1 + unknown
+    assert ratio.min() > least - unknown
+    assert np.median(ratio) > least
