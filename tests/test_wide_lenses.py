@@ -198,6 +198,11 @@ def test_a_thousand_wide_cameras_all_reach_the_minimum(model: str, part: int) ->
     assert (np.abs(rms - 1) < 3 / np.sqrt(2 * len(z))).all(), rms
 
 
+def test_a_local_minimum_that_few_views_leave_by_themselves_is_one() -> None:
+    scene = wide_set(102, "fisheye")
+    assert found(scene).rmse_px <= AT_THE_MINIMUM * scene.least_rmse()
+
+
 def test_a_valley_that_leaves_the_range_of_xi_is_followed_to_its_border() -> None:
     scene = wide_set(1085, "omnidir", published=True)  # the lowest minimum within the range is higher by 16 %
     one = found(scene)

@@ -28,7 +28,7 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.repeated_poses import RepeatedPoses, repeated_poses
 from neurocal_cli.bundle_adjustment.reprojection import CameraState
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
-from neurocal_cli.bundle_adjustment.restart import of_few_views
+from neurocal_cli.bundle_adjustment.restart import is_elsewhere, of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
@@ -128,6 +128,8 @@ def _may_lead_lower(
     closest = min(fitted.values(), key=lambda c: c.cost)
     whole = replace(solution, problem=closest.problem, adjusted=closest.adjusted)
     few = of_few_views(whole, VIEWS_THAT_TELL)
+    if is_elsewhere(few, whole):
+        return True
     limit *= float(few.adjusted.cost.sum()) / closest.cost
     return any(
         candidate.cost < limit

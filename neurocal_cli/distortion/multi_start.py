@@ -19,7 +19,7 @@ from neurocal_cli.bundle_adjustment.observability import is_weak
 from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.bundle_adjustment.reprojection import CameraState, farthest_angle
 from neurocal_cli.bundle_adjustment.residual_correlation import correlation, point_residuals
-from neurocal_cli.bundle_adjustment.restart import of_few_views
+from neurocal_cli.bundle_adjustment.restart import is_elsewhere, of_few_views
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.camera.directions import WIDE
@@ -48,9 +48,13 @@ def with_more_starts(solution: Solution, more_starts: Callable[[Problem], Iterab
     if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR} or not _may_be_local(solution):
         return solution
     few = of_few_views(solution, VIEWS_THAT_TELL)
-    if few is not solution and _cost(_lowest(few, more_starts)) >= _LOWER * _cost(few.adjusted):
-        return solution
-    return replace(solution, adjusted=_lowest(solution, more_starts))
+    if few is solution or is_elsewhere(few, solution) or _is_lower(few, _lowest(few, more_starts)):
+        return replace(solution, adjusted=_lowest(solution, more_starts))
+    return solution
+
+
+def _is_lower(solution: Solution, other: Adjusted) -> bool:
+    return _cost(other) < _LOWER * _cost(solution.adjusted)
 
 
 def _may_be_local(solution: Solution) -> bool:
