@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.zoom_lens.setting_normals import Tables
 from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
@@ -42,7 +43,10 @@ def contradiction(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str
         Fitted with the setting.
     s : int
     """
-    prediction = lens.predict(setting[None])
+    try:
+        prediction = lens.predict(setting[None])
+    except InputError:  # no camera there: another setting spoils what is left
+        return None
     L = len(lens.names)
     H = tables.normal.H[s, :L, :L]
     error = prediction.local[0] - tables.local[s]
