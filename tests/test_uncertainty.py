@@ -154,7 +154,7 @@ def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
 
 
 @pytest.mark.parametrize(
-    ("n_views", "trials", "least"), slow_but([(5, 40, 0.6)], [(5, 40, 0.6), (5, 400, 0.6), (20, 150, 0.8)])
+    ("n_views", "trials", "least"), slow_but([(5, 40, 0.55)], [(5, 40, 0.55), (5, 400, 0.6), (20, 150, 0.8)])
 )
 def test_the_std_is_the_spread_over_many_noises(n_views: int, trials: int, least: float) -> None:
     """Never less, and more by what it costs to count views: the variance between five of them is rough."""
@@ -171,7 +171,4 @@ def test_the_std_is_the_spread_over_many_noises(n_views: int, trials: int, least
     # The noise of each result is drawn anew with its covariances, which all have one distribution;
     # n draws know a standard deviation to 1 / sqrt(2 n), the largest of 35 to 4 times that.
     ratio = values.std(axis=0) / np.sqrt((std**2).mean(axis=0))
-    unknown = 4 / np.sqrt(2 * trials)
-    assert ratio.max() < 1 + unknown
-    assert ratio.min() > least - unknown
-    assert np.median(ratio) > least
+    assert least < ratio.min() <= ratio.max() < 1 + 4 / np.sqrt(2 * trials)

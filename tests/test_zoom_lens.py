@@ -440,7 +440,6 @@ def test_networks_beat_every_baseline_between_45_settings(bends: bool) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(reason="148.6 px: without one of the settings other networks are taken, 63 px off")
 def test_a_real_lens_of_42_zooms_left_out_one_by_one(real_files: RealFiles) -> None:
     (table_file,) = real_files("zoom_sony24-70/sony_fe24-70gm_42settings.csv")
     data = np.genfromtxt(table_file, delimiter=",")
@@ -451,4 +450,7 @@ def test_a_real_lens_of_42_zooms_left_out_one_by_one(real_files: RealFiles) -> N
         table = dict(zip(names, rest[:, :5].T, strict=True))
         lens = fit_lens_cameras(LensCameras.of(table))
         errors.append(lens.predict(data[k : k + 1, :1]).local[0, 0] - data[k, 1])
-    assert np.sqrt(np.mean(np.square(errors))) < 147  # px; a quadratic 147.1, a cubic 150, a line 158
+    error = np.sqrt(np.mean(np.square(errors)))
+    assert error < 150  # px; a cubic 150, a line 158
+    if error >= 147:  # a quadratic 147.1
+        pytest.xfail("without one of the settings other networks are taken, 63 px farther off")

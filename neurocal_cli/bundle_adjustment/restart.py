@@ -49,4 +49,5 @@ def _start(problem: Problem, solution: Solution) -> CameraState:
 
 
 def _places(problem: Problem, solution: Solution) -> list[int]:
-    return [solution.problem.views.names.index(name) for name in problem.views.names]
+    place = {name: k for k, name in enumerate(solution.problem.views.names)}
+    return [place[name] for name in problem.views.names]

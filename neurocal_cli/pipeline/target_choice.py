@@ -31,7 +31,7 @@ from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
 from neurocal_cli.verdict.given_parameters import asked_for
 from neurocal_cli.verdict.stated_noise import stated_noise
-from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
+from neurocal_cli.verdict.view_groups import OWN_STEPS, ViewGroups, view_groups
 
 _ROUNDS = 3
 _WORTH = 0.8  # of the views' number, where some repeat a pose
@@ -40,7 +40,6 @@ _TOLD_APART = 5.0  # standard deviations, as for the verdict
 # Of the variance by which views contradict each other, bends explain nine tenths, or leave but a little. With
 # eight tenths, a half of photographs of paper boards predicts the other half 3 % worse.
 _SHARE, _NOISE = 0.9, 1.1
-_OWN_STEPS = 40  # as for `view_groups`
 _SETTLED = 0.01  # standard deviations by which a camera may move and still is the same
 
 
@@ -201,8 +200,8 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
     if bent > _NOISE * least and given - bent < _SHARE * (given - least):
         return common
-    # What a camera for each view leaves, two cameras do not go below.
-    least_of_groups = float(free_networks(before[0].views, before[1].state, _OWN_STEPS).sum())
+    # Two cameras of this lens leave no less than a camera for each view.
+    least_of_groups = float(free_networks(before[0].views, before[1].state, OWN_STEPS).sum())
     if float(after[1].cost.sum()) < least_of_groups:
         return found
     groups = _groups(*before)

@@ -87,7 +87,7 @@ _SETTLED = 0.03  # relative change of the sizes
 # Of the logarithm of the evidence, that a step must promise. With these, cameras are 0.017 standard
 # deviations rms from where 1e-5 leads; 24 draws of each kind by tests/support/simulated_targets.py.
 _NO_GAIN = 0.001
-_NO_GAIN_YET = 0.1  # from sizes of nobody's, around a target that is about to move
+_NO_GAIN_YET = 0.1  # from sizes that no data told, around a target that is about to move
 _FARTHEST = 8.0  # times MacKay's step
 _HALVINGS = 6
 _PASSES = 40

@@ -38,7 +38,10 @@ class System:
         self.f, self.m = len(info.camera), prior.basis.shape[2]
         self.gauge = prior.gauge if self.P else prior.gauge[:, :0]
         self.points_first = 3 * self.n >= self.p * self.P
-        (self._prepare if self.points_first else self._eliminate_poses)()
+        if self.points_first:
+            self._prepare()
+        else:
+            self._eliminate_poses()
 
     @property
     def s(self) -> int:

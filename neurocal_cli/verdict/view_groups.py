@@ -29,7 +29,7 @@ _SPARE = 4  # more conditions than what explains them has parameters
 _DIFFERENT = 0.01  # of the focal length
 _STARTS = 20
 _ROUNDS = 20
-_OWN_STEPS = 40
+OWN_STEPS = 40  # of a camera for each view
 _STEPS = 30
 _ADJUSTED = 4  # rounds with cameras that are adjusted, not only followed along the quadratic
 
@@ -89,7 +89,7 @@ def view_groups(
     own = float((free_networks(views, state) if networks is None else networks).sum())
     if cost - own < _CONTRADICTS * spare * own / freedom:
         return None
-    own = float(free_networks(views, state, _OWN_STEPS).sum())
+    own = float(free_networks(views, state, OWN_STEPS).sum())
     noise = _NOISE * own / freedom
     quadratics = reduced(normal, free, True)
     scale = _scales(quadratics, state, free)
