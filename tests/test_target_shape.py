@@ -31,6 +31,9 @@ from neurocal_cli.target_shape.prior import Prior, prior_of
 from neurocal_cli.target_shape.system import System
 
 PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
+TOO_SIMPLE = tuple(
+    (seed, n_views, k1) for seed in (1, 2, 3) for n_views in (3, 5, 15) for k1 in (-0.2, -0.05, 0.03, 0.1)
+)
 SIZES = {"bend": 0.3, "stretch": 0.2, "warp": 0.1, "place": 0.05, "height": 0.04}
 
 
@@ -210,6 +213,27 @@ def test_a_wrong_square_is_not_taken_for_a_shape() -> None:
     assert found.target is None
     assert found.verdict is not None
     assert found.verdict.word != "good"
+
+
+# A bent board that was found in its place was good, with the focal length five standard deviations off.
+@pytest.mark.parametrize(("seed", "n_views", "k1"), slow_but(((1, 5, 0.03),), TOO_SIMPLE))
+def test_a_distortion_that_is_too_simple_is_not_taken_for_a_shape(seed: int, n_views: int, k1: float) -> None:
+    points, _ = photographed("flat", seed, n_views, k=(k1,), model="k1")
+    found = calibrate(points, distortion="none")
+    assert found.target is None
+    assert found.verdict is not None
+    assert found.verdict.word != "good"
+    assert any("the distortion model is too simple" in reason for reason in found.verdict.reasons)
+    assert "auto" in " ".join(found.verdict.advice)
+
+
+def test_a_bent_board_is_found_with_a_distortion_that_is_rich_enough() -> None:
+    points, truth = photographed("parabola", 12, k=(-0.2,), model="k1")
+    found = calibrate(points, distortion="k1")
+    assert found.target is not None
+    assert found.verdict is not None
+    assert not any("too simple" in reason for reason in found.verdict.reasons)
+    assert np.abs(errors(found, truth.K) / [found.std[name] for name in PARAMETERS]).max() < 4
 
 
 def test_an_outlier_view_is_left_out_and_not_bent() -> None:

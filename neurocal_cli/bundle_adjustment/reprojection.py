@@ -59,6 +59,13 @@ class CameraState:
         """The distortion that all views share."""
         return Distortion(self.model, self.k)
 
+    def with_model(self, model: str) -> CameraState:
+        """The same camera with a model that begins with the same coefficients; new ones are 0."""
+        k = np.zeros(len(coefficient_names(model)))
+        kept = min(len(k), len(self.k))
+        k[:kept] = self.k[:kept]
+        return replace(self, model=model, k=k)
+
     def of_view(self, view: int) -> CameraState:
         """Of one view alone."""
         own = slice(view, view + 1)

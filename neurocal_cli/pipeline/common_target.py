@@ -15,7 +15,7 @@ from neurocal_cli.calibration import Calibration
 from neurocal_cli.errors import NeurocalError
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.find import LEAST_GAIN, enough_views, find_target
-from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
+from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
 from neurocal_cli.target_shape.surveyed import find_surveyed
 
 
@@ -48,7 +48,10 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
     found = (find_lens_and_target if chosen else find_target)(
         fits, choice == "flat", known, LEAST_GAIN if choice == "auto" else -np.inf
     )
-    return None if found is None else found.target
+    if found is None:
+        return None
+    named = known is None and not chosen and choice == "auto"
+    return None if named and named_lens_is_too_simple(fits, found) else found.target
 
 
 def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:

@@ -28,7 +28,7 @@ from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points, planes_of
 from neurocal_cli.target_shape.bent_anew import find_bends
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
-from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
+from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
 from neurocal_cli.verdict.given_parameters import asked_for
 from neurocal_cli.verdict.stated_noise import stated_noise
 from neurocal_cli.verdict.view_groups import OWN_STEPS, ViewGroups, view_groups
@@ -151,11 +151,14 @@ def lines_that_are_bent(solution: Solution, unit: str) -> str:
 
 
 def _other_reason(solution: Solution, found: Found) -> bool:
-    """Whether stated sigmas, given parameters, two cameras or a zoom that moves are why, not the target."""
+    """Whether stated sigmas, a named distortion, given parameters or several cameras are why."""
     problem, points = solution.problem, solution.problem.points
     place = np.array([problem.views.names.index(name) for name in points.view_names])
     predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
     if any(grade for grade, *_ in stated_noise(points, predicted - points.pixels)):
+        return True
+    named = solution.model_errors is None and solution.straight_lines is None
+    if named and named_lens_is_too_simple([(problem, solution.adjusted)], found):
         return True
     if not problem.free_poses:
         return False

@@ -107,6 +107,11 @@ def find_target(
     return found if found is None or not many else _of_all_views(found, fits, known)
 
 
+def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
+    """Logarithm of the evidence of the target as it is given, comparable with that of one that was found."""
+    return evidence_of_given(Search(fits, flat=False, known=None).information())
+
+
 def searched(search: Search, least_gain: float) -> Found | None:
     """What a search ends with; None also where the points do not determine it."""
     try:

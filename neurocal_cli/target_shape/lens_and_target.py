@@ -7,15 +7,13 @@ evidence, then the next simpler one as long as it costs next to nothing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
 from neurocal_cli.bundle_adjustment.problem import Problem
-from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.target import Target
-from neurocal_cli.target_shape.find import Found, find_target
+from neurocal_cli.target_shape.find import Found, evidence_as_given, find_target
 
 # Each has the coefficients of the one before and more.
 _CHAIN = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")
@@ -51,10 +49,28 @@ def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
         place = _CHAIN.index(adjusted.state.model) + step if adjusted.state.model in _CHAIN else -1
         if not 0 <= place < len(_CHAIN) or problem.type == 3:
             return None
-        model = _CHAIN[place]
-        k = np.zeros(len(coefficient_names(model)))
-        kept = min(len(k), len(adjusted.state.k))
-        k[:kept] = adjusted.state.k[:kept]
-        new = problem.with_model(model)
-        fits.append((new, new.adjust(replace(adjusted.state, model=model, k=k))))
+        fits.append(_adjusted_with(problem, adjusted, _CHAIN[place]))
     return find_target(fits, flat, found.target)
+
+
+def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -> bool:
+    """Whether richer lenses explain the points as given better than the target with the named ones.
+
+    Parameters
+    ----------
+    fits : sequence of (Problem, Adjusted)
+        Each camera at its minimum for the given target.
+    found : Found
+        For the same lenses.
+    """
+    if not any(a.state.model in _CHAIN[:-1] and p.free[0] for p, a in fits):
+        return False
+    richer = [
+        _adjusted_with(p, a, _CHAIN[-1]) if a.state.model in _CHAIN and p.free[0] else (p, a) for p, a in fits
+    ]
+    return evidence_as_given(richer) > found.evidence
+
+
+def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:
+    new = problem.with_model(model)
+    return new, new.adjust(adjusted.state.with_model(model))

@@ -8,6 +8,7 @@ Everything follows from the calibration and its points, so a file can be judged 
 * how far two halves of the data disagree, in units of their reported uncertainty;
 * whether residuals of neighbours are correlated (`residual_correlation`);
 * whether the views are of two cameras, or of a focal length that changes (`view_groups`);
+* whether the distortion model that was named lacks coefficients (`missing_coefficients`);
 * whether the points ask for other values of parameters that were given (`given_parameters`);
 * how much of the image and how many directions the points cover (`coverage`);
 * how far projected pixels would move with other noise (`projection_uncertainty`).
@@ -55,6 +56,7 @@ from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import pixel_spread
 from neurocal_cli.verdict.given_parameters import asked_for
+from neurocal_cli.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
 from neurocal_cli.verdict.noise_shape import noise_shape
 from neurocal_cli.verdict.projection_uncertainty import (
     ProjectionUncertainty,
@@ -71,6 +73,7 @@ _STEPS = 5  # poses that were given, and a file that was edited, may be off the 
 _IN_PLANE = 1e-9  # depth over the largest one that rounding leaves of 0
 _BY_FLEXING = 0.01  # relative
 _EXACT = 1e-4  # of the spread of the pixels: errors that cost nothing
+_ALIKE = 0.1  # correlation of neighbours' residuals: noise leaves 0.04 of 600 points
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
@@ -205,6 +208,7 @@ class _AtMinimum:
                 *noise_shape(self.points, residuals, alike),
             ),
             groups=None if stated else self._groups(),
+            missing=self._missing(alike),
         )
 
     def _residuals(self) -> Array:
@@ -274,6 +278,13 @@ class _AtMinimum:
         std = float(np.sqrt(self.covariance[0, 0]))
         times = float(self.repeated.variance.mean())
         return board_shape(self.views, self.state, self.free, self.cost / self.spare, self.spare, times, std)
+
+    def _missing(self, alike: float) -> MissingCoefficients | None:
+        chosen = self.calibration.lens_choice or self.calibration.straight_lines is not None
+        if chosen or alike < _ALIKE or not self.free[0]:
+            return None
+        std = float(np.sqrt(self.covariance[0, 0]))
+        return missing_coefficients(self.views, self.state, self.normal, self.free, self.free_poses, std)
 
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TypeVar
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, Limit, name_some
+from neurocal_cli.verdict.missing_coefficients import MissingCoefficients
 from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
 
@@ -24,9 +26,13 @@ _NEAR = 0.02  # of the focal length
 # Real boards of good calibrations are bent, too; they cost up to 0.4 % and 1.3 sigmas.
 _OFF, _MUCH_OFF = 0.005, 0.05  # of the focal length
 _SIGMAS = 2.0
+_TOO_SIMPLE = Limit(1.2, 4.0)  # times the rms error with all coefficients
 # Times the noise floor that may be left when a cause is taken away: what leaves more is not the cause, or not
 # the only one. Of the wrong inputs, true causes leave up to 1.04 and others 1.38 and more.
 _LEFT = 1.25
+
+
+Cause = TypeVar("Cause", BoardShape, ViewChange, ViewGroups)
 
 
 def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding]:
@@ -41,6 +47,13 @@ def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding
         Whether the lens is a wide one, whose rays may not meet in one point.
     """
     change, board, groups = _explanation(evidence), evidence.board, evidence.groups
+    missing = evidence.missing
+    if missing is not None and _explains(missing.explained, evidence):
+        # Distortion that is left in the residuals looks like a bent board, and like several cameras.
+        least = missing.explained
+        board, change, groups = _above(least, board), _above(least, change), _above(least, groups)
+        if board is None and change is None and groups is None:
+            yield _too_simple(missing)
     differ = groups if change is None else change
     if board is not None and not _explains(board.explained, evidence):
         board = None
@@ -51,6 +64,21 @@ def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding
     # Views of a bent board differ, and not by chance; rows given twice know less than they seem to.
     if change is not None and not evidence.repeated and (board is None or change.explained > board.explained):
         yield _changed(change, wide)
+
+
+def _too_simple(missing: MissingCoefficients) -> Finding:
+    times, off = 1.0 / np.sqrt(1.0 - missing.explained), missing.focal_length
+    return (
+        max(_TOO_SIMPLE.grade(times), _worse_by(off, missing.sigmas)),
+        f"the distortion model is too simple: more coefficients make the error {times:.2g} times smaller, "
+        f"and the focal length {100 * abs(off):.2g} % {'shorter' if off > 0 else 'longer'}",
+        "give a --distortion with more coefficients, or --distortion auto",
+    )
+
+
+def _above(share: float, cause: Cause | None) -> Cause | None:
+    """A cause, unless it explains less than a share of the squared error."""
+    return None if cause is None or cause.explained < share else cause
 
 
 def _explanation(evidence: Evidence) -> ViewChange | None:
@@ -132,11 +160,16 @@ def _changed(change: ViewChange, wide: bool) -> Finding:
 def _bent(board: BoardShape, unit: str) -> Finding:
     off = abs(board.focal_length)
     return (
-        max(int(board.sigmas > _SIGMAS), int(off > _OFF) + int(off > _MUCH_OFF)),
+        _worse_by(off, board.sigmas),
         f"the residuals repeat on the board in all views: it seems {_shape(board, unit)}, which "
         f"makes the focal length {100 * off:.2g} % too {'short' if board.focal_length > 0 else 'long'}",
         "use a board that is flat, or measure its shape and give X,Y,Z as measured",
     )
+
+
+def _worse_by(off: float, sigmas: float) -> int:
+    """Grade of a share by which the focal length is off."""
+    return max(int(sigmas > _SIGMAS), int(abs(off) > _OFF) + int(abs(off) > _MUCH_OFF))
 
 
 def _shape(board: BoardShape, unit: str) -> str:

@@ -7,6 +7,7 @@ from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.coverage import Coverage
 from neurocal_cli.verdict.findings import Finding
 from neurocal_cli.verdict.given_parameters import AskedFor
+from neurocal_cli.verdict.missing_coefficients import MissingCoefficients
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.verdict.view_change import ViewChange
 from neurocal_cli.verdict.view_groups import ViewGroups
@@ -52,6 +53,8 @@ class Evidence:
         How the camera differs between views; None where it does not.
     board : BoardShape or None
         How a target that is said to be flat seems to be bent; None where it does not.
+    missing : MissingCoefficients or None
+        What distortion coefficients explain that the named model lacks; None where it lacks none.
     """
 
     rmse_px: float
@@ -71,3 +74,4 @@ class Evidence:
     poses: int
     change: ViewChange | None
     board: BoardShape | None
+    missing: MissingCoefficients | None

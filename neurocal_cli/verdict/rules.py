@@ -111,7 +111,7 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         yield (
             0 if flexes else _DISAGREEMENT.grade(e.disagreement),
             f"the results of two halves of the data differ by {np.sqrt(e.disagreement):.1f} standard "
-            f"deviations{'' if e.groups is not None else _NO_SINGLE_CAMERA}",
+            f"deviations{'' if e.groups or e.missing else _NO_SINGLE_CAMERA}",
             "expect errors larger than the standard deviations; look for a wrong view or a board that is not "
             "flat",
         )
