@@ -9,6 +9,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from typing import TypeVar
 
 from neurocal_cli.errors import NeurocalError
@@ -54,11 +55,25 @@ def work_through(
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(jobs, context, prepare or start_worker)
     try:
-        yield from pool.map(work, tasks)
+        with _interrupts_held():
+            results = pool.map(work, tasks)  # starts the processes
+        yield from results
     except BrokenProcessPool as error:
         raise NeurocalError("a process was stopped, perhaps for lack of memory; use --jobs 1") from error
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Put interrupts off. Processes that start meanwhile never get any, not even while they load modules."""
+    mask = getattr(signal, "pthread_sigmask", None)  # not on Windows
+    former = mask(signal.SIG_BLOCK, {signal.SIGINT}) if mask else None
+    try:
+        yield
+    finally:
+        if mask:
+            mask(signal.SIG_SETMASK, former)
 
 
 def start_worker() -> None:

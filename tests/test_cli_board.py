@@ -234,6 +234,11 @@ def test_a_board_that_looks_the_same_turned_round_is_named(tmp_path: Path) -> No
     words = ["--cols", 8, "--rows", 6, "--square", 20]
     result = run("board", *words, "-o", tmp_path / "target.svg")
     assert "looks the same after a turn of 180 degrees; 8 x 5 would not" in result.stderr
+    result = run("board", "--cols", 3, "--rows", 3, "--square", 20, "-o", tmp_path / "target.svg")
+    assert "; 3 x 4 would not" in result.stderr
+    assert "needs at least" not in result.stderr
+    result = run("board", "--cols", 3, "--rows", 2, "--square", 20, "-o", tmp_path / "target.svg")
+    assert result.stderr.startswith("warning: neurocal detect needs at least 3 x 3 inner vertices\n")
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from support.command_line import run
 from support.rigs import RigScene, corner, random_rig
 
 from neurocal_cli import Calibration, calibrate, read_calibration, write_calibration, write_points
+from neurocal_cli.io.result_files import lean_calibration, lean_rig
 from neurocal_cli.io.rig_yaml import write_rig
 from neurocal_cli.stereo.evaluation import evaluate_rig, evaluate_stereo
 from neurocal_cli.stereo.fit_rig import fit_rig
@@ -190,3 +191,22 @@ def test_opencvs_cameras_are_judged_by_points_with_fitted_poses(tmp_path: Path) 
     assert values["rig"]["epipolar_px"] == pytest.approx(0.2, rel=0.2)
     assert values["baseline"] == pytest.approx(np.linalg.norm(made.rig.t), rel=0.01)
     one_line_error(evaluate(*words), "has no neurocal block")
+
+
+def test_lean_files_are_judged_by_points_with_fitted_poses(tmp_path: Path) -> None:
+    made, rng = scene(), np.random.default_rng(4)
+    words, points = [], []
+    for side, camera in enumerate(calibrated(made)):
+        words.append(tmp_path / f"{side}.yaml")
+        write_calibration(lean_calibration(camera), words[-1])
+        points.append(tmp_path / f"{side}.csv")
+        write_points(made.points(side, 0.2, rng), points[-1])
+    result = evaluate(*words, "--points", *points, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert result.stderr.count("holds no poses; they are fitted") == 2
+    assert json.loads(result.stdout)["baseline"] == pytest.approx(np.linalg.norm(made.rig.t), rel=0.01)
+    one_line_error(evaluate(*words), "the left camera has no points of its own")
+    rig = tmp_path / "rig.yaml"
+    write_rig(lean_rig(fit_rig(*calibrated(made))), rig)
+    one_line_error(evaluate(rig), "the rig has no points of its own; give the points to evaluate it on")
+    assert evaluate(rig, "--points", *points).exit_code == 0

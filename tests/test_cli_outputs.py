@@ -68,6 +68,34 @@ def test_an_input_is_never_written_over(
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize(
+    ("words", "read"),
+    [
+        (("calibrate", "-", "-o", "flat.csv"), "flat.csv"),
+        (("undistort", "camera.yaml", "-", "-o", "flat.csv"), "flat.csv"),
+        (("undistort", "-", "flat.csv", "-o", "camera.yaml"), "camera.yaml"),
+    ],
+)
+def test_nor_is_one_that_the_shell_makes_standard_input(
+    made: Path, tmp_path: Path, words: tuple[str, ...], read: str
+) -> None:
+    for name in ("flat.csv", "camera.yaml"):
+        (tmp_path / name).write_bytes((made / name).read_bytes())
+    before = contents(tmp_path)
+    with open(tmp_path / read, "rb") as stdin:
+        command = [sys.executable, "-m", "neurocal_cli", *words]
+        done = subprocess.run(command, stdin=stdin, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert done.returncode == 2
+    assert done.stderr == f"Error: {read} is an input and would be overwritten; give another output\n"
+    assert contents(tmp_path) == before
+
+
+def test_closed_standard_output_is_said_to_be_closed(made: Path) -> None:
+    words = f"{sys.executable} -m neurocal_cli -qq convert {made / 'camera.yaml'} --to json >&-"
+    done = subprocess.run(["sh", "-c", words], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (1, "Error: stdout is closed; give a file\n")
+
+
 INCOMPLETE = {
     "undistort": ("undistort", "camera.yaml", "flat.csv", "-o", "us.csv", "--camera", "zz/c.yaml"),
     "calibrate": ("calibrate", "flat.csv", "--plot", "p.png", "-o", "zz/x.yaml"),

@@ -116,6 +116,8 @@ def test_an_image_without_a_board_says_so() -> None:
             detect_points(np.full((100, 120), value, dtype=np.uint8), BOARD)
     with pytest.raises(NoBoardError, match="no board detected"):
         detect_points(np.zeros((8, 8), dtype=np.uint8), BOARD)
+    with pytest.raises(NoBoardError, match="no board detected"):
+        detect_points(np.zeros((1, 9000), dtype=np.uint8), BOARD)
 
 
 def test_a_board_of_another_size_is_not_taken() -> None:

@@ -182,6 +182,8 @@ def test_a_piece_beside_a_bigger_board_is_not_taken_but_a_board_before_it_is() -
 def test_no_grid_is_no_board() -> None:
     with pytest.raises(NoBoardError, match="no board detected"):
         identify(Board.single(9, 6, 25), [], EMPTY)
+    with pytest.raises(NoBoardError, match="fewer than 3 x 3 inner vertices are not detected"):
+        identify(Board.single(7, 2, 25), [], EMPTY)
 
 
 @pytest.mark.parametrize("seed", slow_but((1,), range(2)))

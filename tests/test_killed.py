@@ -56,3 +56,22 @@ def test_workers_end_with_a_detection_that_is_killed(tmp_path: Path, how: signal
     while left := {pid for pid in started if alive(pid)}:
         assert time.monotonic() < end, left
         time.sleep(0.05)
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="there is no /proc to see processes in")
+def test_an_interrupt_while_workers_start_is_told_in_one_line(tmp_path: Path) -> None:
+    picture = (SAMPLES / "board01.png").read_bytes()
+    for k in range(20):
+        (tmp_path / f"{k}.png").write_bytes(picture)
+    words = ["detect", str(tmp_path), "--cols", "9", "--rows", "6", "--square", "25", "--jobs", "2"]
+    command = [sys.executable, "-m", "neurocal_cli", "-qq", *words, "-o", os.devnull]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True) as process:
+        end = time.monotonic() + 60
+        while len(descendants(process.pid)) < 3:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        time.sleep(0.2)
+        os.killpg(process.pid, signal.SIGINT)  # a terminal sends it to the workers as well
+        _, told = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert told == b"Error: interrupted\n"

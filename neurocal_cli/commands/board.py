@@ -106,9 +106,11 @@ def _report(target: Board, sheet: Sheet, beside: str | None, as_json: bool) -> N
         warn(
             [
                 f"a board of {cols} x {rows} inner vertices looks the same after a turn of 180 degrees; "
-                f"{cols} x {max(2, rows - 1)} would not"
+                f"{cols} x {rows - 1 if rows > 3 else rows + 1} would not"
             ]
         )
+    if any(min(plane.cols, plane.rows) < 3 for plane in target.planes):
+        warn(["neurocal detect needs at least 3 x 3 inner vertices"])
     if as_json:
         keys = ("name", "cols", "rows", "square")
         planes = [{key: getattr(plane, key) for key in keys} for plane in target.planes]

@@ -140,12 +140,14 @@ def _evaluate(
 
 
 def _camera(name: str, points: Correspondences) -> Calibration:
-    """Read a calibration, or any camera file: then its poses are fitted to the points."""
+    """Read a calibration, or any camera file: where that holds no poses, they are fitted to the points."""
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.methods import calibrate
 
     camera, seen = calibration_or_camera(name, points, "; the poses are fitted")
     if isinstance(camera, Calibration):
-        return camera
+        if camera.views:
+            return camera
+        note([f"{name}: holds no poses; they are fitted"])
     assert seen is not None
     return calibrate(seen, type=3, intrinsics=camera, outliers="keep")

@@ -44,7 +44,8 @@ def other_target(grey: NDArray[np.generic]) -> str:
 def _small(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
     scale = min(1.0, _LONGEST / max(grey.shape))
     if scale < 1:
-        grey = cv2.resize(np.ascontiguousarray(grey), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        size = [max(1, round(scale * length)) for length in grey.shape[::-1]]
+        grey = cv2.resize(np.ascontiguousarray(grey), size, interpolation=cv2.INTER_AREA)
     if grey.dtype == np.uint8:
         return np.ascontiguousarray(grey, dtype=np.uint8)
     brightest = max(int(grey.max(initial=1)), 1)

@@ -41,6 +41,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
         The file cannot be read: missing, a folder, not permitted.
     """
     if str(path) == "-":
+        _protect_stdin()
         with _stdin_failures():
             return sys.stdin.buffer.read(), "<stdin>"
     source = one_line(path)
@@ -55,6 +56,7 @@ def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
     A file without line ends comes as one block.
     """
     if str(path) == "-":
+        _protect_stdin()
         with _stdin_failures():
             yield from _whole_lines(sys.stdin.buffer, size)
         return
@@ -76,6 +78,12 @@ def _protect(file: IO[bytes]) -> None:
     outputs = held_back()
     if outputs is not None:
         outputs.protect_status(os.fstat(file.fileno()))
+
+
+def _protect_stdin() -> None:
+    outputs = held_back()
+    if outputs is not None:
+        outputs.protect("-")
 
 
 def _whole_lines(file: IO[bytes], size: int) -> Iterator[bytes]:

@@ -7,6 +7,7 @@ Files are told apart by their identity on the disk, not by their names: links le
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -25,11 +26,14 @@ class Outputs:
         self._stdout: list[bytes] = []
 
     def protect(self, *paths: str | None) -> None:
-        """Never write over these files; the ones that do not exist are left to their readers."""
+        """Never write over these files; the ones that do not exist are left to their readers.
+
+        ``-`` is what the shell made stdin of, which may be a file: ``< FILE``.
+        """
         for path in paths:
-            if path is not None and path != "-":
-                with suppress(OSError, ValueError):
-                    self.protect_status(os.stat(path))
+            if path is not None:
+                with suppress(AttributeError, OSError, ValueError):  # stdin may be closed or no file
+                    self.protect_status(os.stat(sys.stdin.fileno() if path == "-" else path))
 
     def protect_status(self, status: os.stat_result) -> None:
         """Never write over the file of this status."""

@@ -121,6 +121,8 @@ def evaluate_rig(
 
     The views of a rig have one pose for both cameras, so `by_view` and `rig` are equal.
     """
+    if points is None and not (len(rig.left.points) and len(rig.right.points)):
+        raise InputError("the rig has no points of its own; give the points to evaluate it on")
     judgement = partial(assess_rig, rig)
     return _Evaluator((rig.left, rig.right), rig, points, method, list(rig.warnings), judgement).evaluation()
 

@@ -69,8 +69,14 @@ def pair_views(left: Sequence[str], right: Sequence[str]) -> ViewPairs:
     Raises
     ------
     InputError
-        No pair, ambiguous names, or names that show that the cameras are swapped.
+        No view, no pair, ambiguous names, or names that show that the cameras are swapped.
     """
+    for side, names in (("left", left), ("right", right)):
+        if not names:
+            raise InputError(
+                f"the calibration of the {side} camera has no points of its own; give a file that was not "
+                "written with --lean"
+            )
     if not set(left).isdisjoint(right):
         keys = dict(zip(left, left, strict=True)), dict(zip(right, right, strict=True))
     else:

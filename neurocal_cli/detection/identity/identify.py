@@ -94,6 +94,8 @@ def identify(board: Board, grids: Sequence[Grid], grey: NDArray[np.generic]) -> 
         No board, a board of another size, or several possible arrangements. The message says which.
     """
     if not grids:
+        if all(min(plane.cols, plane.rows) < 3 for plane in board.planes):
+            raise NoBoardError("boards of fewer than 3 x 3 inner vertices are not detected; use a larger one")
         raise NoBoardError("no board detected; show the whole board, sharp and evenly lit")
     chosen = _candidates(board, grids, grey)
     whole = [candidate for candidate in chosen if candidate.whole]
