@@ -17,7 +17,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 Decorator = Callable[[type], Any]
 
 
-def classes(frozen: Decorator, unequal: Decorator) -> tuple[Any, Any, Any]:
+def classes(frozen: Decorator, unequal: Decorator) -> tuple[Any, ...]:
     @frozen
     class Point:
         """A point."""
@@ -41,6 +41,13 @@ def classes(frozen: Decorator, unequal: Decorator) -> tuple[Any, Any, Any]:
     class Named(Point):
         name: str = field(default="", kw_only=True)
 
+    @frozen
+    class Mixed(Named):
+        last: int = field(kw_only=True)
+        both: tuple[int, ...] = field(default_factory=tuple, kw_only=True)
+        y: float = 3.0
+        wide: bool = False
+
     @unequal
     class Identity:
         value: int
@@ -48,7 +55,7 @@ def classes(frozen: Decorator, unequal: Decorator) -> tuple[Any, Any, Any]:
         def __repr__(self) -> str:
             return "one"
 
-    return Point, Named, Identity
+    return Point, Named, Identity, Mixed
 
 
 OURS = classes(frozen_dataclass, frozen_dataclass(eq=False))
@@ -68,7 +75,8 @@ class Kept:
 def test_signature_and_fields_are_those_of_a_dataclass(ours: Any, theirs: Any) -> None:
     assert str(inspect.signature(ours)) == str(inspect.signature(theirs))
     assert str(inspect.signature(ours.__init__)) == str(inspect.signature(theirs.__init__))
-    assert ours.__init__.__qualname__ == theirs.__init__.__qualname__
+    for name in ("__name__", "__qualname__", "__module__", "__annotations__"):
+        assert getattr(ours.__init__, name) == getattr(theirs.__init__, name)
     assert ours.__match_args__ == theirs.__match_args__
     assert is_dataclass(ours)
     assert [repr(f) for f in fields(ours)] == [repr(f) for f in fields(theirs)]
@@ -97,7 +105,7 @@ def test_objects_compare_by_their_fields(cls: Any) -> None:
 
 
 def test_objects_of_two_classes_differ() -> None:
-    Point, Named, _ = OURS
+    Point, Named, *_ = OURS
     assert Point(1.0) != Named(1.0)
 
 
@@ -127,6 +135,40 @@ def test_wrong_arguments_are_refused_in_the_same_words(arguments: tuple[Any, ...
     with pytest.raises(TypeError) as ours:
         OURS[1](*arguments)
     assert str(ours.value) == str(theirs.value)
+
+
+def test_arguments_are_given_by_position_and_by_name() -> None:
+    for arguments, names in [
+        ((1.0,), {"last": 2}),
+        ((1.0, 5.0, ["a"], True), {"last": 2, "name": "b", "both": (3,)}),
+    ]:
+        mine, other = OURS[3](*arguments, **names), THEIRS[3](*arguments, **names)
+        assert vars(mine) == vars(other)
+        assert repr(mine) == repr(other)
+
+
+def test_what_a_class_defines_itself_stays() -> None:
+    @frozen_dataclass
+    class Own:
+        value: int
+
+        def __init__(self) -> None:
+            vars(self)["value"] = 4
+
+        def __eq__(self, other: object) -> bool:
+            return True
+
+    assert Own().value == 4
+    assert Own() == 5
+
+
+def test_a_default_stands_behind_the_fields_without_one() -> None:
+    with pytest.raises((TypeError, SyntaxError), match="default argument"):
+
+        @frozen_dataclass
+        class Disordered:
+            first: int = 1
+            second: int
 
 
 def test_objects_are_pickled() -> None:

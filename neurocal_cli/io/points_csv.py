@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Sequence
 from itertools import chain
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from neurocal_cli.io.table import read_table
 from neurocal_cli.io.table_header import Schema, quoted_field
 from neurocal_cli.io.writing import write_whole
 from neurocal_cli.points import Correspondences
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 POINTS = Schema(
     kind="points",
@@ -53,7 +57,7 @@ def read_points(
     InputError
         Rows that are well formed but do not fit together.
     """
-    several = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    several = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     if not several:
         raise InputError("there are no files of points; give at least one")
     tables = [read_table(path, POINTS) for path in several]

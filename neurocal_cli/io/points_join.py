@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import os
 from typing import Any
 
 import numpy as np
@@ -75,7 +75,7 @@ def _points(tables: list[Table], notes: list[str]) -> NDArray[Any] | None:
 def _views_of_file(table: Table) -> NDArray[Any]:
     if "view" in table.labels:
         return table.labels["view"]
-    name = "stdin" if table.source == "<stdin>" else Path(table.source).stem
+    name = "stdin" if table.source == "<stdin>" else os.path.splitext(os.path.basename(table.source))[0]
     return np.full(len(table), name)
 
 
