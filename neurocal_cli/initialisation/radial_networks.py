@@ -75,7 +75,7 @@ def radial_start(problem: Problem, options: Options) -> Solution | None:
 
 
 def _pinholes(problem: Problem, middle: Array) -> Iterator[Problem]:
-    """The problem with fixed centre and skew, which a long lens hardly determines; then the problem itself."""
+    """The problem with fixed centre and skew, which long lenses hardly determine; then the problem itself."""
     if problem.free[3:].all():
         entries, free = problem.entries.copy(), problem.free.copy()
         entries[3:], free[[1, 3, 4]] = middle, False

@@ -26,10 +26,10 @@ from neurocal_cli.pipeline.odd_views import may_be_bent
 from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly, rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points, planes_of
-from neurocal_cli.target_shape.bent_anew import find_bends
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target
-from neurocal_cli.verdict.given_parameters import asked_for
+from neurocal_cli.target_shape.view_bends import find_bends
+from neurocal_cli.verdict.given_parameters import reestimate_given
 from neurocal_cli.verdict.stated_noise import stated_noise
 from neurocal_cli.verdict.view_groups import OWN_STEPS, ViewGroups, view_groups
 
@@ -160,7 +160,7 @@ def _other_reason(solution: Solution, found: Found) -> bool:
         return True
     if not problem.free_poses:
         return False
-    asked = asked_for(problem.views, solution.state, problem.fixed, problem.free_poses)
+    asked = reestimate_given(problem.views, solution.state, problem.fixed, problem.free_poses)
     if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
         return True
     return _are_two_cameras(solution, found)
