@@ -16,7 +16,7 @@ from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
-from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_told
+from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_supported
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.multi_start import with_more_starts
 from neurocal_cli.errors import DegenerateGeometryError
@@ -120,7 +120,7 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
         return _from_simpler(problem, _first_solution(problem.with_model("fisheye"), options))
     if problem.free_distortion and model in WITH_PRISM:
         plain = _first_solution(problem.with_model("plumb_bob"), options)
-        return with_denominator_if_told(
+        return with_denominator_if_supported(
             _from_simpler(replace(problem, fixed=problem.fixed | DENOMINATOR), plain)
         )
     try:
