@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _USUAL_SIGMA = 0.5  # of a rig without points [px]
 _LARGEST_SIGMA = 1e6  # px; no image is that large
-_MANY_OFF = 0.5  # share of the points that no bad luck explains
+_MANY_OFF = 0.5  # share of the points that chance does not explain
 
 
 @click.command(cls=options.Command)
