@@ -10,7 +10,7 @@ from neurocal_cli.calibration import Verdict
 from neurocal_cli.stereo.contradiction import Contradiction
 from neurocal_cli.stereo.evidence import RigEvidence
 from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.stereo.sound_pairs import MOVED, pair_name, describe_faults, describe_move
+from neurocal_cli.stereo.sound_pairs import MOVED, describe_faults, describe_move, pair_name
 from neurocal_cli.verdict.findings import WORDS, Finding, Limit, verdict_of
 
 # Repeated by tests/test_wrong_rigs.py, in which no wrong rig may be good, and by tests/test_rig_verdict.py,
