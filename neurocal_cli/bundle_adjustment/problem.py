@@ -236,7 +236,7 @@ def problem_for(
         fixed |= {"u0", "v0"}
     elif type == 3:
         if intrinsics is None:
-            raise UsageError("type 3 needs the camera's intrinsics; give intrinsics=")
+            raise UsageError("type 3 needs the intrinsics of the camera; give intrinsics=")
         entries = intrinsics.A[ENTRIES]
         if not np.abs(entries[[0, 2]]).min() > 1 / _LARGEST or np.abs(entries).max() > _LARGEST:
             raise InputError(
@@ -341,7 +341,7 @@ def _centre(points: Correspondences, image_center: tuple[float, float] | None) -
 
 def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
     if extrinsics is None:
-        raise UsageError("type 4 needs the pose of each view; give extrinsics=")
+        raise UsageError("type 4 needs the extrinsics of each view; give extrinsics=")
     missing = [name for name in points.view_names if name not in extrinsics]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
