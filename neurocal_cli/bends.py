@@ -1,11 +1,11 @@
-"""A flat board that bends anew in each view: out of its plane, by a quadratic surface of each view's own.
+"""Bends of single views: a flat board that leaves its plane by a different quadratic surface in each view.
 
-A thin sheet bends into cylinders. A shallow one with its axis at the angle phi has the height
+A thin sheet bends into cylinders. A shallow cylinder whose axis has the angle phi has the height
 
-    a (x cos phi + y sin phi)^2 = a/2 (x^2 + y^2) + a/2 cos 2 phi (x^2 - y^2) + a/2 sin 2 phi (2 x y),
+    a (x cos phi + y sin phi)^2 = a/2 (x^2 + y^2) + a/2 cos 2 phi (x^2 - y^2) + a/2 sin 2 phi (2 x y).
 
-so that over all angles the three shapes on the right have variances of 2 : 1 : 1. Less the plane that is
-nearest to each, because a pose makes up for planes, these are the shapes of a view's bend.
+Averaged over all angles, the three shapes on the right have variances in the ratio 2 : 1 : 1. The
+best-fitting plane is subtracted from each shape, because the pose absorbs planes.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ N_SHAPES = 3
 
 @frozen_dataclass(eq=False)
 class Bends:
-    """How the board is bent in each view.
+    """The bend of the board in each view.
 
     Attributes
     ----------
     size : float [world unit]
-        Prior standard deviation of each coefficient: the rms height of boards that are as this one.
+        Prior standard deviation of each coefficient, the expected rms height of a bend.
     names : tuple of str
-        Views.
+        Names of the views.
     coefficients : (V, 3) array [world unit]
-        Of the three shapes, in each view.
+        Coefficients of the three shapes in each view.
     """
 
     size: float
@@ -37,21 +37,21 @@ class Bends:
     coefficients: Array
 
     def of_views(self, names: tuple[str, ...]) -> Array:
-        """(V, 3) coefficients of some views; 0 where a view is not known."""
+        """(V, 3) coefficients of the named views; 0 for unknown views."""
         known = dict(zip(self.names, self.coefficients, strict=True))
         return np.array([known.get(name, np.zeros(N_SHAPES)) for name in names]).reshape(-1, N_SHAPES)
 
     def determined(self, coefficients: Array) -> float:
-        """How many of the coefficients (V, 3) the data determine, where the size is the most probable one.
+        """Effective number of coefficients (V, 3) that the data determine, at the most probable size.
 
-        MacKay's step stays there: of n coefficients w, gamma = |w|^2 / size^2.
+        It follows from the fixed point of MacKay's update: gamma = |w|^2 / size^2 for the coefficients w.
         """
         return float(min((coefficients**2).sum() / self.size**2, coefficients.size))
 
 
 @frozen_dataclass(eq=False)
 class Surface:
-    """The three shapes over the plane of a board.
+    """The three shapes of a bend over the plane of a board.
 
     Attributes
     ----------
@@ -61,9 +61,10 @@ class Surface:
     half : float [world unit]
         Half of the board's longer side.
     times : (3,) array
-        Of x^2 + y^2, x^2 - y^2 and 2 x y, so that coefficients of variance 1 make heights of mean square 1.
+        Factors of x^2 + y^2, x^2 - y^2 and 2 x y, with which coefficients of variance 1 give heights of mean
+        square 1.
     planes : (3, 3) array
-        What is taken from each shape: columns of 1, x and y.
+        The plane subtracted from each shape (columns), as coefficients of 1, x and y (rows).
     """
 
     centre: Array
@@ -73,18 +74,18 @@ class Surface:
     planes: Array
 
     def offsets(self, world: Array) -> Array:
-        """(N, 3, 3) offsets of points (N, 3), in the world's axes, for a coefficient of 1 of each shape."""
+        """(N, 3, 3) offsets of points (N, 3) in world axes, for unit coefficients of the shapes (last)."""
         places = (world - self.centre) @ self.axes[:, :2] / self.half
         heights = _shapes(places) * self.times - _linear(places) @ self.planes
         return np.asarray(self.axes[:, 2, None] * heights[:, None])
 
 
 def surface_of(given: Array) -> Surface:
-    """Shapes for a flat board with these points (n, 3)."""
+    """The shapes for a flat board with the points (n, 3)."""
     centre = given.mean(axis=0)
     normal = np.linalg.svd(given - centre, full_matrices=False)[2][2]
     normal = normal * np.sign(normal[np.argmax(np.abs(normal))])
-    x = np.eye(3)[np.argmin(np.abs(normal))]  # not the principal axes: a square board has none
+    x = np.eye(3)[np.argmin(np.abs(normal))]  # not principal axes: a square board has none
     x = x - (x @ normal) * normal
     x /= np.linalg.norm(x)
     axes = np.column_stack([x, np.cross(normal, x), normal])

@@ -1,4 +1,4 @@
-"""What a calibration returns: the camera, the poses, how sure they are and how they were found."""
+"""`Calibration`, the result: the camera, the poses, their standard deviations and how they were estimated."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from neurocal_cli.target import Target
 
 
 class StopReason(str, Enum):
-    """Why training stopped; the value is the sentence to show."""
+    """Why the estimation stopped; the value is the text shown to the user."""
 
     CONVERGED = "converged: the reprojection error is at a minimum"
     MAX_ITERATIONS = "stopped at the maximum number of iterations before the reprojection error settled"
@@ -31,7 +31,7 @@ class StopReason(str, Enum):
 
 @frozen_dataclass(eq=False)
 class NetworkRecord:
-    """What the training did, kept with the result.
+    """Record of the training, kept with the result.
 
     Attributes
     ----------
@@ -40,19 +40,19 @@ class NetworkRecord:
     V : dict of (3, 4) arrays by view
         Hidden weights; ``[R | t] = s2 V S2`` up to the scale that gamma leaves free.
     S1 : (3, 3) array
-        Normalised to real pixels.
+        From normalised to real pixels.
     S2 : dict of (4, 4) arrays by view
-        Real to normalised world coordinates; ``P = S1 W V S2`` up to scale.
+        From real to normalised world coordinates; ``P = S1 W V S2`` up to scale.
     starts, agreed : int
-        Random starts used, over all views; how many of them ended at the result they agreed on.
+        Number of random starts over all views; least number in any view that ended at its best result.
     iterations : int
         Training iterations (epochs for backprop) of the network, summed over the starts.
     refine_iterations : int
-        Iterations of the last step on the true pixel error (3).
+        Iterations of bundle adjustment on the reprojection error (3).
     loss : float
         Root mean square of the network's error (5) after training [px].
     rmse_before, rmse_after : float
-        Pixel error (3) before and after the last step [px].
+        Reprojection error (3) before and after bundle adjustment [px].
     curve : tuple of float
         Learning curve: loss of the network [px rms] along the training of the best start.
     """
@@ -73,16 +73,16 @@ class NetworkRecord:
 
 @frozen_dataclass
 class StraightLines:
-    """What a lens was found from, where it was found from straight lines alone.
+    """Record of a distortion that was estimated from straight lines alone.
 
     Attributes
     ----------
     n_lines, n_points : int
-        Lines, counted in each view that shows them, and points on them.
+        Number of lines, counted in each view that shows them, and of points on them.
     centre : (u, v) [px]
-        Of distortion.
+        Centre of distortion.
     rms_before, rms_after : float [px]
-        Distance of the points from straight lines as seen, and seen through the lens.
+        Distance of the points from straight lines before and after undistortion.
     """
 
     n_lines: int
@@ -116,17 +116,16 @@ class ViewResult:
 
 @frozen_dataclass(eq=False)
 class Rejected:
-    """Points that were set aside because they contradict the others.
+    """Outliers: points and views that were left out because they contradict the others.
 
     Attributes
     ----------
     points : Correspondences or None
-        With their lines in the file; None when there are none.
+        With their lines in the file; None if there are none.
     error_px : (M,) array [px]
-        How far each is from where the camera sees it; nan where it does not, and in views that were set
-        aside whole.
+        Reprojection error of each point; nan where it has none, and in views that were left out as a whole.
     views : dict of str by view name
-        Views that were set aside whole, each with the reason.
+        Views that were left out as a whole, each with the reason.
     """
 
     points: Correspondences | None = None
@@ -139,18 +138,18 @@ class Rejected:
 
 @frozen_dataclass
 class Verdict:
-    """One word on a calibration, and why.
+    """Verdict on a calibration: one word, with reasons and advice.
 
     Attributes
     ----------
     word : str
         "good", "usable" or "poor".
     reasons : tuple of str
-        What speaks against it, the worst first; none when it is good.
+        What is wrong, the worst first; empty for a good calibration.
     advice : tuple of str
-        What to do next.
+        What to do about it.
     measures : dict of float
-        What it rests on (`verdict.evidence.Evidence`); nan for what cannot be told.
+        The measures behind it (`verdict.evidence.Evidence`); nan if not determined.
     """
 
     word: str
@@ -172,26 +171,26 @@ class Calibration:
         Names of the intrinsic parameters that were given.
     views : dict of ViewResult by view name
     points : Correspondences
-        What it was calibrated from, without what was rejected. Where the target was found with the camera,
-        their world coordinates are those that were found.
+        The points it was calibrated from, without outliers. If the target was estimated with the camera,
+        their world coordinates are the estimated ones.
     rejected : Rejected
     target : Target or None
-        The target as it was found; None where it was taken as given.
+        The estimated target; None if it was used as given.
     target_stretched : float
-        Where the target was chosen as given: the probability that its print is stretched by a few thousandths
-        all the same, which standard deviations count. 0 where it is below 0.001.
+        If the given target was selected: the probability that its print is nevertheless stretched by a few
+        thousandths, which the standard deviations include. 0 if it is below 0.001.
     judgement : Verdict or callable, optional
-        The verdict as a file has it, or what reaches it from this calibration; see `verdict`.
+        The verdict read from a file, or the function that computes it from this calibration; see `verdict`.
     lens_choice : dict of float by lens model [px]
-        The models that ``distortion="auto"`` chose from and their rms error on data left out.
+        The candidate models of ``distortion="auto"`` and their cross-validation errors.
     would_take : frozenset of str
-        Lens models that could have been the result, had they been `preferred`; with any other the result is
-        the same. Not in files.
+        Lens models that would have been selected if they were `preferred`; any other preference has no
+        effect. Not in files.
     covariance : (n, n) array
-        Of the free intrinsic parameters, in the order of `covariance_names`; per-view blocks are
-        in `views`.
+        Of the free intrinsic parameters, in the order of `covariance_names`; `views` holds the standard
+        deviations of the poses.
     warnings : tuple of str
-        What the user should know; printed by the command.
+        Warnings, which the command prints.
     """
 
     intrinsics: Intrinsics
@@ -224,20 +223,17 @@ class Calibration:
 
     @cached_property
     def verdict(self) -> Verdict | None:
-        """What the data say of this calibration beyond its error, reached when it is first read.
-
-        None where it has no points of its own to be judged by.
-        """
+        """Verdict on this calibration, computed when it is first read; None without points of its own."""
         return self.judgement(self) if callable(self.judgement) else self.judgement
 
     @property
     def n_rejected(self) -> int:
-        """Points that were set aside."""
+        """Number of points that were left out."""
         return len(self.rejected)
 
     @property
     def camera(self) -> Camera:
-        """The camera alone."""
+        """The camera without poses and statistics."""
         distortion = Distortion(self.distortion_model, self.distortion)
         return Camera(self.intrinsics, distortion, self.image_size, self.camera_name)
 
@@ -248,9 +244,9 @@ class Calibration:
 
     @property
     def relative_std_of_scale(self) -> float:
-        """Standard deviation of the image's scale over its value, the larger of u and v.
+        """Relative standard deviation of the scale in the image centre, the larger of u and v.
 
-        Of alpha; with a wide lens's xi, of alpha / (1 + xi), the scale in the middle of the image.
+        The scale is alpha, or alpha / (1 + xi) in models with xi.
         """
         shares = [self.std[name] / getattr(self.intrinsics, name) for name in ("alpha_u", "alpha_v")]
         if self.distortion_model in WITH_XI and {"alpha_u", "xi"} <= set(self.covariance_names):
@@ -289,14 +285,14 @@ class Calibration:
 
 
 def camera_of(given: Camera | Calibration | Intrinsics | Array) -> Camera:
-    """Take a camera in any of the forms that users have it in; a matrix has no distortion.
+    """Convert any of the accepted types to a `Camera`; a matrix has no distortion.
 
     Raises
     ------
     UsageError
-        Something else.
+        Another type.
     InputError
-        A matrix that is no camera's.
+        A matrix that is no camera matrix.
     """
     if isinstance(given, Camera):
         return given

@@ -1,9 +1,8 @@
-"""How well a camera predicts where known points are seen: the reprojection error, paper eq. (3).
+"""Evaluation of a camera: its reprojection error, paper eq. (3), on known points.
 
-Points may be those that the camera was calibrated from or others. A view that the calibration does
-not know has no pose yet: its pose is estimated with the intrinsic parameters held fixed (type 3),
-so that the error left is what the intrinsic parameters cannot explain. So is the pose of a view of
-which the calibration knows only the name: another image may have been given the same one.
+The points may be those of the calibration or others. The pose of a new view is estimated with the intrinsic
+parameters held fixed (type 3), so the remaining error is what the camera cannot explain. The same is done for
+a view with a known name that shows another image.
 """
 
 from __future__ import annotations
@@ -23,11 +22,11 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.given_points import GivenPoints
 
-# Most points of the same image lie within these of where the calibration sees them: a user's own noise and
-# small edits do, another image of the board does not. Repeated by tests/test_evaluation.py.
+# In the same image, most points lie within these distances of the calibration's prediction, even after small
+# edits by the user; in another image of the board they do not. Repeated by tests/test_evaluation.py.
 _NEAR_PX = 2.0
 _NEAR = 5.0  # times the rms error of the calibration
-_FEWEST = 4  # points that a pose can be found from
+_FEWEST = 4  # fewest points that determine a pose
 
 
 @frozen_dataclass
@@ -38,11 +37,11 @@ class ViewEvaluation:
     ----------
     n_points : int
     n_behind : int
-        Points that lie on or behind the focal plane; they are in no average.
+        Points on or behind the focal plane; all averages leave them out.
     rmse_px, max_px : float [px]
-        nan when no point lies in front of the camera.
+        nan if no point lies in front of the camera.
     fitted : bool
-        Whether the pose was estimated from these very points.
+        Whether the pose was estimated from these points.
     """
 
     n_points: int
@@ -59,8 +58,7 @@ class CameraEvaluation:
     Attributes
     ----------
     residuals : (N, 2) array [px]
-        Predicted minus observed; nan for points on or behind the focal plane, which are in no
-        average below.
+        Predicted minus observed; nan for points on or behind the focal plane, which all averages leave out.
     n_points, n_behind : int
     rmse_px : float [px]
         ``sqrt(mean(du^2 + dv^2))``.
@@ -73,11 +71,11 @@ class CameraEvaluation:
     views : dict of ViewEvaluation by view name
     warnings : tuple of str
     renamed : tuple of str
-        Fitted views that have the name of a view of the calibration but not its pose.
+        Fitted views that have the name of a view of the calibration, but show another image.
     fit : Calibration or None
         The fitted views, with the camera given.
     on_target : bool
-        Whether points were taken where the calibration found them on its target, not where they were given.
+        Whether the estimated target of the calibration replaced the given world coordinates.
     """
 
     residuals: Array
@@ -102,7 +100,7 @@ class CameraEvaluation:
 
     @property
     def given_points(self) -> GivenPoints:
-        """What a verdict on these points rests on."""
+        """The measures for a verdict on these points."""
         return GivenPoints(self.rmse_px, self.n_points, self.n_behind, self.fit)
 
 
@@ -114,10 +112,10 @@ def evaluate_camera(
     Parameters
     ----------
     calibration : Calibration, Camera or Intrinsics
-        Of a camera without poses, the pose of every view is fitted.
+        For a camera without poses, the pose of every view is fitted.
     points : Correspondences, optional
-        Default: the points that the camera was calibrated from. Points of the target that was found with the
-        camera are taken where they were found.
+        Default: the points of the calibration. If it has estimated its target, points of that target get
+        their estimated coordinates.
 
     Returns
     -------
@@ -126,9 +124,9 @@ def evaluate_camera(
     Raises
     ------
     InputError
-        Points of another image size, or none.
+        The points have another image size, or there are none.
     DegenerateGeometryError
-        A new view whose points do not determine its pose.
+        The points of a new view do not determine its pose.
     """
     warnings: list[str] = []
     poses: dict[str, Pose] = {}
@@ -186,9 +184,9 @@ def refuse_another_size(calibration: Calibration, points: Correspondences) -> No
 
 
 def _other_images(calibration: Calibration, points: Correspondences) -> tuple[str, ...]:
-    """Views named as some of the calibration, of which most points are not where these see them.
+    """Views with the name of a view of the calibration, whose pose does not fit most of their points.
 
-    A view of too few points for a pose of its own keeps the one that it has.
+    A view with too few points for a new pose is not among them.
     """
     known = [name for name in points.view_names if name in calibration.views]
     if not known:
@@ -205,7 +203,7 @@ def _other_images(calibration: Calibration, points: Correspondences) -> tuple[st
 
 
 def _compare_units(calibration: Calibration, points: Correspondences, poses: Mapping[str, Pose]) -> list[str]:
-    """What to warn of where calibrated poses are used for points in another unit."""
+    """Warn if calibrated poses are used for points in another unit."""
     if points.unit == calibration.unit or poses.keys().isdisjoint(points.view_names):
         return []
     return [
@@ -217,8 +215,8 @@ def _compare_units(calibration: Calibration, points: Correspondences, poses: Map
 def _fit_poses(
     camera: Calibration | Camera | Intrinsics, points: Correspondences, seed: int
 ) -> tuple[Calibration, list[str]]:
-    """Type 3: poses of views that the calibration does not know, and what to warn of."""
-    from neurocal_cli.methods import fit_poses  # the trainers: only when there is something to train
+    """Fit the poses of new views (type 3); also the warnings."""
+    from neurocal_cli.methods import fit_poses  # imports the trainers, so only if needed
 
     fit = fit_poses(points, camera, seed)
     warnings = [f"fitting the poses of the new views: {text}" for text in fit.warnings]
@@ -228,7 +226,7 @@ def _fit_poses(
 
 
 def _predict(camera: Camera, poses: list[Pose], points: Correspondences) -> tuple[Array, NDArray[np.bool_]]:
-    """Pixels of all the points, each through the pose of its view, and which lie in front."""
+    """Project all points with the poses of their views; also which points lie in front."""
     R = np.stack([pose.R for pose in poses])[points.view_index]
     t = np.stack([pose.t for pose in poses])[points.view_index]
     return camera.project(np.einsum("nij,nj->ni", R, points.world) + t)

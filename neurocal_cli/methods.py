@@ -1,4 +1,4 @@
-"""`calibrate`: points in, calibrated camera out."""
+"""`calibrate`: from points to a calibrated camera."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ OUTLIERS = ("reject", "keep")
 _STARTS = 20
 _FOUND = ("auto", "plumb-line")  # ways to find a distortion model, not models
 _NOT_FOUND = (
-    "the target stays as given, because these points do not tell another one; it takes three different views "
-    "of most points, and offsets below 2 % of the target's size"
+    "the target stays as given, because these points do not determine its shape; that needs three different "
+    "views of most points, and offsets below 2 % of the target's size"
 )
 _MISFIT = 0.05  # rms error over the rms spread of the pixels: neither noise nor distortion
 
@@ -72,33 +72,33 @@ def calibrate(
         What is given (paper, section 4.1): 1 nothing, 2 the image centre, 3 the intrinsics,
         4 the extrinsics.
     image_center : (u0, v0), optional [px]
-        Type 2; else the one with the points, else the centre of their image size.
+        For type 2. Default: that of the points, else the middle of their image size.
     intrinsics : Camera, Calibration, Intrinsics or (3, 3) array, optional
-        Type 3. The first two bring their distortion with them.
+        For type 3. A Camera or Calibration includes its distortion.
     extrinsics : dict of Pose by view name, optional
-        Type 4.
+        For type 4.
     method : {"neuro", "linear", "nonlinear", "tsai"}
-        The network; or one of the methods that the paper compares it with (`baselines`). These use all
-        points, outliers included, and have no random starts.
+        The network, or one of the methods that the paper compares it with (`baselines`). These use all
+        points, including outliers, and have no random starts.
     trainer : {"lm", "backprop"}
     distortion : {"auto", "plumb-line"} or one of `camera.distortion.MODELS`
-        The distortion model whose coefficients are estimated with everything else; auto: the simplest that
-        the points support (`lens_choice`), with another method none, with tsai k1; plumb-line, the paper's
-        way: k1, k2, p1 and p2 from the images of straight lines alone, then the pinhole camera. Type 3 takes
-        the one of the given camera instead.
+        The distortion model whose coefficients are estimated with all other parameters. "auto" selects the
+        simplest model that the points support (`lens_choice`); with the methods linear and nonlinear it is
+        none, with tsai k1. "plumb-line", the paper's way, estimates k1, k2, p1 and p2 from the images of
+        straight lines alone, then the pinhole camera. Type 3 uses the distortion of the given camera.
     skew : bool
-        False: theta is pi/2.
+        False fixes theta at pi/2.
     outliers : {"reject", "keep"}
-        Whether points, and whole views, that contradict the others are set aside (`outlier_rejection`).
+        Whether points and whole views that contradict the others are left out (`outlier_rejection`).
     seed : int
         Of the random weights; the same seed gives the same result.
     target : {"auto", "given", "flat", "free"} or Target
-        Where the points of the target are: given, as they are given; free, found with the camera; flat,
-        found, but each left in its plane; auto: found where the data ask for it (`target_shape`). A target
-        that was found already: there. Points whose standard deviations are stated (`world_std`) are found by
-        these, unless given.
+        How the target's points are treated: "given" uses them as given; "free" estimates them with the
+        camera; "flat" does so within their plane; "auto" does so if the data support it (`target_shape`). A
+        Target that is known already is used as it is. Points with stated standard deviations (`world_std`)
+        are adjusted within these, unless "given".
     preferred : str
-        With ``distortion="auto"``, a model to take where no other predicts decidedly better, such as that
+        With ``distortion="auto"``, a model to select unless another predicts decidedly better, such as that
         of the other camera of a rig.
     starts : int
         Most random starts for each network, at least 2.
@@ -106,19 +106,19 @@ def calibrate(
         Rates and epochs of the backprop trainer.
     camera_name : str
     progress : callable, optional
-        Called with a stage's name and the share of it that is done.
+        Called with the name of a stage and the completed share of it.
 
     Returns
     -------
     Calibration
-        `converged` is False when training was cut short; everything else is still there.
+        `converged` is False if training ended before it converged; the result is complete all the same.
 
     Raises
     ------
     UsageError
-        Something missing for the type, or an option that does not exist.
+        A parameter that the type needs is missing, or an option does not exist.
     InputError, DegenerateGeometryError
-        Points that cannot give an answer, with the reason.
+        The points do not determine the camera; the message says why.
     """
     known_target = replace(target, bends=None) if isinstance(target, Target) else None
     choice = "given" if isinstance(target, Target) else target
@@ -167,7 +167,7 @@ def calibrate(
         text, copies = str(error), repeated_views(points)
         if copies:
             text += f"; the rows of {len(copies)} of {points.n_views} views are those of another view"
-        # Views and normal matrices do not know the file that the user should look at.
+        # The code that raised this does not know the points' file, so its name is added here.
         if points.lines is not None and not text.startswith(points.source):
             text = f"{points.source}: {text}"
         if text == str(error):
@@ -176,7 +176,7 @@ def calibrate(
 
 
 def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> tuple[Solution, Rejected]:
-    """The network's answer; what is not asked for is not imported, either."""
+    """Fit with the neural method and the chosen options. Imports are local: only what is needed is loaded."""
     if outliers == "reject":
         from neurocal_cli.pipeline.outlier_rejection import fit_robustly
 
@@ -197,7 +197,7 @@ def _solved(problem: Problem, options: Options, outliers: str, choice: str) -> t
 
 
 def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics, seed: int) -> Calibration:
-    """Poses of the views of a given camera from all their points, however badly they fit (type 3).
+    """Estimate the poses of a given camera's views (type 3) from all points, without outlier rejection.
 
     Raises
     ------
@@ -211,7 +211,7 @@ def fit_poses(points: Correspondences, camera: Camera | Calibration | Intrinsics
 
 
 def _distortion_of(method: str, distortion: str) -> str:
-    """The distortion model of a method other than the network's."""
+    """The distortion model for a method other than neuro."""
     if distortion in ("plumb-line", "rich"):
         raise UsageError(f"distortion {distortion} needs the method neuro, but the method is {method}")
     if distortion == "auto":
@@ -220,7 +220,7 @@ def _distortion_of(method: str, distortion: str) -> str:
 
 
 def _about_target(found: Calibration, solution: Solution, choice: str) -> tuple[str, ...]:
-    """What the user should know of a target that stays as given."""
+    """Warnings about a target that stays as given."""
     if choice != "given" and solution.straight_lines is not None:
         from neurocal_cli.pipeline.target_choice import lines_that_are_bent
 
@@ -237,14 +237,14 @@ def _about_target(found: Calibration, solution: Solution, choice: str) -> tuple[
 
 
 def _unused(points: Correspondences, why: str) -> tuple[str, ...]:
-    """Note that the survey's standard deviations play no part."""
+    """Warn that the points' standard deviations are not used."""
     if points.world_std is None:
         return ()
     return (f"the points' standard deviations sX,sY,sZ are not used, because {why}",)
 
 
 def _refuse_misfit(calibration: Calibration) -> None:
-    """A camera that does not fit its points at all is no answer."""
+    """Refuse a camera that does not fit its points at all."""
     spread = np.sqrt(calibration.points.pixels.var(axis=0).sum())
     if calibration.rmse_px < _MISFIT * spread:
         return

@@ -1,4 +1,4 @@
-"""Known points and where they were seen: the data that a calibration learns from."""
+"""`Correspondences`, the input of a calibration: known world points and their pixels."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_ONLY_VIEW = "view"  # the name of the single view of points that name none
-_LARGEST = 1e100  # squares of coordinates beyond this overflow; no camera sees such a point
+_ONLY_VIEW = "view"  # name of the single view if the points name none
+_LARGEST = 1e100  # largest coordinate, so that squares do not overflow
 
 
 @frozen_dataclass(eq=False)
@@ -39,22 +39,22 @@ class Correspondences:
         Columns suu, suv, svv of each pixel's covariance. Only ratios between points matter: the
         noise level itself is estimated from the residuals.
     across : (N, 2) array, optional
-        Direction in the image in which each point was measured by itself, of any length; (0, 0) for one
-        that was measured in both. In the other direction its place comes from other points of the view,
-        as a mid-point's along its edge: not a measurement of its own. None: all in both.
+        Direction in the image in which each point was measured, of any length; (0, 0) for points measured in
+        both directions. In the other direction the position was interpolated from other points of the view,
+        such as that of a mid-point along its edge. None: all were measured in both.
     unit : str
         Of the world coordinates.
     source : str
-        Where the rows come from, for messages.
+        Name of the file or source, for messages.
     lines : (N,) int array, optional
         Line of each row in its file, for messages.
     sources : dict of str by view, optional
         The file of each view where several files were read, for messages.
     world_std : (N, 3) array, optional [world unit]
-        Standard deviation of each world point's X, Y and Z, as a survey states it; 0: exactly there. The
-        same for the same world point in all views. All zero is None.
+        Standard deviation of each world point's X, Y and Z, as a survey states it; 0 means exact. It must be
+        the same for a world point in all views. All zero is None.
     distances : tuple of Distance
-        Measured on the board that the points are of; they hold its scale.
+        Distances measured on the points' board; they determine its scale.
 
     Attributes
     ----------
@@ -66,8 +66,8 @@ class Correspondences:
     Raises
     ------
     InputError
-        Shapes that do not fit, no rows, numbers that are not finite (or beyond 1e100), a
-        covariance that is not positive definite.
+        Shapes do not match, there are no rows, a number is not finite (or beyond 1e100), or a covariance is
+        not positive definite.
     """
 
     world: Array
@@ -134,7 +134,7 @@ class Correspondences:
 
     @classmethod
     def none(cls, image_size: tuple[int, int] | None = None, unit: str = "mm") -> Correspondences:
-        """No points at all, for a camera that was not found from any of its own."""
+        """Empty correspondences, for a camera without points of its own."""
         empty = cls(np.zeros((1, 3)), np.zeros((1, 2)), image_size=image_size, unit=unit)
         empty._set(world=_frozen(np.zeros((0, 3))), pixels=_frozen(np.zeros((0, 2))))
         empty._set(view_names=(), view_index=_frozen(np.zeros(0, dtype=np.int64)))
@@ -154,7 +154,7 @@ class Correspondences:
         return len(self.view_names)
 
     def place(self, row: int) -> str:
-        """Where a row came from, ``file:line`` or ``points, row 7``."""
+        """Origin of a row, as ``file:line`` or ``points, row 7``."""
         if self.lines is not None:
             source = self.source
             if self.sources is not None and self.view is not None:
@@ -163,7 +163,7 @@ class Correspondences:
         return f"{self.source}, row {row + 1}"
 
     def of_few_views(self, most: int) -> Correspondences:
-        """The points of at most so many views, which lie evenly among all."""
+        """The points of at most `most` views, evenly spaced among all."""
         if self.n_views <= most:
             return self
         return self.select(np.isin(self.view_index, np.linspace(0, self.n_views - 1, most).round()))
@@ -243,7 +243,7 @@ class Correspondences:
 
 def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
     try:
-        # A copy, so that nobody else writes into it; of a million rows only if anybody could.
+        # Copy the array, unless nobody else can write to it: it may have a million rows.
         shared = not isinstance(values, np.ndarray) or values.flags.writeable or values.base is not None
         array = np.array(values, dtype=float) if shared else np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
@@ -254,7 +254,7 @@ def _matrix(name: str, values: ArrayLike, columns: int) -> Array:
 
 
 def _pair(values: ArrayLike) -> tuple[float, float]:
-    """Two numbers; nan for whatever is not."""
+    """Convert to two numbers; nan if that fails."""
     try:
         first, second = np.array(values, dtype=float)
         return float(first), float(second)
@@ -272,7 +272,7 @@ def _factorise(
 ) -> tuple[tuple[str, ...], NDArray[np.int64]]:
     """Names in order of first appearance and each row's position among them.
 
-    Rows of a view mostly stand together, so only the first row of each run is sorted.
+    Rows of a view are mostly consecutive, so only the first row of each run is sorted.
     """
     if labels is None:
         return (_ONLY_VIEW,), np.zeros(n, dtype=np.int64)

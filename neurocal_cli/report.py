@@ -1,7 +1,7 @@
-"""Results as plain text: what a calibration found, how well a camera fits.
+"""Results as plain text and JSON: the summary of a calibration, and the errors of a camera on points.
 
-A value is rounded by its standard deviation: the deviation keeps two significant digits and the
-value the same decimals, so that no digit is shown that means nothing.
+Values are rounded by their standard deviation: it keeps two significant digits, and the value has the same
+number of decimals, so that no meaningless digit is shown.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from neurocal_cli.verdict.report import verdict_json, verdict_lines
 if TYPE_CHECKING:
     from neurocal_cli.evaluation import CameraEvaluation
 
-_MOST_VIEWS = 20  # rows of a table that still fit on a screen
-_MOST_DECIMALS = 9  # digits beyond these are noise of the arithmetic, not of the data
+_MOST_VIEWS = 20  # rows of a table that fit on a screen
+_MOST_DECIMALS = 9  # further digits are rounding errors
 _GIVEN = {
     1: "nothing given",
     2: "image centre given",
@@ -33,7 +33,7 @@ _GIVEN = {
 
 
 def rounded(value: float, std: float) -> tuple[str, str]:
-    """Write a value and its standard deviation, both to the deviation's second digit.
+    """Format a value and its standard deviation, both to the deviation's second significant digit.
 
     Examples
     --------
@@ -65,10 +65,7 @@ def align(rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def calibration_report(calibration: Calibration) -> str:
-    """Summary of a calibration: parameters, views, fit, how the training went, the verdict.
-
-    Warnings are not in it.
-    """
+    """Summary of a calibration: parameters, views, fit, training and verdict, without the warnings."""
     blocks = [
         [_headline(calibration)],
         align(parameter_rows(calibration)),
@@ -84,7 +81,7 @@ def calibration_report(calibration: Calibration) -> str:
 
 
 def target_lines(target: Target | None, unit: str) -> list[str]:
-    """The target that was found, in a line or two; none where it was taken as given."""
+    """The estimated target in one or two lines; none if it was used as given."""
     if target is None:
         return []
     unit = "units" if unit == "unknown" else printable(unit)
@@ -118,9 +115,9 @@ def _surveyed_line(target: Target, unit: str) -> str:
     held = int((target.stated == 0).all(axis=1).sum()) if target.stated is not None else 0
     exact = f"; {plural(held, 'point')} of {len(target.found)} held" if held else ""
     factor = target.sizes["stated"]
-    taken = "" if factor == 1 else f" taken {factor:.2g} times as large, as the residuals ask for"
+    taken = "" if factor == 1 else f", scaled by {factor:.2g} to match the residuals"
     return (
-        f"surveyed points: found {found:.2g} {unit} rms from where they were stated, by their "
+        f"surveyed points: found {found:.2g} {unit} rms from where they were stated, by their stated "
         f"standard deviations{taken}{exact}"
     )
 
@@ -142,7 +139,7 @@ def evaluation_tables(evaluation: CameraEvaluation) -> tuple[list[list[str]], li
 
 
 def evaluation_json(evaluation: CameraEvaluation, verdict: Verdict | None = None) -> dict[str, Any]:
-    """Turn an evaluation into values that JSON can hold; a number that does not exist is None."""
+    """Convert an evaluation to JSON values; numbers that are not finite become None."""
     names = ("rmse_px", "max_px", "rms_u", "rms_v", "bias_u", "bias_v")
     return {
         "n_points": evaluation.n_points,
@@ -155,7 +152,7 @@ def evaluation_json(evaluation: CameraEvaluation, verdict: Verdict | None = None
 
 
 def calibration_json(calibration: Calibration) -> dict[str, Any]:
-    """Turn the summary of a calibration into values that JSON can hold; see `evaluation_json`."""
+    """Convert the summary of a calibration to JSON values; see `evaluation_json`."""
     verdict = calibration.verdict
     return {
         "camera_name": calibration.camera_name,
@@ -193,7 +190,7 @@ def _parameters_json(calibration: Calibration) -> dict[str, Any]:
 
 
 def target_json(target: Target | None, unit: str) -> dict[str, Any] | None:
-    """Turn the target that was found into values that JSON can hold; None where it was taken as given."""
+    """Convert the estimated target to JSON values; None if it was used as given."""
     if target is None:
         return None
     return {
@@ -215,18 +212,18 @@ def number_or_none(value: float) -> float | None:
 
 
 def _bias(value: float, rms: float) -> str:
-    """To the digits of the rms error that it is part of: what is smaller is rounding."""
+    """Format a mean residual with the decimals of the rms error of the same axis."""
     if not (math.isfinite(value) and math.isfinite(rms)):
         return "-"
     text = _pixels(rms)
     if "e" in text:
         return f"{value:+.1e}"
     decimals = len(text.partition(".")[2])
-    return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0: no minus before a zero
+    return f"{round(value, decimals) + 0.0:+.{decimals}f}"  # + 0.0 avoids -0
 
 
 def _pixels(value: float) -> str:
-    """Four significant digits, without an exponent for all but tiny errors."""
+    """Format a pixel error with about four significant digits; only tiny errors have an exponent."""
     if not math.isfinite(value):
         return "-"
     if value != 0 and abs(value) < 1e-4:
@@ -236,7 +233,7 @@ def _pixels(value: float) -> str:
 
 
 def printable(name: str) -> str:
-    """The name on one line, whatever characters a file put in it."""
+    """The name as printable text on one line, with other characters escaped."""
     return name if name.isprintable() else ascii(name)[1:-1]
 
 
@@ -256,7 +253,7 @@ def _headline(calibration: Calibration) -> str:
 
 
 def parameter_rows(calibration: Calibration) -> list[list[str]]:
-    """Rows of the intrinsic parameters, and of the pose as well when there is only one view."""
+    """Rows of the intrinsic parameters, and of the pose if there is only one view."""
     rows = [["parameter", "value", "std", "relative"]]
     for name in INTRINSIC_NAMES:
         unit = "rad" if name == "theta" else "px"
@@ -279,7 +276,7 @@ def parameter_rows(calibration: Calibration) -> list[list[str]]:
 
 
 def _displacement_row(calibration: Calibration) -> list[str]:
-    """A rich lens's nodes in one line: how far they move the points that were seen, at most [px]."""
+    """One row for all nodes of a rich lens: their largest displacement at the observed points [px]."""
     rays = calibration.camera.unproject(calibration.points.pixels)
     k = calibration.distortion[-len(rich_lens.NAMES) :]
     X, Y, Z = rays[np.isfinite(rays[:, 0])].T
@@ -297,7 +294,7 @@ def _parameter_row(name: str, unit: str, value: float, std: float, given: bool) 
 
 
 def _view_lines(views: Any) -> list[str]:
-    """Each view's error, in the order of the data, or the worst ones when there are many."""
+    """Error of each view in the order of the data, or the largest errors if there are many views."""
     if len(views) == 1:
         return []
     shown: list[tuple[str, ViewResult]] = list(views.items())
@@ -324,7 +321,7 @@ def _training_lines(calibration: Calibration) -> list[str]:
 
 
 def _lens_lines(calibration: Calibration) -> list[str]:
-    """What the lens model was chosen from, best first."""
+    """The candidates of the model selection with their cross-validation errors, best first."""
     choice = calibration.lens_choice
     if not choice:
         return []

@@ -1,4 +1,4 @@
-"""The target as a calibration found it: where its points really are, beside where the file has them."""
+"""`Target`, the estimated shape of a target: the true positions of its points besides the given ones."""
 
 from __future__ import annotations
 
@@ -21,37 +21,38 @@ if TYPE_CHECKING:
 
 TARGETS = ("auto", "given", "flat", "free")
 
-_DIGITS = 9  # of a coordinate over the target's size: the same point is written alike in all views
-_THIN = 1e-6  # of the size: a plane up to rounding
+_DIGITS = 9  # digits, relative to the target's size, to which coordinates of the same point agree
+_THIN = 1e-6  # thickness of a plane up to rounding, relative to its size
 
 
 @frozen_dataclass(eq=False)
 class Target:
-    """Points of a target, given and found.
+    """Points of a target, given and estimated.
 
-    What no photograph tells is kept from the given points: the found ones are turned, moved and scaled as a
-    whole so that they are nearest to them.
+    Images determine the shape only up to a similarity transformation. Therefore the estimated points are
+    rotated, moved and scaled as a whole to be nearest to the given ones.
 
     Attributes
     ----------
     given, found : (n, 3) array [world unit]
     std : (n, 3) array [world unit]
-        Standard deviations of the found ones, along the world's axes.
+        Standard deviations of the estimated points, along the world's axes.
     plane : (n,) int array
-        Which of the target's planes each point belongs to.
+        Index of the plane of the target to which each point belongs.
     sizes : dict of float [world unit]
-        Prior standard deviation of each part of the offsets, as the data tell it; see `target_shape.prior`.
+        Prior standard deviation of each part of the offsets, estimated from the data; see
+        `target_shape.prior`.
     flat : bool
-        Whether points were left in their plane.
+        Whether the points were kept in their plane.
     evidence : float
-        By how much the found target raises the logarithm of the evidence.
+        Gain in log evidence (marginal likelihood) over the given target.
     point : (n,) labels, optional
         Ids.
     stated : (n, 3) array, optional [world unit]
-        Standard deviations of the given points, where a survey states them. The found ones are then nearest
-        to the given ones by these, and `sizes` has the factor that they are taken with.
+        Standard deviations of the given points, if a survey states them. They then weight the distances from
+        the given points, and `sizes` holds the factor by which they were scaled.
     bends : Bends, optional
-        In each view beside what is found, of a board that bends anew each time.
+        Additional bend in each view, for a board that bends differently each time.
     """
 
     given: Array
@@ -67,43 +68,43 @@ class Target:
 
     @property
     def offsets(self) -> Array:
-        """(n, 3) found less given [world unit]."""
+        """(n, 3) found minus given [world unit]."""
         return self.found - self.given
 
     @property
     def only_bends(self) -> bool:
-        """Whether the points are where they are given, but for the bends of each view."""
+        """Whether the points stay as given except for the bends of single views."""
         return self.bends is not None and not self.offsets.any()
 
     def places(self, world: Array) -> NDArray[np.intp]:
-        """(N,) which of the target's points some world points are, by their given coordinates; -1: none."""
+        """(N,) index of the target point with the same given coordinates as each world point; -1: none."""
         return _places(self.given, world)
 
     def rows_of(self, world: Array) -> NDArray[np.intp]:
-        """The same by the coordinates that were found."""
+        """(N,) index of the target point with the same estimated coordinates; -1: none."""
         return _places(self.found, world)
 
     def applied(self, points: Correspondences) -> Correspondences:
-        """Points with the coordinates that all views share, where they are points of this target."""
+        """Points of this target moved to their estimated coordinates, without the bends of single views."""
         place = self.places(points.world)
         world = np.where((place >= 0)[:, None], self.found[place], points.world)
         return points if (place < 0).all() else replace(points, world=world)
 
     def seen(self, points: Correspondences) -> Correspondences:
-        """The same, as they were in each view from which the target was found."""
+        """Points of this target moved to their estimated coordinates, with the bend of each view."""
         found = self.applied(points)
         bent = (self.places(points.world) >= 0)[:, None] * self._bend(found)
         return found if self.bends is None else replace(found, world=found.world + bent)
 
     def straightened(self, points: Correspondences) -> Correspondences:
-        """Points as they were in each view, with the coordinates that all views share."""
+        """Estimated points with the bend of each view removed."""
         if self.bends is None:
             return points
         world = points.world - self._bend(points)
         return replace(points, world=np.where((self.rows_of(world) >= 0)[:, None], world, points.world))
 
     def as_given(self, points: Correspondences) -> Correspondences:
-        """The inverse of `seen`."""
+        """Points moved back to their given coordinates: the inverse of `seen`."""
         place = self.rows_of(self.straightened(points).world)
         world = np.where((place >= 0)[:, None], self.given[place], points.world)
         return points if (place < 0).all() else replace(points, world=world)
@@ -116,20 +117,20 @@ class Target:
         return np.asarray((self._shapes(points.world) @ by_view[..., None])[..., 0])
 
     def _shapes(self, world: Array) -> Array:
-        """(N, 3, 3) offsets of points for a coefficient of 1 of each shape of a bend."""
+        """(N, 3, 3) offsets of points for a unit coefficient of each shape of a bend."""
         from neurocal_cli.bends import surface_of
 
         return surface_of(self.given).offsets(world)
 
     def bend_of_views(self) -> float:
-        """Rms height over points and views by which the board is bent anew [world unit]; 0: not at all."""
+        """Rms height of the bends of single views, over points and views [world unit]; 0 without bends."""
         if self.bends is None:
             return 0.0
         heights = self._shapes(self.found) @ self.bends.coefficients.T  # (n, 3, V)
         return float(np.sqrt((heights**2).sum(axis=1).mean()))
 
     def joined(self, other: Target) -> Target:
-        """One target from two that were found apart: their mean where both have a point."""
+        """Merge two separately estimated targets: the mean for points of both."""
         place = self.places(other.given)
         both, new = np.flatnonzero(place >= 0), np.flatnonzero(place < 0)
         found, std = self.found.copy(), self.std.copy()
@@ -152,7 +153,7 @@ class Target:
         )
 
     def bend(self) -> float:
-        """Most by which a plane's points lie above and below their mean plane, together [world unit]."""
+        """Height between the highest and lowest point over the mean plane, of the worst plane [world]."""
         worst = 0.0
         for plane in range(int(self.plane.max()) + 1):
             local, _ = _in_plane(self.found[self.plane == plane], self.given[self.plane == plane])
@@ -162,7 +163,7 @@ class Target:
         return worst
 
     def stretch(self) -> float:
-        """By which share the most stretched plane is longer along one direction than across it."""
+        """Anisotropic stretch of the worst plane: ratio of its two principal scales, minus 1."""
         worst = 0.0
         for plane in range(int(self.plane.max()) + 1):
             found, given = _in_plane(self.found[self.plane == plane], self.given[self.plane == plane])
@@ -174,14 +175,14 @@ class Target:
 
 
 def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) -> Board:
-    """The chessboard that a target is, with its points as they were found.
+    """Convert a target that is a chessboard to a `Board` with its estimated points.
 
     Parameters
     ----------
     target : Target
     unit : str
     distances : tuple of Distance
-        Measured on it.
+        Distances measured on it.
 
     Raises
     ------
@@ -190,7 +191,7 @@ def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) ->
     """
     if target.point is None:
         raise InputError(
-            "the points have no ids, so they are no board's; calibrate from points that detect found"
+            "the points have no ids of a board; calibrate from points found by `neurocal detect`"
         )
     from neurocal_cli.board import Board
 
@@ -202,12 +203,12 @@ def board_of(target: Target, unit: str, distances: tuple[Distance, ...] = ()) ->
 
 
 def scale_of(points: Correspondences) -> Scale:
-    """What the distances that came with points say of the scale of these points.
+    """The scale of the points according to the distances measured on their board.
 
     Raises
     ------
     InputError
-        Points or distances that are of no chessboard.
+        The points or distances do not belong to a chessboard.
     """
     if not points.distances:
         return NO_SCALE
@@ -216,7 +217,7 @@ def scale_of(points: Correspondences) -> Scale:
 
 
 def scale_of_points(world: Array, ids: NDArray[np.str_] | None, distances: tuple[Distance, ...]) -> Scale:
-    """The same of the different points (n, 3) of a target with their ids."""
+    """The same for the distinct points (n, 3) of a target with their ids."""
     if not distances or ids is None:
         return NO_SCALE
     from neurocal_cli.board import smooth_between
@@ -242,7 +243,7 @@ def _place(label: str) -> tuple[str, tuple[float, float]]:
     name, _, place = label.rpartition("/")
     *kind, c, r = place.split(":") if place.count(":") in (1, 2) else ("?", "", "")
     half = {(): (0.0, 0.0), ("h",): (0.5, 0.0), ("v",): (0.0, 0.5)}.get(tuple(kind))
-    # -1 names the edges to the rim before the first vertices.
+    # -1 names the edges between the board's rim and the first vertices.
     if half is None or not (c.removeprefix("-").isdecimal() and r.removeprefix("-").isdecimal()):
         raise InputError(f"the point {label!r} has no id of a chessboard; calibrate from points of detect")
     return name, (int(c) + half[0], int(r) + half[1])
@@ -263,7 +264,7 @@ def _plane(name: str, rows: list[tuple[tuple[float, float], Array, Array]]) -> P
 
 
 def _size(places: Array) -> int:
-    """Number of vertices in a row, by the places of points; those between two vertices may be at the rim."""
+    """Number of vertices in a row, from grid coordinates of points; half coordinates may be at the rim."""
     whole = places[places == np.rint(places)]
     return int(whole.max() if len(whole) else np.ceil(places.max())) + 1
 
@@ -271,7 +272,7 @@ def _size(places: Array) -> int:
 def distinct_points(
     some: Sequence[Correspondences],
 ) -> tuple[Array, NDArray[np.intp], NDArray[np.str_] | None]:
-    """The different world points (n, 3), which of them each row is (N,), and their ids, if all have one."""
+    """The distinct world points (n, 3), the index of each row's point (N,), and the ids, if all have one."""
     world = np.concatenate([points.world for points in some])
     first, label = distinct_rows(_whole(world, _scale(world)))
     ids = None
@@ -281,7 +282,7 @@ def distinct_points(
 
 
 def planes_of(given: Array, point: NDArray[np.str_] | None) -> NDArray[np.intp]:
-    """Plane (N,) of each point given (N, 3): what its id says before a slash, else all are of one."""
+    """Plane index (N,) of each given point (N, 3), by the name before the slash in its id; else one plane."""
     one = np.zeros(len(given), dtype=np.intp)
     if point is None or not np.char.count(point, "/").astype(bool).all():
         return one
@@ -298,7 +299,7 @@ def is_flat(given: Array) -> bool:
 
 
 def _in_plane(found: Array, given: Array) -> tuple[Array, Array]:
-    """Both around their centres, along the principal axes of the given ones."""
+    """Both sets of points relative to their centres, along the principal axes of the given ones."""
     centred = given - given.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2].T
     return (found - found.mean(axis=0)) @ axes, centred @ axes
@@ -313,7 +314,7 @@ def _places(known: Array, world: Array) -> NDArray[np.intp]:
 
 
 def _scale(world: Array) -> float:
-    """The last digit that tells points apart [world unit]."""
+    """Resolution to which coordinates of the same point agree [world unit]."""
     size = float(np.ptp(world, axis=0).max()) if len(world) else 1.0
     return float(10.0 ** (np.ceil(np.log10(size)) - _DIGITS)) if size > 0 else 1.0
 

@@ -47,7 +47,7 @@ def test_points_whose_sigma_is_too_small_are_no_outliers() -> None:
     found = calibrate(with_sigma(0.2 * 10 ** np.random.default_rng(5).uniform(-1, 1, len(POINTS))))
     assert found.n_rejected < 10
     assert found.verdict is not None
-    assert "the stated sigmas say nothing of the residuals" in found.verdict.reasons
+    assert "the stated sigmas do not predict the residuals" in found.verdict.reasons
 
 
 @pytest.mark.parametrize("by_view", slow_but((False,), (True, False)))

@@ -108,7 +108,7 @@ def test_a_survey_that_is_wrong_about_itself_is_told_so_and_does_no_harm(stated:
     assert wrong.std["alpha_u"] == pytest.approx(right.std["alpha_u"], rel=0.1)
     assert wrong.verdict is not None
     assert wrong.verdict.word == "usable"
-    (reason,) = [text for text in wrong.verdict.reasons if text.endswith("as the residuals ask for")]
+    (reason,) = [text for text in wrong.verdict.reasons if text.endswith("to match the residuals")]
     times, size = re.search(r"points are ([0-9.]+) times too (\w+)", reason).groups()
     assert size == said
     assert 8 < float(times) < 12.5

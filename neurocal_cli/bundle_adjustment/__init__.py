@@ -1,1 +1,1 @@
-"""The pixel error (3) of all views: its unknowns, minimum and covariance, and what parts of the data say."""
+"""Bundle adjustment: minimum of the reprojection error (3), covariance, cross-validation, observability."""

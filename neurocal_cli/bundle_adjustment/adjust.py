@@ -1,11 +1,11 @@
-"""Bundle adjustment: the reprojection error (3), with exact rotations, at its minimum.
+"""Bundle adjustment: minimise the reprojection error (3) with exact rotations.
 
     E = sum_k sum_i |m_ki - pi(A (R_k M_i + t_k))|^2
 
-over the free entries of A and the distortion coefficients, shared by all views, and one pose for each
-view. Rotations move by R -> exp(omega) R, so they stay rotations. `least_squares` descends: views that
-share unknowns are one group, whose poses are eliminated view by view (Schur complement), so the cost
-grows linearly with the views; views that share nothing are a group each.
+The unknowns are the free entries of A and the distortion coefficients, shared by all views, and one pose for
+each view. Rotations are updated as R -> exp(omega) R, so they stay rotations. `least_squares` runs the
+descent. Views that share unknowns form one group; its poses are eliminated view by view (Schur complement),
+so the work grows linearly with the number of views. Views that share nothing are a group each.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from neurocal_cli.least_squares.schur_complement import schur_step
 # A share of 1e-9 of the cost is 2e-4 standard deviations of one of ten unknowns for a thousand equations.
 # test_refine.py holds the minimum against SciPy's.
 OPTIONS = DescentOptions(damping=1e-4, tolerance=1e-9, flat=1e-6, max_iterations=200)
-FLOOR = 1e-13  # rms in normalised pixels that rounding alone accounts for
+FLOOR = 1e-13  # rms in normalised pixels that rounding alone can cause
 
-# Equations on the camera beside those of the points: derivatives (m, 5 + K), and what is missing (m,).
+# Extra equations on the shared camera, such as a prior: Jacobian (m, 5 + K) and residuals (m,).
 Restraint = Callable[[CameraState], tuple[Array, Array]]
 
 
@@ -46,7 +46,7 @@ class Adjusted:
         Sum of squared (whitened) residuals of each view.
     iterations : int
     each_settled : bool array
-        Whether it converged: of each independent problem, or one for all views together.
+        Whether each independent problem converged; a single value if all views are one problem.
     """
 
     state: CameraState
@@ -57,7 +57,7 @@ class Adjusted:
 
     @property
     def converged(self) -> bool:
-        """Whether all did."""
+        """Whether all problems converged."""
         return bool(self.each_settled.all())
 
 
@@ -69,22 +69,22 @@ def adjust(
     max_iterations: int = OPTIONS.max_iterations,
     restraint: Restraint | None = None,
 ) -> Adjusted:
-    """Minimise the reprojection error (3) from a start that is already near.
+    """Minimise the reprojection error (3) from a start near the minimum.
 
     Parameters
     ----------
     batches : PointBatches
     start : CameraState
-        With all points in front of the camera.
+        All points must lie in front of the camera.
     free : (5 + K,) bool array
-        Which entries of A and distortion coefficients move. With none free, or with a camera for
-        each view, the views are independent problems, solved side by side, each with its own damping.
+        Which entries of A and distortion coefficients are estimated. If none is, or if each view has its
+        own camera, the views are independent problems, solved side by side, each with its own damping.
     free_pose : bool
-        Whether the poses move.
+        Whether the poses are estimated.
     max_iterations : int
     restraint : callable, optional
-        Of a camera that is shared: squares to be added to those of the pixels; the result's `normal` and
-        `cost` are of the pixels alone.
+        Extra residuals on the shared camera, whose squares are added to those of the pixels. The result's
+        `normal` and `cost` contain the pixels alone.
     """
     problem = _Reprojection(batches, start, free, free_pose, restraint)
     options = replace(OPTIONS, max_iterations=max_iterations)
@@ -101,9 +101,9 @@ _Trial = tuple[CameraState, Array]  # a state and its normal matrices
 
 
 class _Reprojection:
-    """The reprojection error as `least_squares` sees it.
+    """The reprojection error as a `LeastSquaresProblem`.
 
-    All views together are one group when they share what is sought; else each view is one.
+    All views together are one group if they share unknowns; otherwise each view is a group.
     """
 
     def __init__(
@@ -115,7 +115,7 @@ class _Reprojection:
         restraint: Restraint | None,
     ) -> None:
         self.batches, self.state, self.restraint = batches, start, restraint
-        # Columns of the camera's parameters, and the places of the free ones among them.
+        # Columns of the camera's parameters, and indices of the free ones among them.
         self.camera = camera_columns(start.k.shape[-1])
         self.free, self.free_pose = np.flatnonzero(free), free_pose
         self.shared, self.pose = self.camera[self.free], np.arange(POSE.start, POSE.stop)
@@ -133,7 +133,7 @@ class _Reprojection:
         return by_view.sum(keepdims=True) if self.together else by_view
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
-        """Steps of the cameras and the poses, and the gains that they promise."""
+        """Steps of the cameras and the poses, and their predicted gains."""
         if not self.together:
             return self._solve_apart(self.normal, damping, active)
         if not self.free_pose:
@@ -144,7 +144,10 @@ class _Reprojection:
         return self._solve_together(float(damping[0]))
 
     def move(self, step: _Step, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
-        """The state after a step, with all points in front of their cameras and none folded back."""
+        """The state after a step, its costs, and whether it is valid.
+
+        It is if all points lie in front of their cameras, where the distortion is monotonic.
+        """
         trial = self.state.moved(*step)
         normal, by_view = self._blocks(trial)
         sensible = np.array([by_view.all()]) if self.together else by_view
@@ -155,7 +158,7 @@ class _Reprojection:
         return (trial, normal), cost, sensible
 
     def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Take over the groups that became better."""
+        """Accept the trial for the groups that improved."""
         if not better.any():
             return
         state, normal = trial
@@ -181,11 +184,11 @@ class _Reprojection:
             by_camera, missing = self.restraint(state)
             rows = np.zeros((len(missing), normal.shape[-1]))
             rows[:, self.camera], rows[:, -1] = by_camera, missing
-            normal[0] += rows.T @ rows  # of any view: the camera is that of all
+            normal[0] += rows.T @ rows  # any view will do, because all share the camera
         return normal, sensible
 
     def _solve_apart(self, N: Array, damping: Array, active: NDArray[np.intp]) -> tuple[_Step, Array]:
-        """Each group has its own unknowns; those that have ended stay where they are."""
+        """Steps of groups with unknowns of their own; groups that have ended do not move."""
         columns, moving = self.columns, N if len(active) == len(N) else N[active]
         H, g = moving[:, columns[:, None], columns], moving[:, columns, -1]
         step, promised = damped_step(H, g, damping)

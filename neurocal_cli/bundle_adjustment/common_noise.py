@@ -1,22 +1,21 @@
-"""What the points' stated covariances leave out: errors that are alike for all points.
+"""Noise that the stated covariances of the points leave out because it is common to all points.
 
-A detector knows how sharply it sees each point, not how far the target's squares or the camera's model
-are off. Where that is the larger error, weighing points by the stated covariances C alone lets the sharpest
-few points decide everything. So the noise is taken for
+A detector knows how sharply it sees each point, but not the errors of the target or of the camera model. If
+those dominate, weights from the stated covariances C alone let the few sharpest points decide the result. So
+the noise is modelled as
 
     k ((1 - m) C + m c I),   c the mean variance of C,
 
-k being the residuals' level. As long as they do not contradict it, m is 0; otherwise it is the largest
-share that they do not contradict: too much weight for a few points costs more than too little. Where C says
-nothing of the residuals, m is 1 and all points count the same.
+where k is the level of the residuals. If the residuals do not contradict m = 0, m is 0. Otherwise it is the
+largest m that they do not contradict, because overweighting a few points does more harm than underweighting
+them. If C does not predict the residuals at all, m is 1 and all points have equal weight.
 
-Covariances that are round for every point (a column ``sigma``) are weights that somebody chose: they are
-taken as they are.
+Isotropic covariances (a column ``sigma``) are weights that the user chose; they are used as they are.
 
-Of points measured across edges (`measured_directions`) C and the residuals count there. Their covariances are
-those of the measurement and of the board's unevenness. Where k is 4 and more, most of the residuals is
-of a target or a lens that are not as modelled, which shows along the edges as much as across: all points
-then count the same in both directions, and up to k = 2 as they were measured.
+For points measured across edges (`measured_directions`), C and the residuals are those across the edge. Their
+covariances contain the measurement noise and the board's unevenness. If k is 4 or more, most of the residuals
+are model errors of the target or the lens, which appear along the edges as much as across them: then all
+points are weighted equally in both directions. Up to k = 2 they are weighted as measured.
 """
 
 from __future__ import annotations
@@ -38,23 +37,23 @@ from neurocal_cli.geometry import Array
 # Repeated by tests/test_common_noise.py and tests/test_measured_directions.py: with these, true covariances
 # lower the errors of the camera and wrong ones do no harm; boards that are not flat have levels of 4 and
 # more, rendered ones of about 1.
-_MOST_POINTS = 20000  # enough to tell a share to a percent
+_MOST_POINTS = 20000  # enough to estimate the share to a percent
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 _STEPS = 12  # of golden section and of bisection
 _CONTRADICTED = 3.0  # standard deviations
-_MEASURED, _MISFIT = 2.0, 4.0  # levels up to and from which residuals are and are not the measurement's
+_MEASURED, _MISFIT = 2.0, 4.0  # levels: measurement noise up to the first, model error from the second
 
 
 @frozen_dataclass
 class Noise:
-    """How far stated covariances are believed.
+    """How far the stated covariances are trusted.
 
     Attributes
     ----------
     share : float
-        m, what is the same for all points.
+        m, the share of the noise that is common to all points.
     along : float
-        Say along their edges of points that were measured across them.
+        Weight along the edge of points measured across it.
     """
 
     share: float = 0.0
@@ -62,7 +61,7 @@ class Noise:
 
 
 def noise_of(covariance: Array, residuals: Array, across: Array | None) -> Noise:
-    """What the residuals of a fit bear out.
+    """The noise model that the residuals of a fit support.
 
     Parameters
     ----------
@@ -84,13 +83,13 @@ def noise_of(covariance: Array, residuals: Array, across: Array | None) -> Noise
 
 
 def measured(covariance: Array) -> bool:
-    """Whether covariances (N, 3) are measured ones: not round for every point."""
+    """Whether covariances (N, 3) are measured ones, that is, not all isotropic."""
     suu, suv, svv = covariance.T
     return bool((suv != 0).any() or (suu != svv).any())
 
 
 def with_common_share(covariance: Array, share: float, across: Array | None = None) -> Array:
-    """Covariances (N, 3) of the same mean with a share that is the same for all points.
+    """Covariances (N, 3) with the same mean and a share `m` common to all points.
 
     Parameters
     ----------
@@ -109,14 +108,14 @@ def with_common_share(covariance: Array, share: float, across: Array | None = No
 
 
 def common_share(covariance: Array, residuals: Array, across: Array | None = None) -> float:
-    """The share of the noise that is the same for all points, as the residuals have it.
+    """Share of the noise that is common to all points, estimated from residuals by maximum likelihood.
 
     Parameters
     ----------
     covariance : (N, 3) array
         suu, suv, svv as stated, any unit.
     residuals : (N, 2) array
-        Of a fit, any unit.
+        Residuals of a fit, any unit.
     across : (N, 2) array, optional
         Direction in which each point was measured.
     """
@@ -151,10 +150,10 @@ def common_share(covariance: Array, residuals: Array, across: Array | None = Non
 
 
 def _unlikelihood(covariance: Array, residuals: Array, across: Array | None) -> Callable[[float], float]:
-    """The negative log-likelihood of a point by the share, but for a constant, the level k at its best.
+    """Mean negative log-likelihood per point as a function of the share, up to a constant.
 
-    With covariances as `with_common_share` has them. Points that were measured in one direction have one
-    variance, the others two by two.
+    The level k is at its optimum. The covariances are those of `with_common_share`. Points measured in one
+    direction have a scalar variance, the others a 2 x 2 covariance.
     """
     if across is None:
         own, one = 0.5 * (covariance[:, 0] + covariance[:, 2]), np.zeros(len(covariance), dtype=bool)

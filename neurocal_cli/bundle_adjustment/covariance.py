@@ -1,8 +1,8 @@
 """Covariance of the estimated parameters: the inverse normal matrix times the residual variance.
 
-For Gaussian noise this is the Cramer-Rao bound at the estimate. The intrinsics' block comes from
-the Schur complement over the views, each pose's block from its own view plus what the intrinsics'
-uncertainty adds.
+For Gaussian noise this is the Cramer-Rao bound at the estimate. The block of the intrinsics comes from the
+Schur complement over the views. The block of each pose is that of its own view plus the part propagated from
+the intrinsics.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Covariance:
     entries : (f, f) array
         Of A's free entries and the free distortion coefficients.
     poses : (V, 6, 6) array
-        Of omega and tau of each view; zero where poses are given.
+        Of omega and tau of each view; zero if the poses are given.
     smallest : float
-        Smallest eigenvalue of the normal matrices scaled to a unit diagonal, 0 when singular.
+        Smallest eigenvalue of the normal matrices scaled to a unit diagonal; 0 if singular.
     """
 
     entries: Array
@@ -51,7 +51,8 @@ def covariance(
     n_residuals : int
         Number of equations: two for most points; see `measured_directions`.
     shared : (f, f) array, optional
-        Covariance of what is free of A and the distortion, where it comes from elsewhere; the poses' follows.
+        Covariance of the free entries of A and the free coefficients, if it comes from elsewhere; the poses'
+        covariance is propagated from it.
     """
     f = camera_columns(len(free) - 5)[np.flatnonzero(free)]
     V = len(normal)

@@ -1,10 +1,10 @@
-"""Cross-validation of a calibration, to second order and without calibrating again.
+"""Cross-validation of a calibration to second order, without calibrating again.
 
-The normal matrices of the views say how the reprojection error (3) grows around its minimum. With each
-view's pose eliminated they are the `Quadratics` of `least_squares.leave_out` in what the views share, so
-the calibration without some views, and its error on them (their poses fitted, as `evaluate_camera` does),
-follow from the same few small matrices. A single view, or views that share nothing, leave out points
-instead.
+The normal matrices of the views are the quadratic model of the reprojection error (3) around its minimum.
+With each view's pose eliminated they are the `Quadratics` of `least_squares.leave_out` in the shared
+parameters. So the calibration without some views, and its error on them (with their poses fitted, as in
+`evaluate_camera`), follow from the same few small matrices. For a single view, or views that share nothing,
+points are left out instead.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ from neurocal_cli.least_squares.leave_out import Quadratics, folds_of, inverse_o
 from neurocal_cli.least_squares.schur_complement import eliminate
 
 FOLDS = 5
-_RIDGE = 1e-13  # on the scaled diagonal: one view's pose that nothing holds must not spoil the others
+_RIDGE = 1e-13  # added to the scaled diagonal, so that one undetermined pose does not spoil the other views
 _GOLDEN = 0.6180339887498949
 _POSE = np.arange(POSE.start, POSE.stop)
-_Restraint = tuple[Array, Array]  # what is known besides: (f, f) on the matrix, (f,) on the right side
-# What nothing determines is infinite or nan, and told so by the results.
+_Restraint = tuple[Array, Array]  # prior added to the normal matrix (f, f) and to the right side (f,)
+# Undetermined parameters become inf or nan; the results are tested for that.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @_quietly
 def reduced(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Quadratics:
-    """Eliminate the poses.
+    """Eliminate the poses from normal matrices.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def reduced(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> Quadrat
 
 
 def _eliminated(normal: Array, free: NDArray[np.bool_], free_poses: bool) -> tuple[Quadratics, Array]:
-    """Quadratics; how the poses follow the shared parameters, and their own step; (..., 6, f + 1)."""
+    """Quadratics, and the poses' response to the shared parameters with their own step; (..., 6, f + 1)."""
     kept = np.append(_shared(free), normal.shape[-1] - 1)
     if free_poses:
         left, solved = eliminate(normal, kept, _POSE, _RIDGE)
@@ -75,7 +75,7 @@ class Minimum:
         Of A's entries and the distortion coefficients.
     free_poses : bool
     repeated : RepeatedPoses, optional
-        Views of one pose, which are not taken apart.
+        Views that repeat a pose; they stay in the same fold.
     """
 
     views: Views
@@ -88,10 +88,10 @@ class Minimum:
 
 @_quietly
 def held_out(m: Minimum) -> Array:
-    """Squared error of parts of the data when they are left out; (parts,).
+    """Squared error of parts of the data when they are held out; (parts,).
 
-    The parts are views, left out in five folds as long as the others can do without them, else folds
-    of each view's points.
+    The parts are views, held out in five folds. If the other views do not determine the camera, the parts are
+    folds of each view's points.
     """
     if m.views.n_views > 1 and m.free.any():
         lost = held_out_views(m.normal, m.free, m.free_poses, repeated=m.repeated)
@@ -108,16 +108,16 @@ def held_out_views(
     restraint: _Restraint | None = None,
     repeated: RepeatedPoses | None = None,
 ) -> Array:
-    """Squared error of each view when it is left out; (V,), nan where the others cannot do without it.
+    """Squared error of each view when it is held out; (V,), nan if the others do not determine the camera.
 
     Parameters
     ----------
     normal, free, free_poses
         As for `reduced`.
     restraint : (f, f) array and (f,) array, optional
-        What is added to the normal matrix of the shared parameters and to its right side.
+        Prior, added to the normal matrix of the shared parameters and to its right side.
     repeated : RepeatedPoses, optional
-        Views of one pose are left out together.
+        Views that repeat a pose are held out together.
     """
     q = reduced(normal, free, free_poses)
     fold = folds_of(len(q.cost), FOLDS) if repeated is None else repeated.folds(FOLDS)
@@ -132,10 +132,10 @@ def held_out_points(
     free_poses: bool,
     restraint: _Restraint | None = None,
 ) -> Array:
-    """Squared error of the folds of each view's points when they are left out; (V * folds,).
+    """Squared error of the folds of each view's points when they are held out; (V * folds,).
 
-    The folds are wedges of each view's image: what is wrong with a target shows up in neighbouring
-    points alike, and a model that learns it from them must not be rewarded.
+    The folds are wedges of each view's image. Errors of a target are alike in neighbouring points, so random
+    folds would reward a model that learns them.
     """
     normal = _by_fold(views, state, _wedges(views))  # (V, F, W, W)
     rest = normal.sum(axis=1, keepdims=True) - normal
@@ -144,7 +144,7 @@ def held_out_points(
 
 
 def _wedges(views: Views) -> NDArray[np.intp]:
-    """(N,) fold of each point: five wedges of each view's image with as many points each."""
+    """(N,) fold of each point: five wedges of each view's image with equally many points."""
     du, dv = (views.pixels - np.repeat(_means(views.pixels, views), views.counts, axis=0)).T
     order = np.lexsort((np.arctan2(dv, du), views.index))
     fold = np.empty(len(order), dtype=np.intp)
@@ -158,7 +158,7 @@ def _means(values: Array, views: Views) -> Array:
 
 
 def _dealt(views: Views) -> NDArray[np.intp]:
-    """(N,) fold of each point: all over the target, with a stride that rows and columns do not share."""
+    """(N,) fold of each point, spread over the target by an irrational stride, to avoid rows and columns."""
     rank = np.arange(len(views.index)) - np.repeat(views.first, views.counts)
     return np.asarray((rank * _GOLDEN % 1.0 * FOLDS).astype(np.intp))
 
@@ -194,16 +194,16 @@ def _whole_steps(
 
 @_quietly
 def disagreement(m: Minimum) -> tuple[Array, Array]:
-    """How far the shared parameters from two halves of the data lie apart.
+    """Difference between the shared parameters estimated from two halves of the data.
 
-    The halves are every other view, or every other pose, and the rest; or of points where half of the views
-    cannot do.
+    The halves are alternate views (or alternate poses). If half of the views do not determine the camera,
+    they are two parts of each view's points.
 
     Returns
     -------
     difference : (f,) array
     covariance : (f, f) array
-        Of the difference, for residuals of unit variance; nan where a half cannot do.
+        Of the difference, for residuals of unit variance; nan if a half does not determine the camera.
     """
     repeated = m.repeated
     pose = np.arange(m.views.n_views) if repeated is None else repeated.group

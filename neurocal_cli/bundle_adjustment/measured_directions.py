@@ -1,14 +1,14 @@
 """Points that were measured in one direction only.
 
-The mid-point of an edge is seen across the edge. Where along the edge it lies is told by the smooth map
-through all the edges of its board: true, and often to a smaller fraction of a pixel, but it is what the
-other edges have said already. Errors along the edges are common to a board's points, and taking them
-for as many independent measurements would make every standard deviation too small, several times over.
-So such a point gives one equation, across its edge; along it, it has the small say `LEAST` that keeps a
-pose in place which nothing else holds. Where residuals are not the measurement's (`noise`), it has more.
+The mid-point of an edge is measured across the edge. Its position along the edge comes from the smooth map
+through all edges of its board. That is often more precise, but it is no independent measurement: the errors
+along the edges are common to a board's points. To count them as independent would make every standard
+deviation several times too small. So such a point gives one equation, across its edge. Along the edge it has
+the small weight `LEAST`, which keeps a pose determined that nothing else determines. If the residuals are
+model errors, the weight is larger (`common_noise`).
 
-All functions take `across`, (N, 2): the direction in which each point was measured, of any length, or
-(0, 0) for one measured in both directions; None when all were.
+All functions take `across`, (N, 2): the direction in which each point was measured, of any length, or (0, 0)
+for points measured in both directions; None if all were.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ LEAST = 0.01  # of an equation
 
 
 def equations(across: Array | None, n: int, along: float = LEAST) -> Array:
-    """How many equations each of n points gives, (n,): 2, or 1 and its say along the edge."""
+    """Number of equations that each of n points gives, (n,): 2, or 1 plus its weight along the edge."""
     if across is None:
         return np.full(n, 2.0)
     return np.where(single(across), 1.0 + along, 2.0)
 
 
 def measured_part(errors: Array, across: Array | None) -> Array:
-    """The part of pixels' errors (N, 2) in the measured directions; (N, 2)."""
+    """Pixel errors (N, 2) projected on the measured directions; (N, 2)."""
     if across is None:
         return errors
     n = unit(across)
@@ -37,7 +37,7 @@ def measured_part(errors: Array, across: Array | None) -> Array:
 
 
 def variance_across(covariance: Array, across: Array) -> Array:
-    """Variance (N,) in the measured direction; in the mean direction where both were measured.
+    """Variance (N,) in the measured direction; the mean of both where both were measured.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def variance_across(covariance: Array, across: Array) -> Array:
 
 
 def loosened(covariance: Array, across: Array | None, along: float = LEAST) -> Array:
-    """Covariances (N, 3) of points taken to be independent, with some say along their edges."""
+    """Covariances (N, 3) of independent points, with the weight `along` in the direction of their edges."""
     if across is None:
         return covariance
     variance, (nu, nv) = variance_across(covariance, across), unit(across).T
@@ -63,7 +63,7 @@ def loosened(covariance: Array, across: Array | None, along: float = LEAST) -> A
 
 
 def rounded(whitening: Array, across: Array | None) -> Array:
-    """Whitening factors (N, 3), what is known across an edge being known in all directions."""
+    """Whitening factors (N, 3), made isotropic with the factor across the edge."""
     if across is None:
         return whitening
     nu, nv = unit(across).T
@@ -77,6 +77,6 @@ def single(across: Array) -> NDArray[np.bool_]:
 
 
 def unit(across: Array) -> Array:
-    """Directions of length 1; (0, 0) stays."""
+    """Directions normalised to length 1; (0, 0) stays."""
     length = np.hypot(across[:, 0], across[:, 1])[:, None]
     return np.asarray(across / np.where(length > 0, length, 1.0))

@@ -1,4 +1,4 @@
-"""What the points can and cannot determine: refusals with a reason, before and after training."""
+"""Observability: refuse points that do not determine the unknowns, before training and after the fit."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from neurocal_cli.geometry import Array
 # Repeated by tests/test_refusals.py: rounding leaves a millionth of the coordinates, 1e-13 of a normal
 # matrix.
 _COLLINEAR = 1e-6  # second extent as a share of the first
-_SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which rounding rules
-# Std of a focal length over its value. Parallel boards under noise fit best with tilts of about one
-# standard deviation each, and V boards then seem to tell the focal length to 1 / sqrt(2 V): flat
-# targets have to do better than that by this factor.
+_SINGULAR = 1e-13  # eigenvalue of a normal matrix with unit diagonal, below which it is rounding
+# Largest std of a focal length over its value. Noisy parallel boards fit best with tilts of about one
+# standard deviation each, and V of them then seem to determine the focal length to 1 / sqrt(2 V). The std of
+# flat targets must be below that, times this factor.
 _MEANINGLESS = 0.5
 _NEARLY_PARALLEL = 5.0  # degrees
 _WEAK = 0.005  # std of a focal length, over its value; tests/test_campaign.py (slow) repeats it
 
 
 def check_points(problem: Problem) -> None:
-    """Refuse points that cannot do, each with its reason.
+    """Refuse degenerate or insufficient points.
 
     Raises
     ------
     DegenerateGeometryError
-        Points on one line or too few, a single plane, too few views.
+        The points are too few or lie on one line, or there are too few views of a plane.
     """
     views = problem.views
     if problem.free_poses:
@@ -66,7 +66,7 @@ def _check_each_view(views: Views) -> None:
 
 
 def _on_one_line(views: Views) -> NDArray[np.bool_]:
-    """(V,) whether all the view's pixels do, or are the same."""
+    """(V,) whether all pixels of the view lie on one line or coincide."""
     centre = np.add.reduceat(views.pixels, views.first) / views.counts[:, None]
     du, dv = (views.pixels - np.repeat(centre, views.counts, axis=0)).T
     suu, suv, svv = (np.add.reduceat(product, views.first) for product in (du * du, du * dv, dv * dv))
@@ -75,7 +75,7 @@ def _on_one_line(views: Views) -> NDArray[np.bool_]:
 
 
 def _check_planes(problem: Problem) -> None:
-    """Each flat view gives two conditions on the intrinsics, a solid one all five."""
+    """Refuse too few flat views: each gives two conditions on the intrinsics, a solid one all five."""
     free = int(problem.free.sum())
     flat = problem.views.exactly_flat
     if not flat.all() or 2 * len(flat) >= free:
@@ -94,10 +94,10 @@ def _check_planes(problem: Problem) -> None:
 
 
 def _check_views_with_few_points(problem: Problem) -> None:
-    """Views with too few points of their own join the others, which must tell the camera alone.
+    """Refuse views with too few points of their own if the other views do not determine the camera.
 
-    All together might have the equations for it, but from the wrong camera that they begin with they
-    mostly end in a wrong minimum, and nothing shows it.
+    All views together might give enough equations, but without an initial camera from the other views they
+    mostly end in a wrong local minimum, and nothing reveals it.
     """
     views = problem.views
     able = views.distinct >= np.where(views.nearly_flat, 4, 6)
@@ -113,7 +113,7 @@ def _check_views_with_few_points(problem: Problem) -> None:
 
 
 def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -> None:
-    """Refuse an answer that the points leave open.
+    """Refuse a solution that the points do not determine.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
     Raises
     ------
     DegenerateGeometryError
-        A singular normal matrix, or a focal length known no better than to `_MEANINGLESS`.
+        The normal matrix is singular, or the relative std of a focal length is not below the limit.
     """
     views, relative_std = problem.views, relative_std_of_scale(problem, state, cov)
     singular = not cov.smallest > _SINGULAR
@@ -157,15 +157,14 @@ def refuse_undetermined(problem: Problem, state: CameraState, cov: Covariance) -
 
 
 def is_weak(problem: Problem, state: CameraState, cov: Covariance) -> bool:
-    """Whether the points tell a focal length so badly that other minima may be lower."""
+    """Whether a focal length is so poorly determined that other local minima may be lower."""
     return not relative_std_of_scale(problem, state, cov) < _WEAK
 
 
 def relative_std_of_scale(problem: Problem, state: CameraState, cov: Covariance) -> float:
-    """Standard deviation of the image's scale over its value, the larger of u and v.
+    """Relative std of the scale in the image centre, the larger of u and v; 0 if both are given.
 
-    0 where both are given.
-    The scale is that in the middle of the image, which alpha and a wide lens's xi tell together.
+    In models with xi this scale depends on alpha and xi together.
     """
     free = np.flatnonzero(problem.free_camera if state.model != "none" else problem.free)
     largest = 0.0
@@ -181,7 +180,7 @@ def relative_std_of_scale(problem: Problem, state: CameraState, cov: Covariance)
 
 
 def _check_tilts(views: Views, normals: Array, singular: bool) -> None:
-    """Refuse flat boards that stand parallel, to the image or to each other."""
+    """Refuse flat boards that are parallel to the image or to each other."""
     if views.n_views == 1:
         raise DegenerateGeometryError(
             "one view of a board that is (nearly) parallel to the image cannot determine the focal length; "
@@ -190,7 +189,7 @@ def _check_tilts(views: Views, normals: Array, singular: bool) -> None:
     angle = np.degrees(np.arccos(np.clip(np.abs(normals @ normals.T).min(), 0, 1)))
     if singular and angle >= _NEARLY_PARALLEL:
         return
-    # Noise on parallel boards reads as a long lens and large tilts: the angle means nothing then.
+    # Noisy parallel boards fit a long focal length with large tilts, so a large angle proves nothing.
     found = "parallel within the noise"
     if angle < _NEARLY_PARALLEL:
         found = f"all parallel (within {angle:.1f} degrees)"

@@ -1,18 +1,18 @@
-"""What a camera is uncertain by because its distortion model was chosen.
+"""Uncertainty of the camera that comes from the selection of its distortion model.
 
-A model that was chosen for what it predicts lacks coefficients that real lenses have: p1 and p2 move the
-image centre, k3 moves k1 and k2. Where it has them, noise may be why: they are taken where noise makes them
-large. All of these are open here, each group of them absent or with a Gaussian prior, three times or a third
-as wide as real lenses are, all groups alike (George and McCulloch 1993). To second order around the minimum,
-all these models follow from one normal matrix. With w_m the posterior probability of model m, P_m and o_m its
-posterior covariance and mean of the open coefficients o, o_r their reported values, which are 0 where they
-were left out, and T = dc/do how the parameters c of the camera follow them,
+A selected model may lack coefficients that the real lens has: p1 and p2 are correlated with the image centre,
+k3 with k1 and k2. Or it has them only because noise made them large. All these coefficients are called open
+here. Each group of them is either absent or has a Gaussian prior, whose width is three times or a third of
+the typical size in real lenses, the same factor for all groups (spike and slab, George and McCulloch 1993).
+To second order around the minimum, all these models follow from one normal matrix. Let w_m be the posterior
+probability of model m, P_m and o_m its posterior covariance and mean of the open coefficients o, o_r their
+reported values (0 if they were left out), and T = dc/do the response of the camera parameters c. Then
 
-    E = sum_m w_m (P_m + (o_m - o_r) (o_m - o_r)^T),    added(c, o) = [T; 1] E [T; 1]^T,
+    E = sum_m w_m (P_m + (o_m - o_r) (o_m - o_r)^T),    added(c, o) = [T; 1] E [T; 1]^T
 
-which is what model averaging adds (Hoeting et al. 1999) to the covariance for known o, around the parameters
-of the chosen model, because those are reported. The covariance of the chosen model counts already that noise
-moves the open coefficients that it has, and E only what goes beyond it.
+is the term that Bayesian model averaging (Hoeting et al. 1999) adds to the covariance for known o, around the
+reported parameters of the selected model. The covariance of the selected model already contains the noise of
+the open coefficients that it estimates, so only the part of E beyond it is added.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 
-# Groups that come and go together, the power of the radius, and the std of their terms' share of the radius
-# where the lens reaches farthest, in a corner of the image. At the farthest points of four real cameras these
-# are 0.03-0.14, 0.001-0.035, 0.0001-0.001 and 0.0015-0.007; corners have up to three times as much.
-# Repeated by tests/test_choice_uncertainty.py (slow: 200 draws)
+# For each group of coefficients that are present or absent together: the power of the radius, and the prior
+# std of their term as a share of the radius in the farthest corner of the image. At the farthest points of
+# four real cameras the shares are 0.03-0.14, 0.001-0.035, 0.0001-0.001 and 0.0015-0.007, and in the corners
+# up to three times as large. Repeated by tests/test_choice_uncertainty.py (slow: 200 draws).
 _POLYNOMIAL = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("p1", "p2"), 1, 0.0015), (("k3",), 6, 0.012))
 _FISHEYE = ((("k1",), 2, 0.15), (("k2",), 4, 0.05), (("k3",), 6, 0.02), (("k4",), 8, 0.005))
 _STEEPEST = 1.55  # rad
-_NOISE_MAY_MAKE = ("p1", "p2", "k3")  # of those that were estimated; k1 and k2 stand far above their noise
-_ODDS = 3.0  # that a group is there
-_SCALES = (3.0, 0.3)  # of the sizes of all groups together: half a decade above and below
+_NOISE_MAY_MAKE = ("p1", "p2", "k3")  # estimated coefficients that may be mere noise; k1 and k2 never are
+_ODDS = 3.0  # prior odds that a group is present
+_SCALES = (3.0, 0.3)  # common factors of all prior widths: half a decade above and below
 _RICHEST = ("plumb_bob", "k1k2p1p2", "k1k2", "k1")
 
 
 @frozen_dataclass(eq=False)
 class OpenPrior:
-    """What is known of open unknowns before any point is seen.
+    """Prior of the open unknowns.
 
     Attributes
     ----------
@@ -57,15 +57,15 @@ class OpenPrior:
     left_out : (f,) bool array
         Which of these were not estimated.
     value : (o,) array
-        What is reported of the open ones; 0 where they were left out.
+        Reported values of the open unknowns; 0 if they were left out.
     size : (o,) array
-        Std of the open ones around 0, where they are there.
+        Prior std of the open unknowns around 0, if they are present.
     groups : tuple of int arrays
-        Places among the open ones that come and go together.
+        Indices of open unknowns that are present or absent together.
     odds : float
-        That a group is there.
+        Prior odds that a group is present.
     scales : tuple of float
-        Of all sizes together; each is as probable as the others.
+        Common factors of all sizes, equally probable.
     """
 
     is_open: NDArray[np.bool_]
@@ -79,17 +79,17 @@ class OpenPrior:
 
 @frozen_dataclass(eq=False)
 class SpreadOfOpen:
-    """What points tell of open unknowns o.
+    """Posterior of the open unknowns o.
 
     Attributes
     ----------
     E : (o, o) array
-        What is to be added to the covariance of the open ones that was estimated, which is 0 where they were
-        left out; nan where the points leave open what was estimated.
+        Term to add to the estimated covariance of the open unknowns, which is 0 for those left out; nan if
+        the points do not determine those that were estimated.
     follow : (f, o) array
-        [T; 1]: how all that is free follows.
+        [T; 1], the response of all free unknowns to the open ones.
     probability : float
-        That any group is there.
+        Posterior probability that any group is present.
     """
 
     E: Array
@@ -99,16 +99,16 @@ class SpreadOfOpen:
 
 @frozen_dataclass(eq=False)
 class OpenCoefficients:
-    """A camera with the coefficients that its model was chosen without.
+    """A camera extended by the coefficients that its selected model leaves out.
 
     Attributes
     ----------
     model : str
         The richer model.
     k : (K,) array
-        Its coefficients; the open ones are 0.
+        Its coefficients; those left out are 0.
     free : (5 + K,) bool array
-        What is free of A's entries and the coefficients, those left out included.
+        Free entries of A and coefficients, including those left out.
     prior : OpenPrior
     """
 
@@ -118,12 +118,12 @@ class OpenCoefficients:
     prior: OpenPrior
 
     def state(self, state: CameraState) -> CameraState:
-        """The same camera as one of the richer model."""
+        """The same camera, expressed in the richer model."""
         return replace(state, model=self.model, k=self.k)
 
 
 def radius(views: Views, state: CameraState) -> float:
-    """Undistorted radius of the farthest point, normalised; that of 89 degrees at most."""
+    """Undistorted normalised radius of the point farthest from the axis; at most that of 89 degrees."""
     return _farthest((state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index])
 
 
@@ -134,16 +134,15 @@ def _farthest(seen: Array) -> float:
 def corner_radius(
     entries: Array, pixel_centre: Array, pixel_scale: float, size: tuple[int, int] | None
 ) -> float:
-    """Radius of the farthest corner of the image in normalised image coordinates, as it is seen.
+    """Distorted radius of the farthest corner in normalised image coordinates; 0 without an image size.
 
     Parameters
     ----------
     entries : (5,) array
-        Of A, normalised.
+        Entries of A, normalised.
     pixel_centre, pixel_scale
         Of the normalisation.
     size : (width, height), optional
-        Without it, 0.
     """
     if size is None:
         return 0.0
@@ -155,23 +154,23 @@ def corner_radius(
 
 
 def fisheye_sizes(far: float) -> Array:
-    """(4,) standard deviations of k1 to k4 of lenses that reach to an angle [rad]."""
+    """(4,) prior standard deviations of k1 to k4 for lenses that reach the angle `far` [rad]."""
     return np.array([share / far**power for _, power, share in _FISHEYE])
 
 
 def open_coefficients(
     model: str, k: Array, free: NDArray[np.bool_], choice: Collection[str], reach: float, corner: float
 ) -> OpenCoefficients | None:
-    """Coefficients that a model was chosen without; None where there are none.
+    """Open coefficients of a selected distortion model; None if there are none.
 
     Parameters
     ----------
     model, k
-        The chosen distortion.
+        The selected distortion.
     free : (5 + K,) bool array
-        What was estimated of A's entries and the coefficients.
+        Which of A's entries and the coefficients were estimated.
     choice : collection of str
-        The models that were chosen from; empty where the model was named.
+        The candidate models of the selection; empty if the user named the model.
     reach : float
         `radius` of the farthest point.
     corner : float
@@ -215,16 +214,16 @@ def open_coefficients(
 def open_of_calibration(
     calibration: Calibration, free: NDArray[np.bool_], k: Array | None = None
 ) -> OpenCoefficients | None:
-    """Coefficients that the model of a calibrated camera was chosen without; None where there are none.
+    """Open coefficients of a calibrated camera's distortion model; None if there are none.
 
     Parameters
     ----------
     calibration : Calibration
         With its points and poses.
     free : (5 + K,) bool array
-        What was estimated of A's entries and the coefficients.
+        Which of A's entries and the coefficients were estimated.
     k : (K,) array, optional
-        The coefficients of the same model, where they are no longer those of the calibration.
+        Coefficients of the same model, if they differ from those of the calibration.
     """
     points, camera = calibration.points, calibration.camera
     poses = [calibration.views[name].pose for name in points.view_names]
@@ -237,25 +236,25 @@ def open_of_calibration(
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> SpreadOfOpen:
-    """What the points tell of the open unknowns.
+    """Posterior of the open unknowns by model averaging.
 
     Parameters
     ----------
     S : (f, f) array
-        Normal matrix of what is free, poses eliminated.
+        Normal matrix of the free unknowns, with the poses eliminated.
     g : (f,) array
         Right side, J^T r, at the reported values.
     variance : float
-        Of the residuals, larger where they are correlated.
+        Of the residuals, enlarged if they are correlated.
     prior : OpenPrior
     """
     c, o = np.flatnonzero(~prior.is_open), np.flatnonzero(prior.is_open)
     T = -solve_scaled(S[np.ix_(c, c)], S[np.ix_(c, o)])
-    # What is left of the open ones once the others have followed, as a Gaussian's J^T J and J^T r at 0.
+    # Schur complement: J^T J and J^T r of the open unknowns at 0, with all others eliminated.
     left = (S[np.ix_(o, o)] + S[np.ix_(o, c)] @ T) / variance
     right = (g[o] + T.T @ g[c]) / variance + left @ prior.value
     size, logarithm, is_none = _models(prior)
-    # In units of the prior; nan where rounding has the say.
+    # In units of the prior; nan if rounding dominates.
     P = inverse_or_nan(np.eye(len(o)) + size[:, :, None] * left * size[:, None, :])
     mean = (P @ (size * right)[..., None])[..., 0]
     logarithm = logarithm + 0.5 * (size * right * mean).sum(axis=1) + 0.5 * np.linalg.slogdet(P)[1]
@@ -270,7 +269,7 @@ def spread_of_open(S: Array, g: Array, variance: float, prior: OpenPrior) -> Spr
 
 
 def _models(prior: OpenPrior) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Sizes (m, o) of the open ones in each model, 0 where they are absent; log prior; which has none."""
+    """Prior std (m, o) of the open unknowns in each model, 0 if absent; log prior; whether all are absent."""
     there = np.array(list(product((False, True), repeat=len(prior.groups))))
     size = np.zeros((len(prior.scales), len(there), len(prior.size)))
     for group, present in zip(prior.groups, there.T, strict=True):
@@ -280,7 +279,7 @@ def _models(prior: OpenPrior) -> tuple[Array, Array, NDArray[np.bool_]]:
 
 
 def _beyond(second: Array, left: Array, left_out: NDArray[np.bool_]) -> Array:
-    """(o, o) of the second moment what the covariance of the estimated ones does not have; never negative."""
+    """(o, o) part of the second moment beyond the covariance of the estimated unknowns; never negative."""
     if left_out.all():
         return second
     more, own = second.copy(), np.ix_(~left_out, ~left_out)
@@ -293,7 +292,7 @@ def _beyond(second: Array, left: Array, left_out: NDArray[np.bool_]) -> Array:
 
 
 def wide_covariance(entries: Array, E: Array, follow: Array, left_out: NDArray[np.bool_]) -> Array:
-    """(f, f) covariance of all that is free, from that of what was estimated for known open ones."""
+    """(f, f) covariance of all free unknowns: that of the estimated ones plus the spread of the open ones."""
     wide = follow @ E @ follow.T
     wide[np.ix_(~left_out, ~left_out)] += entries
     return np.asarray(wide)

@@ -1,7 +1,7 @@
-"""Views that contradict the others as wholes, though their own points agree with each other.
+"""Outlier views: whole views that contradict the others, although their own points are consistent.
 
-Such a view is of another camera (another zoom, another picture size), or of a target whose points are
-not where its world coordinates say: read in the wrong order, mirrored, with the wrong size of square.
+Such a view comes from another camera (another zoom, another picture size), or its target has wrong world
+coordinates: points in the wrong order, mirrored, or with the wrong size of square.
 """
 
 from __future__ import annotations
@@ -22,25 +22,24 @@ from neurocal_cli.median import median
 
 # Repeated by tests/test_outlier_rejection.py (slow: 105 sets with one wrong view, all found; 200 clean ones,
 # none blamed) and tests/test_multi_start.py (1000 clean sets under strong distortion, no view blamed).
-_FEWEST = 4  # views, of which the others must outvote one
-_MOVES = 2.5  # standard deviations of any shared parameter that leaving a view out must move
-_OUTLIER = 25.0  # times what noise, and what the others contradict each other by
+_FEWEST = 4  # fewest views, so that the others outvote one
+_MOVES = 2.5  # leaving a view out must move some shared parameter by at least this many standard deviations
+_OUTLIER = 25.0  # times the contradiction that noise causes, and that of the other views
 _STEPS = 60
-# Of a free camera, from the common one. A flat view under distortion has a long valley: 60 steps end up to
-# 0.6 % above the rms error of hundreds, one step and the minimum of its quadratic within 0.5 % of it where
-# the common camera is right; tests/test_free_networks.py repeats it.
+# Steps of a view's own camera, from the common one. A flat view with distortion has a long valley: 60 steps
+# end up to 0.6 % above the rms error of hundreds of steps; one step and the minimum of its quadratic model
+# come within 0.5 % of it if the common camera is right. tests/test_free_networks.py repeats it.
 _FREE_STEPS = 1
-_UNSEEN = 1e-9  # added to a unit diagonal: directions that the points do not tell are not followed
+_UNSEEN = 1e-9  # ridge on a unit diagonal, against steps in undetermined directions
 _SAME_PLANE = 1e-3
 
 
 def find_outlier_view(solution: Solution) -> str | None:
-    """The view that contradicts the others most, if any does.
+    """The view that contradicts the others most, or None if no view is an outlier.
 
-    By how much is measured by the squared error that it would spare if it had a camera of its own,
-    for each of the conditions that the common camera puts on it, in units of the noise's variance: 1
-    for noise alone. On real boards, which are not quite flat, it is some tens for every view; an
-    outlier's stands out from the others'.
+    The contradiction of a view is the drop in squared error if the view had its own camera, per condition
+    that the common camera imposes on it, in units of the noise variance. Noise alone gives 1. On real boards,
+    which are not quite flat, every view has some tens; an outlier must stand out from the other views.
     """
     problem, adjusted = solution.problem, solution.adjusted
     views = problem.views
@@ -71,7 +70,7 @@ def find_outlier_view(solution: Solution) -> str | None:
 
 
 def _largest_move(q: Quadratics, variance: float) -> float:
-    """Most standard deviations by which leaving one view out moves a shared parameter."""
+    """Largest move of a shared parameter when one view is left out, in standard deviations."""
     S = q.S.sum(axis=0)
     with np.errstate(invalid="ignore"):
         std = np.sqrt(np.abs(np.diagonal(inverse_or_nan(S))) * variance)
@@ -80,7 +79,7 @@ def _largest_move(q: Quadratics, variance: float) -> float:
 
 
 def _contradictions(q: Quadratics, own: Array, conditions: NDArray[np.intp]) -> Array:
-    """(V,) squared error that each view would spare with a camera of its own, by condition."""
+    """(V,) drop in squared error if each view had its own camera, per condition."""
     with np.errstate(invalid="ignore"):
         spared = q.cost.sum() - q.cost_without_each() - own
     return np.asarray(np.where(np.isfinite(spared), spared, 0.0) / conditions)
@@ -91,19 +90,19 @@ def _of(state: CameraState, views: NDArray[np.intp]) -> CameraState:
 
 
 def conditions_on_views(views: Views, state: CameraState) -> NDArray[np.intp]:
-    """(V,) conditions that a common camera puts on the network of each view.
+    """(V,) number of conditions that a common camera imposes on the network of each view.
 
-    Of its eleven parameters a flat target determines eight; seen through a wide lens, all.
+    Of the network's eleven parameters a flat target determines eight, or all if seen through a wide lens.
     """
     flat = views.nearly_flat & (state.model not in WIDE)
     return np.where(flat, 2, 5)
 
 
 def free_networks(views: Views, state: CameraState, steps: int = _FREE_STEPS) -> Array:
-    """Squared reprojection error of a free camera for each view, with the distortion as it is; (V,).
+    """(V,) squared reprojection error of each view with a camera of its own and the common distortion.
 
-    Eleven parameters for each view are as free as its product W V: what no camera common to all the
-    views can go below, and so the precision of the points themselves.
+    Its eleven parameters are as free as the network's product W V. No camera common to all views can have a
+    smaller error, so this measures the precision of the points themselves.
     """
     own = CameraState(np.repeat(state.entries, views.n_views, axis=0), state.R, state.t, state.model, state.k)
     free = np.concatenate([np.ones(5, dtype=bool), np.zeros(len(state.k), dtype=bool)])
@@ -111,7 +110,7 @@ def free_networks(views: Views, state: CameraState, steps: int = _FREE_STEPS) ->
 
 
 def least_of_free_networks(normal: Array) -> Array:
-    """The same by the quadratics at a state: normal matrices (V, 12 + K, 12 + K) to squared errors (V,)."""
+    """The same from the quadratic model at a state: normal (V, 12 + K, 12 + K) to squared errors (V,)."""
     H, g = normal[:, : POSE.stop, : POSE.stop], normal[:, : POSE.stop, -1]
     H = H * (1.0 + _UNSEEN * np.eye(POSE.stop))
     gain = (g * solve_scaled(H, g[..., None])[..., 0]).sum(axis=1)
@@ -119,16 +118,16 @@ def least_of_free_networks(normal: Array) -> Array:
 
 
 def seen_from_behind(views: Views, state: CameraState) -> list[str]:
-    """Views that show a flat target from the side that the other views do not show.
+    """Names of the views that seem to show a flat target from behind.
 
-    Nobody sees through a board: its points are mirrored in those views (or in the others).
+    A board is opaque, so the points of these views (or of all others) are mirrored.
     """
     if views.n_views < _FEWEST or not views.nearly_flat.all():
         return []
     normal = views.basis[:, :, 2] * np.sign(views.basis[:, :, 2] @ views.basis[0, :, 2])[:, None]
     if np.abs(normal - normal[0]).max() > _SAME_PLANE:
         return []
-    # The centroid lies along t: on which side of the plane is the camera?
+    # The centroid lies along t: its sign tells on which side of the plane the camera is.
     side = ((state.R @ normal[..., None])[..., 0] * state.t).sum(axis=1)
     behind = (side < 0) != (np.sign(side).sum() < 0)
     return [views.names[k] for k in np.flatnonzero(behind)]

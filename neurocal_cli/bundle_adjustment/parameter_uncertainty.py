@@ -1,7 +1,7 @@
-"""From the covariance of normalised unknowns to parameters with standard deviations, and what to warn of.
+"""Standard deviations of the user's parameters from the covariance of the normalised unknowns, with warnings.
 
-The estimators work on A's entries in normalised pixels and on each pose about its target's centre; users
-want the paper's parameters in pixels, radians and their own unit.
+The estimators work with A's entries in normalised pixels and with poses about the centre of their target.
+Users want the paper's parameters in pixels, radians and world units.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.camera.pinhole import INTRINSIC_NAMES, Intrinsics
 from neurocal_cli.geometry import Array, cross_matrix, euler_jacobian
 
-# What users are warned of; no result depends on it.
-# A parameter whose std exceeds this share of its value (for the centre: of alpha) is warned of.
-_POOR = 0.05
+# These limits decide only about warnings; no result depends on them.
+_POOR = 0.05  # std of a parameter over its value (for the centre: over alpha)
 _POOR_THETA = 0.02  # rad
-_TOLD_APART = 2.0  # standard deviations
+_TOLD_APART = 2.0  # standard deviations from which on a coefficient differs significantly from 0
 
 
 def parameter_covariance(
@@ -31,9 +30,9 @@ def parameter_covariance(
     ----------
     intrinsics : Intrinsics
     model : str
-        Of the distortion, with K coefficients.
+        Distortion model with K coefficients.
     covariance : (5 + K, 5 + K) array
-        Of A's entries A11, A12, A22, A13, A23 in normalised pixels and the coefficients; 0 for given ones.
+        Of A's entries A11, A12, A22, A13, A23 in normalised pixels and of the coefficients; 0 for given ones.
     pixel_scale : float
         S1 [px].
     given : collection of str
@@ -59,7 +58,7 @@ def pose_std(R: Array, centre: Array, scale: Array, covariance: Array) -> Array:
     ----------
     R : (V, 3, 3) array
     centre : (V, 3) array
-        Of each target, R c [world unit].
+        Centre of each target in the camera's axes, R c [world unit].
     scale : (V,) array
         S2 [world unit].
     covariance : (V, 6, 6) array
@@ -75,16 +74,16 @@ def pose_std(R: Array, centre: Array, scale: Array, covariance: Array) -> Array:
 
 
 def with_scale(std: Array, t: Array, relative: float) -> Array:
-    """Standard deviations (V, 6) with that of the target's scale: the translations (V, 3) follow it."""
+    """Add the relative std of the target's scale, which scales the translations t (V, 3), to std (V, 6)."""
     return np.asarray(np.hypot(std, relative * np.abs(np.concatenate([np.zeros_like(t), t], axis=1))))
 
 
 def parameter_warnings(
     intrinsics: Intrinsics, distortion: Distortion, std: Mapping[str, float], model_chosen: bool
 ) -> tuple[str, ...]:
-    """Parameters that exist but are badly determined, and coefficients that the data does not tell from 0.
+    """Warn of poorly determined parameters, and of coefficients that are not significantly different from 0.
 
-    A distortion model that was chosen for what it predicts may well have one of those.
+    A model selected by cross-validation may well have such a coefficient, so no warning is given then.
     """
     return (
         *_poor(intrinsics, distortion.model, std),
@@ -93,7 +92,7 @@ def parameter_warnings(
 
 
 def _poor(intrinsics: Intrinsics, model: str, std: Mapping[str, float]) -> tuple[str, ...]:
-    """Parameters that exist but are badly determined; alpha by itself means nothing beside a xi."""
+    """Warn of poorly determined parameters; alpha alone means nothing in models with xi."""
     alpha = max(intrinsics.alpha_u, intrinsics.alpha_v)
     limits = {
         "alpha_u": np.inf if model in WITH_XI else _POOR * intrinsics.alpha_u,
@@ -112,7 +111,7 @@ def _poor(intrinsics: Intrinsics, model: str, std: Mapping[str, float]) -> tuple
 
 
 def _noise_coefficients(distortion: Distortion, std: Mapping[str, float]) -> tuple[str, ...]:
-    """Warn of coefficients that the data does not tell from 0."""
+    """Warn of coefficients that are not significantly different from 0."""
     pairs = zip(coefficient_names(distortion.model), distortion.coefficients, strict=True)
     noise = [
         f"{name} ({k:.2g} +- {std[name]:.2g})"

@@ -1,8 +1,8 @@
-"""Observations laid out for batched arithmetic: batches of equally many points, each batch from one view.
+"""Observations in batches of equally many points, each batch from one view, for vectorised arithmetic.
 
-Views differ in their number of points, from four to a million. Cut into batches of one size (the
-last of a view padded with weight 0) they are plain arrays without a Python loop over views, and a
-handful of batches at a time stays in the processor's cache.
+Views have from four to a million points. Cut into batches of one size (the last batch of a view is padded
+with weight 0), they are plain arrays and need no Python loop over views, and a few batches at a time fit into
+the processor's cache.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from neurocal_cli.geometry import Array
 
 # The fastest of 512 to 4096 points on 13 to 1000 views of 54; tests/benchmarks/test_speed.py repeats it.
 _LARGEST_BATCH = 512
-_POINTS_AT_ONCE = 4096  # about 1.5 MB of derivatives, a share of the second-level cache
+_POINTS_AT_ONCE = 4096  # about 1.5 MB of derivatives, which fit into the second-level cache
 
 
 @frozen_dataclass(eq=False)
@@ -32,8 +32,8 @@ class PointBatches:
     pixels : (T, 2, n) array
         Normalised pixels.
     whitening : (T, 3, n) array or None
-        Entries (0, 0), (0, 1), (1, 1) of the upper triangular factor that whitens a residual; None
-        when every point counts the same and no batch is padded.
+        Entries (0, 0), (0, 1), (1, 1) of the upper triangular factor that whitens a residual; None if all
+        points have equal weight and no batch is padded.
     first : (V,) int array
         First batch of each view.
     view : (T,) int array
@@ -58,16 +58,16 @@ class PointBatches:
     def chunks(self) -> Iterator[slice]:
         """Slices of batches, each a few thousand points; the first is the longest."""
         most = max(1, _POINTS_AT_ONCE // self.local.shape[2])
-        step = -(-len(self.view) // -(-len(self.view) // most))  # as long as each other, nearly
+        step = -(-len(self.view) // -(-len(self.view) // most))  # nearly equal lengths
         for start in range(0, len(self.view), step):
             yield slice(start, min(start + step, len(self.view)))
 
     def memory(self, width: int) -> Array:
-        """(T, width + 1, 2, n) array for the derivatives of any one of the chunks; zero when it is new.
+        """(T, width + 1, 2, n) buffer for the derivatives of any one of the chunks; zero when it is new.
 
-        It is the same one in every call with the same width: the system hands out new memory page by page,
-        which took up to half of the time. Each derivative of all points lies in one piece, which doubles the
-        speed of arithmetic on it. The last row is nobody's; see `products`.
+        Calls with the same width return the same buffer, because allocating new pages took up to half of the
+        time. Each derivative is contiguous over all points, which doubles the speed of arithmetic on it. The
+        last row is padding; see `products`.
         """
         if width not in self._memory:
             longest = next(self.chunks()).stop
@@ -83,10 +83,10 @@ class PointBatches:
 
 
 def products(J: Array, out: Array) -> None:
-    """Products J J^T of the rows of each batch but the last row, summed over u and v and over the points.
+    """Products J J^T of the rows of each batch without the last, summed over u and v and over the points.
 
-    With the last row as a column more than is needed, NumPy does not see that the product is symmetric: as a
-    plain one it takes half of the time.
+    The last row is multiplied as one column too many, so that NumPy does not detect the symmetric product: a
+    general product takes half of the time.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def batches_of(
 
 
 def _batch_size(counts: NDArray[np.intp]) -> int:
-    """The batch size that costs least: padding costs points, batches cost a fixed overhead each."""
+    """The cheapest batch size: padding adds points, and each batch has a fixed overhead."""
     most = int(counts.max())
     if most <= _LARGEST_BATCH and most == counts.min():
         return most

@@ -1,6 +1,6 @@
-"""One calibration problem: the points, and what is given of the camera (the paper's section 4.1).
+"""A calibration problem: the points, and the given parameters of the camera (the paper's section 4.1).
 
-Type 1: nothing. Type 2: the image centre, W13 and W23. Type 3: the intrinsics, all of W.
+Given are: type 1: nothing. Type 2: the image centre, W13 and W23. Type 3: the intrinsics, all of W.
 Type 4: the extrinsics, V.
 """
 
@@ -25,9 +25,10 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, rotation_to_axis
 from neurocal_cli.points import Correspondences
 
-_LEAST_DEPTH = 0.1  # of a ray: 84 degrees from a view's middle
+_LEAST_DEPTH = 0.1  # smallest depth of a unit ray: 84 degrees from the view's mean direction
 _LARGEST = 1e9  # px; no image is larger
-_RIM, _HALVINGS = 0.02, 30  # of the distance from the centre: noise puts pixels no farther outside
+# Noise puts pixels at most this share of their distance from the centre beyond the lens's domain.
+_RIM, _HALVINGS = 0.02, 30
 _MAX_ITERATIONS = 200
 
 
@@ -39,29 +40,29 @@ class Problem:
     ----------
     points : Correspondences
     views : Views
-        The same points, normalised. A given distortion is taken off their pixels, because the networks
-        know a pinhole only, until `with_seen_pixels`.
+        The same points, normalised. A given distortion is removed from their pixels, because the networks
+        model a pinhole; `with_seen_pixels` restores it.
     type : int
     entries : (5,) array
-        A11, A12, A22, A13, A23 [px]; only the given ones mean something.
+        A11, A12, A22, A13, A23 [px]; only the given ones are meaningful.
     free : (5,) bool array
         Entries to estimate.
     poses : dict of Pose by view, or None
-        The given ones.
+        The given poses.
     fixed : frozenset of str
         Names of the given intrinsic parameters, and of distortion coefficients that stay as they are.
     intrinsics : Intrinsics or None
-        All of them, for type 3: returned as they are.
+        The given intrinsics of type 3, returned unchanged.
     distortion : Distortion
-        The distortion model to end with; its coefficients where they are given.
+        The final distortion model, with its coefficients if they are given.
     free_distortion : bool
-        Whether the other coefficients are estimated.
+        Whether the coefficients that are not fixed are estimated.
     restraint : callable, optional
-        What the distortion has to obey beside the points: a condition of these points, or a rich lens's
-        prior, which goes for other points too.
+        Extra residuals on the distortion: a condition that holds for these points only, or a rich lens's
+        prior, which holds for any points.
     turned : (V, 3, 3) array, optional
-        With a given wide lens taken off, the pinhole of each view looks at its target: rotations from the
-        camera's frame to that pinhole's. Until `with_seen_pixels`.
+        If a given wide lens is removed, each view has a pinhole that looks at its target: rotations from the
+        camera's frame to that pinhole's. None after `with_seen_pixels`.
     """
 
     points: Correspondences
@@ -88,7 +89,7 @@ class Problem:
 
     @property
     def free_of_prior(self) -> NDArray[np.bool_]:
-        """The same without a rich lens's nodes, which a prior holds where points do not."""
+        """`free_camera` without the nodes of a rich lens, which its prior determines where points do not."""
         free = self.free_camera
         if self.distortion.model == "rich":
             free[5 + FIRST_NODE :] = False
@@ -101,17 +102,17 @@ class Problem:
 
     @property
     def n_parameters(self) -> int:
-        """Number of unknowns that the points alone have to determine."""
+        """Number of unknowns that the points must determine without a prior."""
         return int(self.free_of_prior.sum()) + (6 * self.views.n_views if self.free_poses else 0)
 
     @property
     def given_centre(self) -> Array | None:
-        """(2,) the image centre [px], where it is given."""
+        """(2,) the image centre [px] if it is given, else None."""
         return None if self.free[3] else self.entries[3:]
 
     @property
     def normalised_entries(self) -> Array:
-        """The given entries in normalised pixels, ``S1^-1 A``; (5,). The free ones mean nothing."""
+        """The given entries in normalised pixels, ``S1^-1 A``; (5,). The free ones are meaningless."""
         scaled = self.entries.copy()
         scaled[3:] -= self.views.pixel_centre
         return scaled / self.views.pixel_scale
@@ -123,12 +124,12 @@ class Problem:
         return intrinsic_matrix(np.where(self.free, pixels, self.entries))
 
     def with_points(self, points: Correspondences) -> Problem:
-        """The same question asked of other points.
+        """The same problem with other points.
 
         Raises
         ------
         InputError
-            A pixel at which the given distortion cannot have seen anything.
+            The given distortion maps no ray to one of the pixels.
         DegenerateGeometryError
             All pixels coincide.
         """
@@ -140,22 +141,22 @@ class Problem:
         return replace(self, points=points, views=views, turned=turned, restraint=restraint)
 
     def with_model(self, model: str) -> Problem:
-        """The same points with another distortion model to be estimated."""
-        # Coefficients that stay as they are belong to the model before.
+        """The same points with another distortion model to estimate."""
+        # Fixed coefficients belong to the previous model.
         fixed = self.fixed & set(INTRINSIC_NAMES)
         return replace(
             self, distortion=Distortion(model), free_distortion=model != "none", fixed=fixed, restraint=None
         )
 
     def with_seen_pixels(self) -> Problem:
-        """The same problem with the pixels as they were seen, normalised as before."""
+        """The same problem with the observed (distorted) pixels, normalised as before."""
         views = self.views
         order = slice(None) if views.order is None else views.order
         pixels = (self.points.pixels[order] - views.pixel_centre) / views.pixel_scale
         return replace(self, views=replace(views, pixels=pixels), turned=None)
 
     def as_seen(self, state: CameraState) -> tuple[Problem, CameraState]:
-        """A given distortion put back, which was taken off the pixels for what knows a pinhole only."""
+        """Undo the removal of a given distortion: the problem with observed pixels, and its state."""
         state = replace(state, model=self.distortion.model, k=self.distortion.coefficients)
         if self.turned is not None:
             back = np.swapaxes(self.turned, 1, 2)
@@ -165,8 +166,8 @@ class Problem:
     def adjust(self, start: CameraState | Adjusted, max_iterations: int = _MAX_ITERATIONS) -> Adjusted:
         """Minimise the reprojection error (3) from a state; see `adjust`.
 
-        A pinhole whose distortion is to be estimated begins with coefficients that leave it one. Iterations
-        are counted on from a start that is itself an adjustment.
+        If the distortion is estimated and the start is a pinhole, its coefficients start at those of a
+        pinhole. If the start is itself an adjustment, its iterations are added.
         """
         done = start.iterations if isinstance(start, Adjusted) else 0
         state = start.state if isinstance(start, Adjusted) else start
@@ -194,7 +195,7 @@ def problem_for(
     skew: bool = True,
     distortion: Distortion | None = None,
 ) -> Problem:
-    """Check what is given against what the problem type needs.
+    """State a problem; check that the given parameters are those of its type.
 
     Parameters
     ----------
@@ -208,10 +209,9 @@ def problem_for(
     Raises
     ------
     UsageError
-        A type that does not exist, something missing for the type, or given but of no use to it.
+        The type does not exist, a parameter that it needs is missing, or one that it does not use is given.
     InputError
-        Values that are not finite, extrinsics without one of the views, a pixel at which the given
-        distortion cannot have seen anything.
+        A value is not finite, the extrinsics lack a view, or the given distortion maps no ray to a pixel.
     DegenerateGeometryError
         All pixels coincide.
     """
@@ -236,7 +236,7 @@ def problem_for(
         fixed |= {"u0", "v0"}
     elif type == 3:
         if intrinsics is None:
-            raise UsageError("type 3 needs the intrinsics of the camera; give them")
+            raise UsageError("type 3 needs the intrinsics of the camera; give intrinsics=")
         entries = intrinsics.A[ENTRIES]
         if not np.abs(entries[[0, 2]]).min() > 1 / _LARGEST or np.abs(entries).max() > _LARGEST:
             raise InputError(
@@ -261,7 +261,7 @@ def problem_for(
 def _undistorted_views(
     points: Correspondences, distortion: Distortion, entries: Array
 ) -> tuple[Views, Array | None]:
-    """Views of points without a given distortion, and how the pinhole of each is turned."""
+    """Views with a given distortion removed from their pixels, and the rotations of their pinholes."""
     if distortion.is_identity:
         return arrange(points), None
     camera = Camera(Intrinsics.from_matrix(intrinsic_matrix(entries)), distortion)
@@ -289,7 +289,7 @@ def _undistorted_views(
 
 
 def _seen_nearby(camera: Camera, pixels: Array) -> Array:
-    """The pixels; those just outside what the camera sees, by noise, at its rim, and nan farther out."""
+    """The pixels; those just outside the lens's domain (by noise) are moved to its rim, others are nan."""
     outside = np.flatnonzero(~np.isfinite(camera.unproject(pixels)[:, 0]))
     if not outside.size:
         return pixels
@@ -307,9 +307,9 @@ def _seen_nearby(camera: Camera, pixels: Array) -> Array:
 
 
 def _turned_pixels(points: Correspondences, rays: Array, camera: Camera) -> tuple[Array, Array]:
-    """Pixels (N, 2) of pinholes that look at the middle of each view's rays, and their rotations (V, 3, 3).
+    """Pixels (N, 2) of pinholes that look along the mean ray of each view, and their rotations (V, 3, 3).
 
-    A target may be seen far beyond 90 degrees from the axis, but it is seen within a cone of less.
+    A target may lie more than 90 degrees from the camera's axis, but it spans a cone of less than that.
     """
     index = points.view_index
     sums = np.zeros((points.n_views, 3))
@@ -326,7 +326,7 @@ def _turned_pixels(points: Correspondences, rays: Array, camera: Camera) -> tupl
 def _centre(points: Correspondences, image_center: tuple[float, float] | None) -> Array:
     centre = image_center if image_center is not None else points.image_center
     if centre is None and points.image_size is not None:
-        # The first pixel's centre is 0, the last one's is the size less 1.
+        # Pixel centres run from 0 to the size less 1.
         centre = ((points.image_size[0] - 1) / 2, (points.image_size[1] - 1) / 2)
     if centre is None:
         raise UsageError("type 2 needs the image centre; give it, or put image_center into the points file")
@@ -341,7 +341,7 @@ def _centre(points: Correspondences, image_center: tuple[float, float] | None) -
 
 def _poses(points: Correspondences, extrinsics: Mapping[str, Pose] | None) -> dict[str, Pose]:
     if extrinsics is None:
-        raise UsageError("type 4 needs the extrinsics of each view; give them")
+        raise UsageError("type 4 needs the extrinsics of each view; give extrinsics=")
     missing = [name for name in points.view_names if name not in extrinsics]
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""

@@ -1,9 +1,9 @@
-"""Views that repeat a pose: frames of a video that stands still, or photographs from a tripod.
+"""Views that repeat a pose: frames of a video without motion, or photographs from a tripod.
 
-Such views are one view to everything that counts views. Whether their errors are news is measured: where the
-same point has the same residual in all of them, n views say no more than one; where the residuals are
-independent, they average. With the correlation rho of residuals between copies, n of them are worth
-n / (1 + (n - 1) rho) views.
+Such views count as one view wherever views are counted. How much independent information they hold is
+measured: if a point has the same residual in all of them, n views are worth no more than one; if the
+residuals are independent, they average out. If rho is the correlation of residuals between repeated views, n
+of them are worth n / (1 + (n - 1) rho) views.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from neurocal_cli.least_squares.leave_out import folds_of
 
 # Repeated by tests/test_repeated_poses.py: copies with 0.01 to 0.1 px of motion are found, and no two of a
 # thousand random views are called the same.
-_STILL = 1.0  # px that the target's points may move, or
-_NOISE = 3.0  # standard deviations of their noise
-_ROWS = 1000  # of a table of distances that is held at a time
+_STILL = 1.0  # px by which the target's points may move, or
+_NOISE = 3.0  # this many standard deviations of their noise, if that is more
+_ROWS = 1000  # rows of the distance matrix computed at a time
 
 
 @frozen_dataclass(eq=False)
 class RepeatedPoses:
-    """Which views repeat which.
+    """Groups of views that share a pose.
 
     Attributes
     ----------
     group : (V,) int array
-        Pose that each view shows, numbered from 0 in the order of the views.
+        Number of each view's pose, from 0 in the order of the views.
     correlation : float
-        Of the same point's residuals in views of one pose, 0 to 1.
+        Correlation of a point's residuals between views of one pose, 0 to 1.
     """
 
     group: NDArray[np.intp]
@@ -53,25 +53,25 @@ class RepeatedPoses:
 
     @property
     def size(self) -> NDArray[np.intp]:
-        """(P,) views of each pose."""
+        """(P,) number of views of each pose."""
         return np.bincount(self.group, minlength=self.n_poses)
 
     @property
     def variance(self) -> Array:
-        """(P,) how many times the variance of the sum over a pose's views is that of independent views."""
+        """(P,) variance of a sum over the views of a pose, relative to that of independent views."""
         return np.asarray(1.0 + (self.size - 1) * self.correlation)
 
     @property
     def worth(self) -> float:
-        """Share of the views' number that they are worth."""
+        """Effective number of independent views over the number of views."""
         return float((self.size / self.variance).sum() / len(self.group))
 
     def folds(self, n_folds: int) -> NDArray[np.intp]:
-        """(V,) fold of each view; views of one pose are in the same."""
+        """(V,) fold of each view; views of one pose are in the same fold."""
         return folds_of(self.n_poses, n_folds)[self.group]
 
     def summed(self, of_views: Array) -> Array:
-        """Sums (P, ...) over the views of each pose of something that each view (V, ...) has."""
+        """Sum values of the views (V, ...) over the views of each pose; (P, ...)."""
         out = np.zeros((self.n_poses, *of_views.shape[1:]))
         np.add.at(out, self.group, of_views)
         return out
@@ -84,9 +84,9 @@ def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedP
     ----------
     views : Views
     state : CameraState
-        Normalised, of a fit.
+        Normalised state of a fit.
     errors : (N, 2) array
-        Its residuals, normalised, in the order of the points.
+        Its normalised residuals, in the order of the views' points.
     """
     noise = float(np.sqrt((errors**2).mean())) if len(errors) else 0.0
     group = _by_distance(_seen(views, state), max(_STILL / views.pixel_scale, _NOISE * noise))
@@ -96,7 +96,7 @@ def repeated_poses(views: Views, state: CameraState, errors: Array) -> RepeatedP
 
 
 def _seen(views: Views, state: CameraState) -> Array:
-    """Where each view's pose puts five places of the target; (V, 10). Only a wide lens is distorted."""
+    """Normalised pixels of five target points in each view; (V, 10). Only wide lenses are distorted."""
     centre = np.average(views.centre, axis=0, weights=views.counts)
     reach = views.scale[0] * views.extent[0, :2] * views.basis[0][:, :2]  # columns
     places = centre + np.concatenate([np.zeros((1, 3)), reach.T, -reach.T])
@@ -111,9 +111,9 @@ def _seen(views: Views, state: CameraState) -> Array:
 
 
 def _by_distance(seen: Array, near: float) -> NDArray[np.intp]:
-    """Number of the pose of each view: the first view of a pose and all that are near it.
+    """Pose number of each view: a pose consists of its first view and all views near that one.
 
-    Not the ones near those: a slow video would be a single pose.
+    Nearness is not transitive here; otherwise a slow video would be a single pose.
     """
     V = len(seen)
     leader = np.arange(V)
@@ -133,7 +133,7 @@ def _by_distance(seen: Array, near: float) -> NDArray[np.intp]:
 
 
 def _correlation(views: Views, errors: Array, group: NDArray[np.intp]) -> float:
-    """Of the same point's residuals in views of one pose; what chance may leave is none."""
+    """Correlation of a point's residuals between views of one pose; negative ones count as 0."""
     size = np.bincount(group)
     rows = np.flatnonzero((size > 1)[group][views.index])
     view = views.index[rows]

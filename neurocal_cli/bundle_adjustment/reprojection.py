@@ -1,8 +1,8 @@
-"""The pixel error (3) of a camera and its poses: residuals, derivatives, normal matrices.
+"""The reprojection error (3) of a camera and its poses: residuals, derivatives, normal matrices.
 
 All quantities are normalised, unless said otherwise: pixels by S1, the world by each view's own S2. The
-columns of every matrix here are the five entries of A, the pose (omega, tau), the coefficients of the
-distortion, the residual.
+columns of every matrix here are the five entries of A, the pose (omega, tau), the distortion coefficients
+and the residual, in this order.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ _COEFFICIENTS = 11  # first column of the coefficients of the distortion
 
 
 def camera_columns(n_coefficients: int) -> NDArray[np.intp]:
-    """Columns (5 + K,) of what all views share: the entries of A, then the coefficients."""
+    """Columns (5 + K,) of the parameters that all views share: the entries of A, then the coefficients."""
     return np.concatenate([np.arange(5), _COEFFICIENTS + np.arange(n_coefficients)])
 
 
 @frozen_dataclass(eq=False)
 class CameraState:
-    """Camera and poses as an adjustment moves them, in normalised units or in pixels and world units.
+    """Camera and poses, the unknowns of an adjustment, in normalised units or in pixels and world units.
 
     Attributes
     ----------
     entries : (1, 5) or (V, 5) array
-        A11, A12, A22, A13, A23 of the camera that all views share, or of a camera for each.
+        A11, A12, A22, A13, A23 of the camera that all views share, or of each view's own camera.
     R : (V, 3, 3) array
     t : (V, 3) array
     model : str
@@ -67,7 +67,7 @@ class CameraState:
         return replace(self, model=model, k=k)
 
     def of_view(self, view: int) -> CameraState:
-        """Of one view alone."""
+        """The state of one view alone."""
         own = slice(view, view + 1)
         entries = self.entries if len(self.entries) == 1 else self.entries[own]
         k = self.k if self.k.ndim == 1 else self.k[view]
@@ -87,9 +87,9 @@ class CameraState:
         )
 
     def _along_valley(self, by_entries: Array, by_k: Array) -> Array:
-        """What a step needs beyond first order to follow the valley in which xi and alpha compensate.
+        """Second-order correction of a step along the valley in which xi and alpha compensate.
 
-        The scale in the middle of the image, alpha / (1 + xi), is what the points tell.
+        The points determine the scale in the image centre, alpha / (1 + xi).
         """
         bend = np.zeros_like(by_entries)
         xi, by_xi = self.k[..., :1], by_k[:, :1]
@@ -98,18 +98,18 @@ class CameraState:
 
     def camera_of(self, view: NDArray[np.intp]) -> tuple[Sequence[Any] | Array, Sequence[Any] | Array]:
         """A's entries and the coefficients for the points of some batches, given each batch's view."""
-        # Of one camera: plain numbers are quicker than NumPy's, or than columns of one.
+        # For one camera, Python numbers are faster than NumPy scalars or columns of one.
         entries = self.entries[view].T[..., None] if len(self.entries) > 1 else self.entries[0].tolist()
         return entries, self.k.tolist() if self.k.ndim == 1 else self.k[view].T[..., None]
 
 
 def normal_blocks(batches: PointBatches, state: CameraState) -> tuple[Array, NDArray[np.bool_]]:
-    """Products of derivatives and residuals summed over each view's points.
+    """Normal matrices: products of derivatives and residuals, summed over each view's points.
 
     Returns
     -------
     normal : (V, 12 + K, 12 + K) array
-        Columns: by A11, A12, A22, A13, A23, omega (3), tau (3), K coefficients, and the residual.
+        Columns: derivatives by A11, A12, A22, A13, A23, omega (3), tau (3), K coefficients, and the residual.
     sensible : (V,) bool array
         Whether all the view's points have positive depth and lie where the distortion is monotonic.
     """
@@ -143,7 +143,7 @@ def residuals(batches: PointBatches, state: CameraState) -> Array:
 def predicted_pixels(
     state: CameraState, world: Array, view: NDArray[np.intp]
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Where points are seen through the pose of each one's view.
+    """Project world points, each with the pose of its view.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def predicted_pixels(
 
 
 def farthest_angle(views: Views, state: CameraState) -> float:
-    """Largest angle of a point from the axis [rad]."""
+    """Largest angle between a point's ray and the optical axis [rad]."""
     X, Y, Z = ((state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]).T
     return float(np.arctan2(np.hypot(X, Y), Z).max())
 
@@ -173,8 +173,8 @@ def farthest_angle(views: Views, state: CameraState) -> float:
 def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Array) -> NDArray[np.bool_]:
     """Fill out (T, 12 + K, 2, n) with the derivatives of the pixels and the residuals.
 
-    Around the centroid, Xc = exp(omega) R M + t + tau, so d Xc = omega x Y + tau with Y = R M: the derivative
-    by tau is that by the point, and by omega it is Y x the same.
+    Around the centroid, Xc = exp(omega) R M + t + tau, so d Xc = omega x Y + tau with Y = R M. The derivative
+    by tau is the derivative by the point, and the derivative by omega is the cross product of Y with it.
     """
     view, pixels = batches.view[chunk], batches.pixels[chunk]
     entries, k = state.camera_of(view)
@@ -199,7 +199,7 @@ def derivatives(batches: PointBatches, chunk: slice, state: CameraState, out: Ar
 
 def _whiten(u: Array, v: Array, factors: Array) -> None:
     """Multiply each point's two rows by its upper triangular factor, in place."""
-    # The rows are used again: entries that stay 0 must be 0 before whitening mixes the rows.
+    # The buffer is reused: structural zeros must be set again before whitening mixes the rows.
     u[:, 2] = u[:, 4] = v[:, 0] = v[:, 1] = v[:, 3] = 0.0
     u *= factors[:, None, 0]
     u += v * factors[:, None, 1]

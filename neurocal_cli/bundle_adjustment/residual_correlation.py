@@ -1,7 +1,7 @@
-"""Whether residuals are noise: neighbours in an image know nothing of each other.
+"""Spatial correlation of residuals, which tells model errors from noise.
 
-A distortion model that is too simple, a board that is not flat, points that are not where they are said to
-be: all leave residuals that are alike in neighbouring points. Noise does not.
+A distortion model that is too simple, a board that is not flat or wrong world coordinates leave similar
+residuals in neighbouring points. Noise is uncorrelated.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from neurocal_cli.bundle_adjustment.reprojection import CameraState, residuals
 from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.geometry import Array
 
-_SOME_SAY = 0.5  # from which on what points say along their edges counts
+_SOME_SAY = 0.5  # least weight along edges with which residuals in that direction are used
 
 
 def correlation(views: Views, errors: Array) -> float:
@@ -24,7 +24,7 @@ def correlation(views: Views, errors: Array) -> float:
     ----------
     views : Views
     errors : (N, 2) array
-        Residual of each point, in the order of `views`; what was not measured of it does not count.
+        Residual of each point, in the order of `views`; directions that were not measured are ignored.
 
     Returns
     -------
@@ -34,9 +34,9 @@ def correlation(views: Views, errors: Array) -> float:
     group, n_groups = views.index, views.n_views
     across = views.across if views.along < _SOME_SAY else None
     if across is not None:
-        # Mid-points of edges one way tell nothing of what those of edges the other way say.
+        # Edges of the two orientations measure different directions, so each point is paired within its own.
         group, n_groups = 2 * group + _other_way(views, across), 2 * n_groups
-    # Strips of each view as high as neighbours are apart; along a strip they follow each other.
+    # Cut each view into strips as high as the spacing of its points; neighbours follow each other in a strip.
     low = np.minimum.reduceat(views.pixels, views.first)
     extent = np.maximum.reduceat(views.pixels, views.first) - low
     strips = np.maximum(np.sqrt(np.bincount(group, minlength=n_groups)), 1.0)[group]
@@ -55,9 +55,9 @@ def correlation(views: Views, errors: Array) -> float:
 
 
 def _other_way(views: Views, across: Array) -> NDArray[np.int64]:
-    """0 or 1 for each point: the side of its edge among the two ways that a view's edges run."""
+    """0 or 1 for each point: the orientation of its edge, one of the two in which a view's edges run."""
     nu, nv = unit(across).T
-    # Four times the angle is the same for both ways, so its mean tells how the edges lie.
+    # Four times the angle is the same for both orientations, so its circular mean gives the view's axes.
     angle = 4 * np.arctan2(nv, nu)
     c, s = (np.add.reduceat(f(angle) * single(across), views.first) for f in (np.cos, np.sin))
     lie = (np.arctan2(s, c) / 4)[views.index]
@@ -65,7 +65,7 @@ def _other_way(views: Views, across: Array) -> NDArray[np.int64]:
 
 
 def effective_number(n: float, rho: float) -> float:
-    """How many independent points n correlated ones are worth, in the plane."""
+    """Effective number of independent points among n correlated ones in the plane."""
     rho = min(max(rho, 0.0), 0.99)
     return max(n * ((1 - rho) / (1 + rho)) ** 2, 1.0)
 

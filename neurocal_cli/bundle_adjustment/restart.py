@@ -1,4 +1,4 @@
-"""A solution adjusted again to other points: fewer of them, or those of fewer views."""
+"""Adjust a known solution again to other points: fewer of them, or those of fewer views."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.bundle_adjustment.units import normalised
 from neurocal_cli.points import Correspondences
 
-_SAME = 0.9  # times the squared error: fifteen unknowns of a lens take a twentieth of 300 residuals
+# Least ratio of the squared errors after and before, at the same minimum: the fifteen unknowns of a lens
+# explain a twentieth of 300 residuals.
+_SAME = 0.9
 
 
 def restarted(solution: Solution, points: Correspondences) -> Solution:
@@ -28,22 +30,22 @@ def restarted(solution: Solution, points: Correspondences) -> Solution:
 
 
 def of_few_views(solution: Solution, most: int) -> Solution:
-    """The solution adjusted to at most so many of its views."""
+    """The solution adjusted to at most `most` of its views."""
     few = solution.problem.points.of_few_views(most)
     return solution if few is solution.problem.points else restarted(solution, few)
 
 
 def is_elsewhere(few: Solution, whole: Solution) -> bool:
-    """Whether a solution went to another minimum when it was adjusted `of_few_views`.
+    """Whether a solution moved to another local minimum when it was adjusted `of_few_views`.
 
-    Without other unknowns of these views, the squared error that they had before hardly becomes smaller.
+    At the same minimum, the squared error of these views hardly drops.
     """
     before, _ = normal_blocks(few.problem.views.batches, _start(few.problem, whole))
     return bool(few.adjusted.cost.sum() < _SAME * before[:, -1, -1].sum())
 
 
 def _start(problem: Problem, solution: Solution) -> CameraState:
-    """The state of a solution for a problem with all of its views, or some of them."""
+    """The state of a solution, reduced to the views of a problem and normalised as they are."""
     known, place = solution.in_pixels, _places(problem, solution)
     return normalised(replace(known, R=known.R[place], t=known.t[place]), problem.views)
 

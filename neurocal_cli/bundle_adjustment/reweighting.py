@@ -1,4 +1,4 @@
-"""Points weighed by their measured covariances only as far as the residuals bear them out."""
+"""Reweight points: their measured covariances count only as far as the residuals support them."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.points import Correspondences
 
 _PASSES = 10
-_SETTLED = 0.005  # change of the share that no result depends on
+_SETTLED = 0.005  # change of the share that is negligible for every result
 
 
 def reweighted(solution: Solution) -> Solution:
-    """Adjust again with the share of the noise that is the same for all points; see `common_noise`.
+    """Alternate between adjusting and estimating the noise common to all points; see `common_noise`.
 
     Parameters
     ----------
     solution : Solution
-        Adjusted by the stated covariances alone.
+        Adjusted with the stated covariances alone.
     """
     points = solution.problem.points
     if points.covariance is None or not measured(points.covariance):
         return solution
-    # From equal weights: residuals of a fit that a few points dominate would confirm that they should.
+    # Start from equal weights: if a few points dominated the fit, their small residuals would confirm that.
     noise = Noise(share=1.0)
     solution = _weighed(solution, noise)
     for _ in range(_PASSES):
@@ -40,7 +40,7 @@ def reweighted(solution: Solution) -> Solution:
 
 
 def weighed(points: Correspondences, residuals: Array) -> Views:
-    """Points arranged, and weighed as far as residuals (N, 2) [px] of a calibration bear out."""
+    """Arrange points and weight them as far as the residuals (N, 2) [px] of a calibration support that."""
     views = arrange(points)
     if points.covariance is None or not measured(points.covariance):
         return views

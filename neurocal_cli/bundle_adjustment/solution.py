@@ -1,4 +1,4 @@
-"""What the stages of one calibration hand on: the problem, its solution so far, and how it was found."""
+"""`Solution`, which the stages of a calibration pass on: the problem, its minimum, and how it was found."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 @frozen_dataclass(eq=False)
 class TrainingRecord:
-    """What was tried.
+    """Record of the training.
 
     Attributes
     ----------
     agreed : (V,) int array
-        How many of each view's random starts ended at its best result.
+        Number of each view's random starts that ended at its best result.
     starts, iterations : int
-        Random starts, and their training steps.
+        Number of random starts, and of their training steps.
     squares, before : float
-        Sum of E_2D's squares after training; squared reprojection error where bundle adjustment began.
+        Sum of squares of E_2D after training; squared reprojection error at the start of bundle adjustment.
     curve : (J,) array
         Learning curve of the first view's best start.
     """
@@ -47,7 +47,7 @@ class TrainingRecord:
 
     @classmethod
     def empty(cls, n_views: int) -> TrainingRecord:
-        """Nothing was tried yet."""
+        """The record before any training."""
         return cls(np.zeros(n_views, dtype=np.int64))
 
     @property
@@ -58,7 +58,7 @@ class TrainingRecord:
     def with_starts(
         self, views: NDArray[np.intp], agreed: NDArray[np.int64], starts: int, iterations: int
     ) -> TrainingRecord:
-        """Add the random starts of some views; what was known of these views is replaced."""
+        """Add random starts of some views; their `agreed` is replaced."""
         everywhere = self.agreed.copy()
         everywhere[views] = agreed
         return replace(
@@ -68,38 +68,38 @@ class TrainingRecord:
 
 @frozen_dataclass(eq=False)
 class Solution:
-    """What was found, in normalised units.
+    """Solution of a problem, in normalised units.
 
     Attributes
     ----------
     problem : Problem
-        What it solves.
+        The problem that it solves.
     adjusted : Adjusted
         The minimum of the reprojection error.
     record : TrainingRecord
     shared : (n, n) array, optional
-        Covariance of A's free entries and the free distortion coefficients, where it is not that of the
-        normal matrix.
+        Covariance of A's free entries and the free distortion coefficients, if it is not that of the normal
+        matrix.
     by_prior : float
-        How many of the estimated coefficients a prior determines, not the points.
+        Effective number of estimated coefficients that a prior determines instead of the points.
     common_noise : float
-        Share of the noise that is the same for all points; see `common_noise`.
+        Share of the noise that is common to all points; see the module `common_noise`.
     model_errors : dict of float by distortion model [px], optional
-        Cross-validation errors of the models that ``distortion="auto"`` chose from.
+        Cross-validation errors of the candidate models of ``distortion="auto"``.
     would_take : frozenset of str
-        Models that would have been taken in one of these choices, had they been preferred.
+        Models that one of these selections would have chosen, had they been preferred.
     straight_lines : StraightLines, optional
-        What ``distortion="plumb-line"`` found the distortion from.
+        The straight lines from which ``distortion="plumb-line"`` estimated the distortion.
     refusal : str
-        Why this is no answer, if so.
+        Why this solution must be refused; empty if it is valid.
     target : Target, optional
-        The target, where it was found with the camera; the problem's points are where it has them.
+        The target if it was estimated with the camera; the problem's points are then those of the target.
     target_kept : bool
-        Whether the target was chosen as given, where it could have been found.
+        Whether the given target was kept although it could have been estimated.
     ambiguity : Ambiguity, optional
-        Other cameras that explain the points as well.
+        Other cameras that explain the points equally well.
     of_all : Solution, optional
-        The fit of all points, where some of them were set aside afterwards.
+        The fit of all points, if some were rejected afterwards.
     """
 
     problem: Problem
@@ -124,5 +124,5 @@ class Solution:
 
     @property
     def in_pixels(self) -> CameraState:
-        """The camera and the poses in pixels and world units, poses in the order of the problem's views."""
+        """Camera and poses in pixels and world units; poses are in the order of the problem's views."""
         return in_pixels(self.problem, self.state)

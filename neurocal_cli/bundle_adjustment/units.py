@@ -1,4 +1,4 @@
-"""Between a state in normalised units and one in pixels and world units."""
+"""Convert a state between normalised units and pixels with world units."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from neurocal_cli.geometry import Array
 
 
 def in_pixels(problem: Problem, state: CameraState) -> CameraState:
-    """Take a normalised state into pixels and world units; given entries come back exactly as given."""
+    """Convert a normalised state to pixels and world units; given entries come back exactly as given."""
     entries = problem.matrix(state.entries[0])[ENTRIES]
     return replace(state, entries=entries[None], t=translations(problem.views, state))
 
 
 def normalised(state: CameraState, views: Views) -> CameraState:
-    """The inverse, for the normalisation of any views; the poses are those of `views`, in their order."""
+    """Convert a state to the normalised units of `views`; its poses are those of `views`, in their order."""
     entries = state.entries.copy()
     entries[:, 3:] -= views.pixel_centre
     t = translations_normalised(views, state.R, state.t)
@@ -28,7 +28,7 @@ def normalised(state: CameraState, views: Views) -> CameraState:
 
 
 def translations(views: Views, state: CameraState) -> Array:
-    """(V, 3) t in world units; the normalised one is of each view's centroid."""
+    """(V, 3) t in world units, from the normalised t, which refers to each view's centroid."""
     return state.t * views.scale[:, None] - (state.R @ views.centre[..., None])[..., 0]
 
 

@@ -1,16 +1,17 @@
-"""Standard deviations that count views, where residuals of one view err together.
+"""Jackknife covariance over views, for residuals that are correlated within a view.
 
-The inverse normal matrix takes every residual for independent. On a board that is not quite flat, with a
-focus that moves, or under a lens that is not quite as modelled, whole views err together, and the parameters
-scatter more from view to view than the residuals say. The jackknife sees that: each view is left out in one
+The inverse normal matrix treats all residuals as independent. But if the board is not quite flat, the focus
+moves or the lens model is not quite right, the errors of a view are correlated, and the parameters scatter
+more from view to view than the residuals suggest. The jackknife measures that: each view is left out by one
 step, d_v = -(S - S_v)^-1 g_v with the poses eliminated, and
 
     covariance = (V - 1) / V  sum_v (d_v - mean) (d_v - mean)^T.
 
-With few views it is a rough measure. Taken always, it would make the std of clean data a third too large at
-five views, and a quarter at ten. So it is taken only where views contradict each other more than chance
-allows, and nowhere below the normal matrix's; and on boards that bend anew in each view, which hides that,
-where it is far larger. Views that repeat a pose (`repeated_poses`) are one view here.
+With few views it is imprecise: used always, it would make the std of clean data a third too large with five
+views, and a quarter with ten. So it is used only if the views contradict each other more than chance allows,
+and it never goes below the covariance of the normal matrix. If each view has bends of its own, they hide such
+contradictions; then it is used if it is far larger than the covariance of the normal matrix. Views that
+repeat a pose (`repeated_poses`) count as one.
 """
 
 from __future__ import annotations
@@ -32,14 +33,14 @@ from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan, sol
 from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diagonal
 
 _CHANCE = 1.645  # sigmas: one clean set in twenty
-_TOLD = 1e-10  # least eigenvalue of a normal matrix with a unit diagonal that rounding leaves alone
-# Variance by the jackknife over that of the normal matrix, from which on it is believed where boards bend
-# anew in each view: at most 11.5 in 63 sets of tests/test_simulated_targets.py, and 21 to 73 in photographs.
+_TOLD = 1e-10  # least eigenvalue of a normal matrix with unit diagonal that is not dominated by rounding
+# Ratio of the jackknife's variance to that of the normal matrix from which on it is used for boards with a
+# bend in each view: at most 11.5 in 63 sets of tests/test_simulated_targets.py, and 21 to 73 in photographs.
 _GROWN = 15.0
-_FEWEST = 3  # poses, of which one can be left out and two still differ
+_FEWEST = 3  # fewest poses: with one left out, two must still differ
 
 
-# What nothing determines is infinite or nan, and told so by the results.
+# Undetermined parameters become inf or nan; the results are tested for that.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def counting_views(
     found: Covariance,
@@ -51,26 +52,26 @@ def counting_views(
     moves_without: Callable[[NDArray[np.intp]], Array | None] | None = None,
     bends: bool = False,
 ) -> Covariance:
-    """Covariances as far as views, not residuals, are independent.
+    """Covariances for residuals that are independent between views only.
 
     Parameters
     ----------
     found : Covariance
-        Of the normal matrix.
+        From the normal matrix.
     normal, free, free_poses, n_residuals
         As for `covariance.covariance`.
     repeated : RepeatedPoses
     moves_without : callable, optional
-        How far the free parameters move without the views of each pose, given each view's pose, where the
-        normal matrices do not tell.
+        Moves of the free parameters when the views of each pose are left out, given the pose number of each
+        view; needed if they do not follow from the normal matrices.
     bends : bool
-        Whether each view has bends of its own. Other causes for which views contradict each other end in
-        these bends, too, and only the jackknife shows that.
+        Whether each view has bends of its own. They absorb contradictions between views that have other
+        causes, and only the jackknife reveals those.
 
     Returns
     -------
     Covariance
-        The one given where views contradict each other no more than residuals do.
+        `found` if the views contradict each other no more than the residuals explain.
     """
     if not free.any() or not np.isfinite(found.entries).all():
         return found
@@ -102,16 +103,16 @@ def counting_views(
 
 @frozen_dataclass(eq=False)
 class _Determined:
-    """Directions of the unknowns that the points tell: p = into z, z = back p."""
+    """Directions of the unknowns that the points determine: p = into z, z = back p."""
 
     into: Array
     back: Array
 
 
 def _determined(S: Array) -> _Determined | None:
-    """Without the directions in which rounding has the say; None where there are none.
+    """Directions not dominated by rounding; None if these are all or none.
 
-    The coefficients of a rational model hardly tell themselves apart, though what they project is certain.
+    Coefficients of a rational model are almost degenerate, although the projection is well determined.
     """
     scaled, scale = unit_diagonal(S)
     try:
@@ -129,7 +130,7 @@ def _determined(S: Array) -> _Determined | None:
 def scores_of_poses(
     normal: Array, free: NDArray[np.bool_], free_poses: bool, repeated: RepeatedPoses
 ) -> Quadratics:
-    """Quadratics of the different poses at their minimum, weighed so that cov(g) is variance times S.
+    """Quadratics of the different poses at their minimum, weighted so that cov(g) is variance times S.
 
     The parameters are those of `reduced`.
     """
@@ -142,7 +143,7 @@ def _weighed(q: Quadratics, times: Array) -> Quadratics:
 
 
 def _by_pose(q: Quadratics, repeated: RepeatedPoses) -> Quadratics:
-    """Of groups of views, with the scores at the minimum of all, which a restraint may keep one from."""
+    """Quadratics summed over repeated views, with the scores at their own minimum (without a restraint)."""
     if not repeated.none:
         q = Quadratics(repeated.summed(q.S), repeated.summed(q.g), repeated.summed(q.cost))
     step = q.steps(np.ones((1, len(q.cost))))[0]
@@ -156,11 +157,11 @@ def _of_copies(q: Quadratics, times: Array, variance: float) -> Array:
 
 
 def _contradict(q: Quadratics, times: Array, variance: float) -> bool:
-    """Whether the poses' scores g are larger than noise has them, with cov(g) = times variance S of each.
+    """Whether the scores g of the poses are larger than noise explains, where cov(g) = times variance S.
 
-    The statistic is sum g^T S^-1 g. Of noise it is a sum of squares with the covariance W_v - W_v W_w between
-    views v and w, W_v being S^-1/2 S_v S^-1/2: its mean and variance follow, and Satterthwaite's (1946)
-    chi-squared has the same.
+    The statistic is sum g^T S^-1 g. For noise it is a sum of squares with the covariance W_v - W_v W_w
+    between views v and w, where W_v = S^-1/2 S_v S^-1/2. Its mean and variance follow, and it is compared
+    with a chi-squared distribution of the same mean and variance (Satterthwaite 1946).
     """
     weighed = _weighed(q, times)
     S, g = weighed.S, weighed.g
@@ -181,19 +182,19 @@ def _contradict(q: Quadratics, times: Array, variance: float) -> bool:
 
 
 def _jackknife(moves: Array) -> Array:
-    """(f, f) from the moves (P, f) without each pose; nan where views cannot be left out."""
+    """(f, f) jackknife covariance from the moves (P, f) without each pose; nan if a pose is indispensable."""
     moves = moves - moves.mean(axis=0)
     return np.asarray((len(moves) - 1) / len(moves) * moves.T @ moves)
 
 
 def _grown(jackknife: Array, entries: Array) -> float:
-    """Mean of the variances by the jackknife over the other ones, in all directions; 0 where unknown."""
+    """Mean ratio of the jackknife's variances to the others over all directions; 0 if unknown."""
     grown = float(np.trace(solve_or_nan(entries, jackknife))) / len(entries)
     return grown if np.isfinite(grown) else 0.0
 
 
 def _at_least(jackknife: Array, entries: Array) -> Array:
-    """The jackknife's covariance, in no direction below the other one."""
+    """The jackknife's covariance, raised to the other one in every direction in which it is smaller."""
     scaled, scale = unit_diagonal(entries)
     try:
         root = np.linalg.cholesky(scaled) / scale[:, None]
@@ -210,7 +211,7 @@ def _at_least(jackknife: Array, entries: Array) -> Array:
 def _followed(
     found: Covariance, normal: Array, free: NDArray[np.bool_], free_poses: bool, entries: Array
 ) -> Array:
-    """The poses' covariances, which follow the shared parameters."""
+    """Covariances of the poses, propagated from those of the shared parameters."""
     if not free_poses:
         return found.poses
     f = camera_columns(len(free) - 5)[np.flatnonzero(free)]

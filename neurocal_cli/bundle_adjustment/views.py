@@ -1,4 +1,4 @@
-"""Points sorted by view and normalised: the paper's S1 and S2, centred, one S2 for each view."""
+"""Points sorted by view and normalised with the paper's S1 and S2: centred, with one S2 for each view."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from neurocal_cli.points import Correspondences
 # Repeated by tests/test_convergence.py, with targets of every thickness.
 # A target thinner than this share of its length is a plane up to rounding ...
 _EXACTLY_FLAT = 1e-6
-# ... and thinner than this it is treated as one until the last step, which sees every coordinate.
+# ... and thinner than this it is treated as a plane until bundle adjustment, which uses all coordinates.
 _NEARLY_FLAT = 0.02
 
 
@@ -31,23 +31,21 @@ class Views:
     ----------
     names : tuple of str
     order : (N,) int array or None
-        Row of the original data at each place; None when it was sorted already.
+        Row of the original data for each point; None if the data were sorted already.
     index : (N,) int array
         View of each point.
     counts, first : (V,) int arrays
-        Points of each view and its first place.
+        Number of points of each view, and index of its first point.
     distinct : (V,) int array
-        Different world points of each view.
+        Number of different world points of each view.
     local : (N, 3) array
         (M - centre) / scale, each view with its own.
     pixels : (N, 2) array
         (m - pixel_centre) / pixel_scale.
     weights : (N,) array
-        Scalar importance, mean 1.
+        Scalar weights, mean 1.
     across : (N, 2) array or None
-        Direction in which each point was measured; see `directions`.
-    along : float
-        Say of such points in the other direction.
+        Direction in which each point was measured; see `measured_directions`.
     whitening : (N, 3) array or None
         Upper triangular factor of the inverse covariance: entries (0, 0), (0, 1), (1, 1).
     centre : (V, 3) array
@@ -61,10 +59,10 @@ class Views:
     pixel_scale : float
         S1 [px].
     along : float
-        Say that points measured across an edge have along it.
+        Weight that points measured across an edge have along it.
     rays : (N, 3) array, optional
-        What the networks learn instead of (u, v, 1): directions of unit length, in the frame of a lens that
-        somebody has in mind. Without them a network is a pinhole.
+        Unit directions that the networks learn instead of (u, v, 1), from an assumed lens. Without them a
+        network models a pinhole.
     """
 
     names: tuple[str, ...]
@@ -89,7 +87,7 @@ class Views:
 
     @property
     def targets(self) -> Array:
-        """(N, 3) what the networks learn: normalised pixels (u, v, 1), or rays."""
+        """(N, 3) training targets of the networks: normalised pixels (u, v, 1), or rays."""
         if self.rays is not None:
             return self.rays
         return np.column_stack([self.pixels, np.ones(len(self.pixels))])
@@ -101,17 +99,17 @@ class Views:
 
     @cached_property
     def equations(self) -> Array:
-        """(V,) equations that each view's points give."""
+        """(V,) number of equations that each view's points give."""
         return np.asarray(np.add.reduceat(equations(self.across, len(self.index), self.along), self.first))
 
     @property
     def n_equations(self) -> float:
-        """Equations that all points give."""
+        """Number of equations that all points give."""
         return float(self.equations.sum())
 
     @property
     def n_distinct_equations(self) -> float:
-        """Equations that different points give; a point given twice is one."""
+        """Number of equations that different points give; a repeated point counts once."""
         return float(np.minimum(2 * self.distinct, self.equations).sum())
 
     @property
@@ -121,18 +119,18 @@ class Views:
 
     @property
     def nearly_flat(self) -> NDArray[np.bool_]:
-        """(V,) whether they nearly do."""
+        """(V,) whether the view's points nearly lie in one plane."""
         return np.asarray(self.extent[:, 2] <= _NEARLY_FLAT * self.extent[:, 0])
 
     @property
     def S1(self) -> Array:
-        """(3, 3) normalised to real pixels, eq. (12)."""
+        """(3, 3) matrix from normalised to real pixels, eq. (12)."""
         s, (u, v) = self.pixel_scale, self.pixel_centre
         return np.array([[s, 0.0, u], [0.0, s, v], [0.0, 0.0, 1.0]])
 
     @property
     def S2(self) -> Array:
-        """(V, 4, 4) real to normalised world coordinates of each view, eq. (12)."""
+        """(V, 4, 4) matrices from real to normalised world coordinates of each view, eq. (12)."""
         S2 = np.eye(4) / self.scale[:, None, None]
         S2[:, :3, 3] = -self.centre / self.scale[:, None]
         S2[:, 3, 3] = 1.0
@@ -173,17 +171,16 @@ class Views:
 
     @cached_property
     def batches(self) -> PointBatches:
-        """All points, laid out for the last step."""
+        """All points, in batches for bundle adjustment."""
         return batches_of(self.local, self.pixels, self.whitening, self.index, self.n_views)
 
     def patterns(
         self, views: NDArray[np.intp], flat: bool, most: int, rng: np.random.Generator | None = None
     ) -> Patterns:
-        """Patterns of some views' networks, at most `most` of each.
+        """Training patterns of some views' networks, at most `most` of each view.
 
-        Fewer than there are: one drawn from each of `most` equal stretches of the view's rows, at
-        random or, without a generator, the middle one. Fewer points than the longest view: padded
-        with weight 0.
+        If a view has more points, one is drawn from each of `most` equal stretches of its rows, at random or,
+        without a generator, the middle one. Views with fewer points than the others are padded with weight 0.
         """
         n = self.counts[views]
         width = min(int(n.max()), most)
@@ -246,14 +243,14 @@ def _principal_axes(local: Array, counts: NDArray[np.intp], first: NDArray[np.in
         scatter[:, a, b] = scatter[:, b, a] = np.add.reduceat(columns[a] * columns[b], first)
     values, basis = np.linalg.eigh(scatter / counts[:, None, None])
     basis = basis[:, :, ::-1] * np.where(np.linalg.det(basis[:, :, ::-1]) < 0, -1.0, 1.0)[:, None, None]
-    # Rounding leaves 1e-16 in an eigenvalue that is 0, so 1e-8 in the extent: enough to tell a plane.
+    # Rounding leaves 1e-16 in a zero eigenvalue, so 1e-8 in the extent, below `_EXACTLY_FLAT`.
     return basis, np.sqrt(np.maximum(values[:, ::-1], 0.0))
 
 
 def _distinct(local: Array, index: NDArray[np.intp], n_views: int) -> NDArray[np.intp]:
     """Number of different world points of each view.
 
-    A fixed irrational combination of the coordinates tells points apart; one sort does all views.
+    Points are identified by a fixed irrational combination of their coordinates; one sort handles all views.
     """
     key = local @ np.array([0.4142135623730951, 0.2360679774997898, 0.1231056256176606])
     key = np.sort(index + 0.5 * (np.round(key, 11) + 0.8) / 1.6)
@@ -270,11 +267,11 @@ def noise_model(
     Parameters
     ----------
     covariance : (N, 3) array or None
-        suu, suv, svv; None: all the same.
+        suu, suv, svv; None if equal for all points.
     across : (N, 2) array, optional
-        Direction in which each point was measured; see `directions`.
+        Direction in which each point was measured; see `measured_directions`.
     along : float
-        Their say in the other direction.
+        Weight of such points along their edge.
     """
     if covariance is None:
         if across is None:

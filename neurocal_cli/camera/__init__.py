@@ -1,1 +1,1 @@
-"""The camera: its intrinsic matrix and pose, the lens's distortion, and where that is monotonic."""
+"""The camera: intrinsic matrix, pose, projection, and lens distortion with its monotonic domain."""

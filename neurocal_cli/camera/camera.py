@@ -32,17 +32,17 @@ from neurocal_cli.geometry import Array
 
 @frozen_dataclass(eq=False)
 class Camera:
-    """A camera, whatever its pose.
+    """A camera without a pose.
 
     Parameters
     ----------
     intrinsics : Intrinsics
         alpha_u, alpha_v, u0, v0 [px] and theta; `Intrinsics.from_matrix` reads them off A.
     distortion : Distortion
-        It acts on normalised image points; then A is applied, skew included.
+        It is applied to normalised image points, before A (skew included).
     image_size : (width, height), optional [px]
     name : str
-        What files call it.
+        Name of the camera in files.
 
     Raises
     ------
@@ -87,7 +87,7 @@ class Camera:
 
     @cached_property
     def model(self) -> str:
-        """The model of its distortion, "none" where that moves no point."""
+        """Name of its distortion model; "none" if the distortion is the identity."""
         return "none" if self.distortion.is_identity else self.distortion.model
 
     def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -101,9 +101,9 @@ class Camera:
         Returns
         -------
         pixels : (..., 2) array [px]
-            ``nan`` for points that are not in front of the camera, or outside what a wide lens shows.
+            ``nan`` for points that are not in front of the camera, or outside the domain of a wide lens.
         in_front : (...) bool array
-            Whether they are not.
+            Whether the point has a pixel.
         """
         X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -112,7 +112,7 @@ class Camera:
         return np.where(seen[..., None], pixels, np.nan), seen
 
     def sees(self, points: Array) -> NDArray[np.bool_]:
-        """Whether points (..., 3) are in front of the camera where its distortion is monotonic."""
+        """Whether points (..., 3) lie in front of the camera, where its distortion is monotonic."""
         X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
         if self.distortion.wide:
             within = np.arctan2(np.hypot(X, Y), Z) < largest_angle(self.distortion)
@@ -140,10 +140,10 @@ class Camera:
         return by_camera.transpose(2, 1, 0), J[5:8].transpose(2, 1, 0)
 
     def unproject(self, pixels: Array) -> Array:
-        """Directions in which pixels see.
+        """Viewing directions of pixels.
 
-        Unit vectors, not points of a plane before the camera: `project` takes them as they are, and only
-        they can tell directions of 90 degrees and more from the axis.
+        They are unit vectors, not points at depth 1, because only unit vectors can represent directions of 90
+        degrees and more from the axis. `project` accepts them unchanged.
 
         Parameters
         ----------
@@ -152,7 +152,7 @@ class Camera:
         Returns
         -------
         rays : (..., 3) array
-            Of unit length, in the camera's frame; ``nan`` where the camera cannot see anything.
+            Of unit length, in the camera's frame; ``nan`` for pixels that the camera cannot produce.
         """
         u, v = np.moveaxis(np.asarray(pixels, dtype=float), -1, 0)
         if self.distortion.wide:
@@ -163,9 +163,9 @@ class Camera:
         return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
     def seen_points(self, pixels: Array) -> Array:
-        """Points that pixels (..., 2) see, at depth 1; of a wide lens, at distance 1.
+        """Points on the rays of pixels (..., 2), at depth 1; for a wide lens, at distance 1.
 
-        ``nan`` where the camera cannot see anything.
+        ``nan`` for pixels that the camera cannot produce.
         """
         rays = self.unproject(pixels)
         return rays if self.distortion.wide else np.asarray(rays / rays[..., 2:])
@@ -180,7 +180,7 @@ class Camera:
         by_pixel : (N, 3, 2) array
         """
         rays = self.unproject(pixels)
-        # A ray r of unit length moves across itself alone, and J dr = dm where J is of `project`.
+        # A unit ray r moves only perpendicular to itself, and J dr = dm with the Jacobian J of `project`.
         by_camera, by_point = self.project_jacobian(rays)
         along = rays[:, None, :]
         square = np.concatenate([by_point, along], axis=1)
@@ -195,7 +195,7 @@ class Camera:
         Parameters
         ----------
         scale : float, or one for u and one for v
-            New width by old width, new height by old height. An image size that it leads to is rounded.
+            New width over old width, new height over old height. The new image size is rounded.
         """
         factors = np.array(np.broadcast_to(scale, 2), dtype=float)
         if not (np.isfinite(factors).all() and (factors > 0).all()):
@@ -209,14 +209,14 @@ class Camera:
         return replace(self, intrinsics=Intrinsics.from_matrix(A), image_size=size)
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
-        """The camera of a part of its images.
+        """The camera of cropped images.
 
         Parameters
         ----------
         left, top : int [px]
             The pixel of the image that becomes (0, 0).
         width, height : int [px]
-            Of the part.
+            Size of the cropped image.
         """
         A = self.A.copy()
         A[:2, 2] -= left, top
@@ -227,9 +227,9 @@ class Camera:
         return image_points(self.entries, self.model, self.distortion.coefficients, x, y)
 
     def normalised_points(self, u: Array, v: Array) -> tuple[Array, Array]:
-        """Normalised image points x, y of pixels u, v, without the distortion; nan where there are none."""
+        """Undistorted normalised image points x, y of pixels u, v; nan where there are none."""
         return undistort(self.distortion, *normalised_points(self.entries, u, v))
 
     def rays(self, u: Array, v: Array, near: tuple[Array, Array] | None = None) -> Rays:
-        """The same with derivatives; see `projection.rays_of`."""
+        """Rays of pixels u, v with derivatives; see `projection.rays_of`."""
         return rays_of(self.entries, self.distortion, u, v, near)

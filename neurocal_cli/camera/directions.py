@@ -1,7 +1,7 @@
-"""Wide lenses: models that project directions, those of 90 degrees and more from the axis too.
+"""Wide lenses: models that project directions, including those of 90 degrees and more from the axis.
 
-A point (X, Y, Z) of the camera's frame, of which only the direction counts, goes to (x', y') and then
-through A. With rho = hypot(X, Y), d = |(X, Y, Z)| and theta = atan2(rho, Z):
+A point (X, Y, Z) of the camera's frame, of which only the direction matters, is mapped to (x', y'). Then A
+is applied. With rho = hypot(X, Y), d = |(X, Y, Z)| and theta = atan2(rho, Z):
 
     fisheye        (x', y') = (X, Y) theta (1 + k1 theta^2 + ... + k4 theta^8) / rho
                                                                   (Kannala and Brandt 2006)
@@ -11,10 +11,11 @@ through A. With rho = hypot(X, Y), d = |(X, Y, Z)| and theta = atan2(rho, Z):
                                                                   (Usenko, Demmel and Cremers 2018)
     eucm           (x', y') = (X, Y) / (alpha hypot(sqrt(beta) rho, Z) + (1 - alpha) Z)
                                                                   (Khomutenko, Garcia and Martinet 2016)
-    rich           (x', y') = the fisheye's, and a smooth displacement: `rich_lens`
+    rich           (x', y') = fisheye plus a smooth displacement: `rich_lens`
 
-omnidir's before its polynomial, double_sphere's and eucm's are (X, Y) / w. The image grows with theta where
-w > 0 and dw/dZ > 0, because w is homogeneous of degree one. What a model shows beyond that is no image.
+omnidir (before its polynomial), double_sphere and eucm have the form (X, Y) / w. Their radius grows with
+theta where w > 0 and dw/dZ > 0, because w is homogeneous of degree one. Beyond that the model is not a valid
+image.
 """
 
 from __future__ import annotations
@@ -35,15 +36,15 @@ WIDE = {
     "eucm": ("alpha", "beta"),
     "rich": ("k1", "k2", "k3", "k4", *rich_lens.NAMES),
 }
-# Their first coefficient is xi, and the scale in the middle of the image is alpha_u / (1 + xi).
+# Models whose first coefficient is xi; the scale in the image centre is alpha_u / (1 + xi).
 WITH_XI = ("omnidir", "double_sphere")
 
-_FLAT = 1e-3  # an xi whose square is rounding in any image
+_FLAT = 1e-3  # an xi whose square is negligible in any image
 _TINY = 1e-24  # squared sine below which a direction is on the axis
 
 
 class Direction(NamedTuple):
-    """Where directions are seen, before A, with derivatives.
+    """Image points of directions, before A, with derivatives.
 
     Attributes
     ----------
@@ -54,7 +55,7 @@ class Direction(NamedTuple):
     by_coefficient : list of pairs of arrays
         Derivatives of x', y' by each coefficient.
     seen : bool array
-        Directions in which the image still grows with theta.
+        Whether the image radius still grows with theta.
     """
 
     x: Array
@@ -77,10 +78,10 @@ def project_directions(
     k : sequence of coefficients
         Each a number or an array that broadcasts against X.
     X, Y, Z : arrays of one shape
-        In any unit; the direction alone counts.
+        In any unit; only the direction matters.
     by_coefficients : bool
-        Whether the derivatives by the coefficients are wanted; a rich lens has hundreds, and leaves them out.
-        Its coefficients are numbers, the same for all points.
+        Whether to compute the derivatives by the coefficients; only a rich lens, which has hundreds, leaves
+        them out. Its coefficients are numbers, the same for all points.
     """
     q = X * X + Y * Y
     if model == "fisheye":
@@ -94,7 +95,7 @@ def project_directions(
 
 
 def xi_is_flat(model: str, k: Coefficients) -> bool:
-    """Whether, to first order, alpha and alpha_u make up for xi: a double sphere's near xi = 0."""
+    """Whether alpha and alpha_u compensate xi to first order, as in a double sphere near xi = 0."""
     return model == "double_sphere" and bool(abs(k[0]) < _FLAT)
 
 
@@ -182,7 +183,7 @@ def _rich(k: Coefficients, X: Array, Y: Array, Z: Array, q: Array, by_coefficien
     by_x, by_y = (
         (a[0] + b[0], a[1] + b[1], a[2] + b[2]) for a, b in ((m.by_x, more.by_x), (m.by_y, more.by_y))
     )
-    # The image grows where it is nowhere folded: the two derivatives across the ray turn the same way.
+    # The image is not folded where the mapping from directions to the image keeps its orientation.
     cross = (
         X * (by_x[1] * by_y[2] - by_x[2] * by_y[1])
         + Y * (by_x[2] * by_y[0] - by_x[0] * by_y[2])

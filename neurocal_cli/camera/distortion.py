@@ -1,8 +1,8 @@
-"""The models of distortion, and the distortion of normalised image points.
+"""Distortion models, and the distortion of normalised image points.
 
-A point (x, y) = (X, Y) / Z of the camera's frame goes to (x', y') and then through A. The models of ordinary
-lenses are in `polynomial`, those of wide lenses, which take directions of 90 degrees and more too, in
-`directions`. The order of the coefficients is OpenCV's, with xi first in `omnidir`.
+A point (x, y) = (X, Y) / Z of the camera's frame is mapped to (x', y'), to which A is applied. The models of
+ordinary lenses are in `polynomial`. Those of wide lenses, which also project directions of 90 degrees and
+more, are in `directions`. The order of the coefficients is OpenCV's, with xi first in `omnidir`.
 
 The inverse is `neurocal_cli.camera.monotonic.undistort`.
 """
@@ -30,13 +30,13 @@ MODELS = {
     "tilted": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY"),
     **WIDE,
 }
-# With a thin prism, and a sensor that may be tilted.
+# Models with a thin prism; the second also with a tilted sensor.
 WITH_PRISM = ("thin_prism", "tilted")
-# What is not the same all around the axis.
+# Coefficients of terms that are not rotationally symmetric.
 NOT_RADIAL = frozenset({"p1", "p2", "s1", "s2", "s3", "s4", "tauX", "tauY"})
 
-# With these a wide lens is a pinhole; a fisheye to the ninth order, where tan(theta) = theta (1 + theta^2 / 3
-# + ...).
+# Coefficients with which a wide lens is a pinhole; a fisheye up to the ninth order of
+# tan(theta) = theta (1 + theta^2 / 3 + ...).
 _PINHOLES = {
     "fisheye": (1 / 3, 2 / 15, 17 / 315, 62 / 2835),
     "omnidir": (0.1, 0.0, 0.0, 0.0, 0.0),
@@ -61,7 +61,7 @@ def coefficient_names(model: str) -> tuple[str, ...]:
 
 @frozen_dataclass(eq=False)
 class Distortion:
-    """A distortion model with its coefficients; without arguments, none.
+    """A distortion model with its coefficients; the default is no distortion.
 
     Parameters
     ----------
@@ -93,17 +93,17 @@ class Distortion:
 
     @property
     def is_identity(self) -> bool:
-        """Whether it moves no point of a plane before the camera; a wide lens never counts as one."""
+        """Whether it leaves all image points unchanged; False for every wide lens."""
         return not self.wide and not self.coefficients.any()
 
     @property
     def wide(self) -> bool:
-        """Whether the model takes directions of 90 degrees and more from the axis."""
+        """Whether the model projects directions of 90 degrees and more from the axis."""
         return self.model in WIDE
 
 
 def pinhole_coefficients(model: str) -> Array:
-    """Coefficients (K,) with which a model moves no point, a fisheye's nearly."""
+    """Coefficients (K,) with which a model is a pinhole (a fisheye nearly)."""
     return np.array(_PINHOLES.get(model, np.zeros(len(coefficient_names(model)))))
 
 

@@ -1,8 +1,8 @@
-"""Where a distortion model is monotonic, and its inverse there.
+"""The domain in which a distortion model is monotonic, and its inverse there.
 
-A polynomial goes on beyond the largest angle that its lens sees: with barrel distortion the image turns
-back inwards from some radius on, and a pixel then has a second, false point far outside. The true one lies
-where the model is monotonic.
+Beyond the field of view a polynomial no longer describes the lens: with barrel distortion the distorted
+radius decreases again from some radius on, so a pixel has a second, spurious point far outside. The true
+point is the one where the model is monotonic.
 """
 
 from __future__ import annotations
@@ -21,23 +21,23 @@ from neurocal_cli.camera.tilt import untilted
 from neurocal_cli.camera.unprojection import first_root, largest_angle, unproject_directions
 from neurocal_cli.geometry import Array
 
-# Where Newton's method starts, and when it ends: random models of tests/test_monotonic.py, up to 95 % of
-# the radius where they cease to be monotonic, come back to 1e-8.
+# Start and end of Newton's method. Random models of tests/test_monotonic.py are inverted to 1e-8 up to 95 %
+# of the radius at which they cease to be monotonic.
 _FARTHEST = 1e3  # undistorted radius that no image reaches
 _TABLE = 4096  # radii
 _NEWTON_STEPS = 30
-_STEP = 1e-9  # of Newton's: the next one, its square, is rounding
-_ACCURACY = 1e-11  # of the point distorted again: more is no inverse
-_SMALL_STEP = 0.02  # of Newton's in the image plane: the next one would be a thousandth
-# Radii at which a slope is looked at: what it falls short of the margin between them is far less.
+_STEP = 1e-9  # last Newton step: the next one would be its square, which is rounding
+_ACCURACY = 1e-11  # largest error of the point when distorted again
+_SMALL_STEP = 0.02  # Newton step in the image plane after which the next one would be a thousandth
+# Radii at which a slope is sampled; between them it changes by far less than the margin.
 _RADII, _BEYOND, _MARGIN = 65, 2.0, 0.02
 
 
 def monotonic_radius(distortion: Distortion) -> float:
-    """Undistorted normalised radius up to which the distorted one grows; infinity if it always does.
+    """Undistorted normalised radius up to which the distorted radius grows; infinity if it always does.
 
-    The first zero of the slope of the radius, or of the rational model's denominator; tangential terms,
-    small within any image, are left out.
+    It is the first zero of the slope or of the rational model's denominator. Tangential terms are ignored,
+    because they are small within any image.
     """
     if distortion.wide:
         theta = largest_angle(distortion)
@@ -51,7 +51,7 @@ def monotonic_radius(distortion: Distortion) -> float:
 
 
 def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
-    """How fast the distorted radius grows with the undistorted one, or a fisheye's with the angle.
+    """Derivative of the distorted radius by the undistorted one; for a fisheye, by the angle.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ def radial_slope(model: str, k: Array, r: Array) -> tuple[Array, Array]:
     Returns
     -------
     slope : (m,) array
-        Without the tangential terms; not positive from `monotonic_radius` on.
+        Without tangential terms; its first zero is at `monotonic_radius`.
     by_k : (m, K) array
     """
     s = r[:, None] ** 2
@@ -93,15 +93,15 @@ def _twice_s_slope(p: Array) -> Array:
 
 
 def reaches(distortion: Distortion, farthest: float) -> bool:
-    """Whether the model is certainly monotonic as far as some distorted radius; a quick test, without roots.
+    """Whether the model is certainly monotonic up to some distorted radius: a quick sufficient test.
 
-    The tangential terms, p = hypot(p1, p2), move a point of radius r by at most 3 p r^2, and the derivatives
-    of that are at most 6 p r. A disc on which the radial part alone grows faster, outwards and across, is
-    mapped without a fold, and covers all that lies within the image of its edge. False says nothing.
+    With p = hypot(p1, p2), the tangential terms move a point of radius r by at most 3 p r^2, and their
+    derivatives are at most 6 p r. A disc on which the radial part grows faster, radially and tangentially, is
+    mapped without a fold and covers everything inside the image of its edge. False is inconclusive.
     """
     k = distortion.coefficients
     if distortion.model not in ("k1", "k1k2", "k1k2p1p2", "plumb_bob"):
-        return False  # poles, or another radius
+        return False  # these models have poles, or use another radius
     r = np.linspace(0, _BEYOND * farthest, _RADII)
     p = np.hypot(*k[2:4]) if len(k) > 2 else 0.0
     radial = np.array([*k[:2], *k[4:]])
@@ -124,8 +124,8 @@ def undistort(
 ) -> tuple[Array, Array]:
     """Undistort normalised image points: the inverse of `distort` where the model is monotonic.
 
-    Newton's method from where the model without its tangential terms has the point, so that no false
-    point is found, nor a true one lost.
+    Newton's method starts from the inverse of the model without tangential terms, so that it finds no
+    spurious point and misses no true one.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ def undistort(
     Returns
     -------
     x, y : arrays of that shape
-        ``nan`` where no undistorted point belongs to the given one.
+        ``nan`` if a point has no undistorted one.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     if distortion.is_identity:
@@ -164,7 +164,7 @@ def undistort(
 def _newton(
     distortion: Distortion, radius: float, x: Array, y: Array, sx: Array, sy: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Undistorted points by Newton's method from (sx, sy), and which are true: within `radius`, and exact."""
+    """Undistort by Newton's method from (sx, sy); also which points converged within `radius`."""
     model, k = distortion.model, distortion.coefficients
     with np.errstate(all="ignore"):
         for _ in range(_NEWTON_STEPS):
@@ -181,13 +181,13 @@ def _newton(
 
 
 def _radially(distortion: Distortion, radius: float, x: Array, y: Array) -> tuple[Array, Array]:
-    """Undistorted points without the tangential terms, nearly: by a table of radii up to `radius`."""
+    """Undistort approximately without tangential terms, by a table of radii up to `radius`."""
     names = coefficient_names(distortion.model)
     k = distortion.coefficients
     radial = [0.0 if name in NOT_RADIAL else k for name, k in zip(names, k, strict=True)]
     # Even steps of the angle reach any radius.
     last = np.arctan(min(radius, _FARTHEST))
-    r = np.tan(np.linspace(0, last, _TABLE, endpoint=False))  # at a pole there is no image
+    r = np.tan(np.linspace(0, last, _TABLE, endpoint=False))  # excludes a pole at the end
     with np.errstate(all="ignore"):
         distorted, _ = distort(distortion.model, radial, r, np.zeros(_TABLE))
         seen = np.hypot(x, y)
@@ -196,7 +196,7 @@ def _radially(distortion: Distortion, radius: float, x: Array, y: Array) -> tupl
 
 
 def nearly_undistorted(distortion: Distortion, x: Array, y: Array) -> tuple[Array, Array]:
-    """The same as `undistort` to a thousandth or so, by two of Newton's steps wherever these do."""
+    """Undistort to about a thousandth: by two Newton steps, or by `undistort` where they do not suffice."""
     if distortion.is_identity:
         return x, y
     sx, sy = x, y

@@ -1,8 +1,8 @@
 """The pinhole camera of the paper's section 2: A, D, P = A D and its 11 parameters.
 
-Five intrinsic parameters make A, six extrinsic ones make D = [R | t]. The estimators work on the
-five free entries of A, which are the network's output weights; the paper's alpha_v and theta
-follow from them. Conventions: see `geometry`.
+A has five intrinsic parameters, D = [R | t] six extrinsic ones. The estimators work with the five free
+entries of A, which are the network's output weights; the paper's alpha_v and theta follow from them. For
+conventions see `geometry`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from neurocal_cli.geometry import Array, euler_to_rotation, nearest_rotation, ro
 INTRINSIC_NAMES = ("alpha_u", "alpha_v", "u0", "v0", "theta")
 POSE_NAMES = ("R_x", "R_y", "R_z", "t_x", "t_y", "t_z")
 
-# A matrix read from a file is a rotation when R R^T is the identity to this accuracy.
+# A given matrix counts as a rotation if R R^T is the identity to this accuracy.
 _ROTATION_TOLERANCE = 1e-4
 
 
@@ -71,7 +71,7 @@ class Intrinsics:
 
     @classmethod
     def from_matrix(cls, A: Array) -> Intrinsics:
-        """Read the parameters off an upper triangular A, scaled so that ``A[2, 2] = 1``."""
+        """Parameters of an upper triangular A, which is scaled to ``A[2, 2] = 1``."""
         A = np.asarray(A, dtype=float)
         if A.shape != (3, 3) or not np.isfinite(A).all() or A[2, 2] == 0:
             raise InputError("a camera matrix must be 3 x 3, finite, with A[2, 2] = 1")
@@ -133,7 +133,7 @@ class Pose:
 
     @classmethod
     def exact(cls, R: Array, t: Array) -> Pose:
-        """Pose from an R that is known to be a rotation; a thousand views need no thousand checks."""
+        """Pose from an exact rotation R, without the checks, which take time for thousands of views."""
         pose = object.__new__(cls)
         object.__setattr__(pose, "R", R)
         object.__setattr__(pose, "t", t)
@@ -160,7 +160,7 @@ class Pose:
 
 
 def entries_of(alpha_u: Any, alpha_v: Any, u0: Any, v0: Any, theta: float) -> tuple[Any, Any, Any, Any, Any]:
-    """A11, A12, A22, A13, A23 of numbers, or of arrays for a camera each; theta [rad] is a number."""
-    # The float nearest to pi/2 is not quite pi/2, and its tangent not infinite.
+    """A11, A12, A22, A13, A23 from numbers, or from arrays with one element per camera; theta is a number."""
+    # The tangent of the float nearest to pi/2 is finite, so this case is separate.
     skew = -alpha_u / np.tan(theta) if theta != np.pi / 2 else 0.0
     return alpha_u, skew, alpha_v / np.sin(theta), u0, v0

@@ -3,9 +3,9 @@
     x' = x R + 2 p1 x y + p2 (r^2 + 2 x^2),  y' = y R + p1 (r^2 + 2 y^2) + 2 p2 x y,
     R = (1 + k1 r^2 + k2 r^4 + k3 r^6) / (1 + k4 r^2 + k5 r^4 + k6 r^6)       (Brown 1971; Heikkila 2000)
 
-with the coefficients k1, k2, p1, p2, k3, k4, k5, k6, of which simpler models have the first 1, 2, 4, 5 and 8.
-A thin prism (Weng, Cohen and Herniou 1992) adds s1 r^2 + s2 r^4 to x' and s3 r^2 + s4 r^4 to y', and behind
-all that the sensor may be tilted (`tilt`): OpenCV's 12 and 14 coefficients.
+with the coefficients k1, k2, p1, p2, k3, k4, k5, k6, of which simpler models have the first 1, 2, 4, 5 or 8.
+A thin prism (Weng, Cohen and Herniou 1992) adds s1 r^2 + s2 r^4 to x' and s3 r^2 + s4 r^4 to y' (OpenCV's 12
+coefficients). A tilted sensor (`tilt`) is applied last (OpenCV's 14 coefficients).
 """
 
 from __future__ import annotations
@@ -107,5 +107,5 @@ def _on_tilted_sensor(k: Coefficients, before: Distorted) -> Distorted:
 
 
 def _all(k: Coefficients) -> list[Any]:
-    """The eight coefficients before a prism's, 0 where a model has none."""
+    """The first eight coefficients; 0 for those that the model lacks."""
     return [*k[:8], *[0.0] * (8 - len(k))]

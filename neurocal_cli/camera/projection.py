@@ -1,13 +1,13 @@
-"""From the camera's frame to pixels and back, with derivatives: written once, for arrays of any shape.
+"""Projection from the camera's frame to pixels and back, with derivatives, for arrays of any shape.
 
     (x, y) = (X, Y) / Z,  (x', y') = distort(x, y),  u = A11 x' + A12 y' + A13,  v = A22 y' + A23
 
-A wide lens has no (x, y): its (x', y') follow from the direction of (X, Y, Z), which may be behind.
+A wide lens has no (x, y): its (x', y') follow from the direction of (X, Y, Z), which may point backwards.
 
-Each coordinate is an array of its own: arithmetic on whole, contiguous arrays is what NumPy does fastest.
-A's entries and the coefficients are numbers, or arrays that broadcast against the points, so that one call
-serves a camera for each view as well as one for all. `Camera` wraps this for one camera and (N, 2) or (N, 3)
-arrays; bundle adjustment and triangulation, whose time is spent here, call it themselves.
+Each coordinate is a separate array, because NumPy is fastest on whole, contiguous arrays. A's entries and the
+coefficients are numbers or arrays that broadcast against the points, so one call handles a common camera as
+well as a camera for each view. `Camera` wraps this for one camera and (N, 2) or (N, 3) arrays. Bundle
+adjustment and triangulation, which spend their time here, call it directly.
 """
 
 from __future__ import annotations
@@ -80,9 +80,9 @@ def image_points_with_jacobian(
 def project_points(
     entries: Entries, model: str, k: Coefficients, X: Array, Y: Array, Z: Array
 ) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Pixels (u, v) of points in the camera's frame, and which of them it can see.
+    """Pixels (u, v) of points in the camera's frame, and which of them are visible.
 
-    It sees points in front; a wide lens, those in whose direction its image grows.
+    Points in front of the camera are visible; for a wide lens, points in the domain of its model.
     """
     if model in WIDE:
         a, s, b, u0, v0 = entries
@@ -105,8 +105,8 @@ def project_with_jacobian(
         The camera.
     points : X, Y, Z, (..., n) arrays
     by_entries : (..., 5, 2, n) array
-        Filled with the derivatives of (u, v) by A11, A12, A22, A13, A23, but for those that are always
-        zero, which must be zero already.
+        Filled with the derivatives of (u, v) by A11, A12, A22, A13, A23, except those that are always zero,
+        which must be zero already.
     by_point : (..., 3, 2, n) array
         Filled with those by X, Y, Z.
     by_coefficient : (..., K, 2, n) array
@@ -116,7 +116,7 @@ def project_with_jacobian(
     -------
     u, v : (..., n) arrays
     valid : (..., n) bool array
-        Points in front of the camera, or of a wide lens anywhere, where the distortion is monotonic.
+        Points where the distortion is monotonic and, unless the lens is wide, in front of the camera.
     """
     X, Y, Z = points
     if model in WIDE:
@@ -173,7 +173,7 @@ def _through_matrix(entries: Entries, changes: Sequence[tuple[Array, Array]], ou
 
 
 def _is_zero(s: Any) -> bool:
-    """Whether there is no skew, as in most cameras; it saves a share of the time."""
+    """Whether there is no skew, as in most cameras, which saves time."""
     return isinstance(s, (float, int)) and s == 0.0
 
 
@@ -191,11 +191,11 @@ class Rays(NamedTuple):
     ----------
     u, v : arrays [px]
     x, y : arrays
-        Undistorted normalised points; nan where the camera sees nothing.
+        Undistorted normalised points; nan for pixels that the camera cannot produce.
     xu, xv, yu, yv : arrays [1/px]
         Derivatives of x and y by u and v.
     z, zu, zv : arrays or floats
-        Not 1, 0 and 0 only where rays are directions of any length, so that they may point sideways.
+        1, 0 and 0, unless rays are general directions, which may also point sideways.
     """
 
     u: Array
@@ -237,7 +237,7 @@ def rays_of(
 
 
 def undistorted_pixels(distortion: Distortion, A: Array, pixels: Array) -> Array:
-    """Pixels (N, 2) as the same camera without distortion would see them; nan where it cannot see any."""
+    """Pixels (N, 2) in the same camera without distortion; nan for pixels that the lens cannot produce."""
     entries = A[ENTRIES].tolist()
     x, y = undistort(distortion, *normalised_points(entries, pixels[:, 0], pixels[:, 1]))
     return np.column_stack(image_points(entries, "none", (), x, y))

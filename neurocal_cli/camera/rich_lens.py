@@ -1,13 +1,13 @@
-"""A smooth displacement of the image, for lenses that no formula describes.
+"""A smooth displacement of the image by splines, for lenses that no closed formula describes.
 
 The displacement (dx', dy') of a distorted point is a function of its direction. In stereographic coordinates
 s = (X, Y) / (d + Z), d = |(X, Y, Z)|, whose length is tan(theta / 2), it is
 
     s / |s| sum_i g_i (B(|s| / h - i) - B(|s| / h + i)) + sum_rc (fx_rc, fy_rc) B(sy / ly - r) B(sx / lx - c)
 
-with the cubic B-spline B: a radial profile, odd and so smooth on the axis, and a field on a grid around the
-axis. They cover |s| <= reach, |sx| <= reach_x and |sy| <= reach_y, and fade to 0 within two or three of
-their nodes' spacings beyond.
+with the cubic B-spline B. The first term is a radial profile, odd and so smooth on the axis; the second is a
+field on a grid around the axis. They cover |s| <= reach, |sx| <= reach_x and |sy| <= reach_y, and fall to 0
+within two or three node spacings beyond.
 Schoeps et al. (2020) calibrate with such fields of directions, mrcal with stereographic ones.
 """
 
@@ -21,14 +21,14 @@ from numpy.typing import NDArray
 from neurocal_cli.geometry import Array
 
 RADII, GRID = 16, 12  # nodes of the profile, and of the field in each direction
-REACHES = ("reach", "reach_x", "reach_y")  # they are never estimated
+REACHES = ("reach", "reach_x", "reach_y")  # extents of the nodes; never estimated
 NODES = (
     *(f"g{n:02d}" for n in range(1, RADII + 1)),
     *(f"f{axis}{row:02d}{column:02d}" for axis in "xy" for row in range(GRID) for column in range(GRID)),
 )
 NAMES = (*REACHES, *NODES)
-FIRST_NODE = 7  # of a rich lens's coefficients: k1 to k4 and the reaches are before it
-_PAD = 3  # nodes that are 0 around the grid: what is beyond fades to 0
+FIRST_NODE = 7  # index of the first node among the coefficients, after k1 to k4 and the reaches
+_PAD = 3  # rows of zero nodes around the grid, so that the field falls to 0
 _LEAST_RADIUS = 1e-6  # |s| below which a direction is on the axis
 
 
@@ -41,7 +41,7 @@ class Displacement(NamedTuple):
     by_x, by_y : three arrays each
         By X, Y, Z.
     by_coefficient : list of pairs of arrays
-        By each of `NAMES`. Empty where not asked for.
+        By each of `NAMES`; empty if not requested.
     """
 
     x: Array
@@ -52,16 +52,16 @@ class Displacement(NamedTuple):
 
 
 def displacement(k: Array, X: Array, Y: Array, Z: Array, by_coefficients: bool = True) -> Displacement:
-    """The displacement in some directions.
+    """The displacement in the given directions.
 
     Parameters
     ----------
     k : (n,) array
         The coefficients `NAMES`.
     X, Y, Z : arrays of one shape
-        In any unit; the direction alone counts.
+        In any unit; only the direction matters.
     by_coefficients : bool
-        Whether the derivatives by the coefficients, which are hundreds, are wanted.
+        Whether to compute the derivatives by the coefficients, of which there are hundreds.
     """
     k, shape = np.asarray(k, dtype=float), X.shape
     X, Y, Z = X.ravel(), Y.ravel(), Z.ravel()
@@ -157,7 +157,7 @@ def _field(f: Array, sx: Array, sy: Array, lx: float, ly: float) -> _Field:
     middle = 0.5 * (GRID - 1)
     column, wx, dx = _basis(sx / lx + middle, 1 - _PAD, GRID)
     row, wy, dy = _basis(sy / ly + middle, 1 - _PAD, GRID)
-    # Nodes -3, -2, ... are numbered from 0; a place's first node is the one before it.
+    # Nodes -3, -2, ... are numbered from 0; the four B-splines start at the node before the point's own.
     place = (row + (_PAD - 1)) * width + column + (_PAD - 1)
     value, by_x, by_y = (np.zeros((2, len(sx))) for _ in range(3))
     for b in range(4):
@@ -170,12 +170,12 @@ def _field(f: Array, sx: Array, sy: Array, lx: float, ly: float) -> _Field:
 
 
 def _basis(t: Array, lowest: int, highest: int) -> tuple[NDArray[np.intp], Array, Array]:
-    """Where places t, in spacings of the nodes, lie, and the four B-splines that are not 0 there.
+    """The four nonzero cubic B-splines at positions t, in units of the node spacing.
 
     Returns
     -------
     node : (N,) int array
-        The node before t, within the limits given; beyond them all values are as at the nearer limit.
+        The node before t, clipped to the given limits; beyond them the values are those at the limit.
     weights, slopes : (4, N) arrays
         Of the nodes node - 1 to node + 2.
     """

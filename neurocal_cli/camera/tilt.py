@@ -26,7 +26,7 @@ def sensor_rotation(tau_x: float, tau_y: float) -> Array:
 
 
 def tilted(tau_x: Any, tau_y: Any, x: Array, y: Array) -> tuple[Array, Array]:
-    """Where the sensor has distorted points x, y; normalised coordinates, arrays of one shape."""
+    """Points x', y' on the tilted sensor of distorted points x, y; normalised, arrays of one shape."""
     cX, sX, cY, sY = np.cos(tau_x), np.sin(tau_x), np.cos(tau_y), np.sin(tau_y)
     w = sY * x - cY * sX * y + cY * cX
     return cX * x / w, (cY * y - sX * sY * x) / w

@@ -1,4 +1,4 @@
-"""Directions from distorted points: the inverse of `project_directions`, as far as the image grows."""
+"""Directions from distorted points: the inverse of `project_directions` on the monotonic domain."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from neurocal_cli.camera.directions import project_directions
 from neurocal_cli.camera.distortion import Distortion, coefficient_names
 from neurocal_cli.geometry import Array
 
-# Held by tests/test_directions.py: random lenses of all models, up to 99 % of their largest angle, come back
-# to 1e-9.
+# Checked by tests/test_directions.py: random lenses of all models are inverted to 1e-9 up to 99 % of their
+# largest angle.
 _TABLE = 4096  # angles
 _NEWTON_STEPS = 30
-_STEP = 1e-9  # rad; the next step, its square, is rounding
-_ACCURACY = 1e-11  # of the point projected again: more is no inverse
+_STEP = 1e-9  # rad; last Newton step: the next one would be its square, which is rounding
+_ACCURACY = 1e-11  # largest error of the point when projected again
 _HALVINGS = 40
-_SMALLEST = 1e-30  # coefficient; what is less overflows, and has no root near any image
-_REAL = 1e-6  # imaginary part of a double root, over its real part, that rounding makes
+_SMALLEST = 1e-30  # smaller coefficients count as 0: their roots overflow or lie outside any image
+_REAL = 1e-6  # imaginary over real part of a double root that rounding can cause
 
 
 def largest_angle(distortion: Distortion) -> float:
-    """Angle from the axis [rad] up to which a wide lens's image grows, at most pi.
+    """Angle from the axis [rad] up to which the image radius of a wide lens grows, at most pi.
 
-    Tangential terms, small within any image, are left out.
+    Tangential terms are ignored, because they are small within any image.
     """
-    if distortion.model in ("fisheye", "rich"):  # whose displacement is small
+    if distortion.model in ("fisheye", "rich"):  # the displacement of a rich lens is small
         slope = np.array([1.0, *(distortion.coefficients[:4] * [3, 5, 7, 9])])
         return float(min(np.sqrt(first_root(slope)), np.pi))
     theta = np.linspace(0.0, np.pi, _TABLE)
@@ -48,7 +48,7 @@ def first_root(coefficients: Array) -> float:
 
 
 def _along_radius(distortion: Distortion, theta: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Distorted radii of angles, without tangential terms or a field, and whether the image grows there."""
+    """Distorted radii of angles, without tangential terms or a field, and whether they grow there."""
     names = coefficient_names(distortion.model)
     k = [
         0.0 if name in ("p1", "p2") or name[0] == "f" else value
@@ -61,9 +61,9 @@ def _along_radius(distortion: Distortion, theta: Array) -> tuple[Array, NDArray[
 
 
 def unproject_directions(distortion: Distortion, x: Array, y: Array) -> tuple[Array, Array, Array]:
-    """Directions that a wide lens puts at distorted points.
+    """Directions that a wide lens maps to distorted points.
 
-    Newton's method on the unit sphere, from where the model without its tangential terms has the point.
+    Newton's method on the unit sphere starts from the inverse of the model without tangential terms.
 
     Parameters
     ----------
@@ -75,11 +75,11 @@ def unproject_directions(distortion: Distortion, x: Array, y: Array) -> tuple[Ar
     Returns
     -------
     X, Y, Z : arrays of that shape
-        Of unit length; ``nan`` where no direction belongs to the point.
+        Of unit length; ``nan`` if a point has no direction.
     """
     x, y = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
     k, limit = distortion.coefficients, largest_angle(distortion)
-    # Even steps up to the limit, which itself is no part of the image.
+    # Equal steps up to the limit, which is excluded.
     angles = np.linspace(0.0, limit, _TABLE, endpoint=False)
     radii = _along_radius(distortion, angles)[0]
     radius = np.hypot(x, y)
@@ -104,9 +104,9 @@ _Three = tuple[Array, Array, Array]
 def _moved(
     ray: _Three, by_x: _Three, by_y: _Three, dx: Array, dy: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Rays of unit length after one of Newton's steps, which is across the ray, and its length."""
+    """Unit rays after a Newton step perpendicular to them, and the length of the step."""
     X, Y, Z = ray
-    # Two directions across the ray: towards the axis's meridian, and around the axis.
+    # Two directions perpendicular to the ray: away from the axis, and around it.
     rho = np.hypot(X, Y)
     cosine = np.where(rho > 0, X / rho, 1.0)
     sine = np.where(rho > 0, Y / rho, 0.0)

@@ -44,12 +44,12 @@ _SUMMARIES = {
 
 
 class _LazyGroup(click.Group):
-    """A group that imports a command's module when the command is asked for.
+    """A group that imports a command's module only when the command is used.
 
     Parameters
     ----------
     summaries : dict
-        What ``--help`` says of each command; None for a hidden one.
+        Summary of each command for ``--help``; None for a hidden one.
     """
 
     def __init__(self, *args: Any, summaries: Mapping[str, str | None], **kwargs: Any) -> None:
@@ -75,8 +75,8 @@ class _LazyGroup(click.Group):
     def make_context(
         self, info_name: str | None, args: list[str], parent: click.Context | None = None, **extra: Any
     ) -> click.Context:
-        """Parse, and keep what was typed; ``--help`` is shown here."""
-        words = tuple(args)  # parsing takes them away
+        """Parse, and keep the words of the command line; ``--help`` is shown here."""
+        words = tuple(args)  # parsing empties args
         with _one_line_errors():
             ctx = super().make_context(info_name, args, parent, **extra)
         if parent is None:
@@ -97,7 +97,7 @@ class _LazyGroup(click.Group):
 
 @contextmanager
 def _one_line_errors() -> Iterator[None]:
-    """Turn errors into a line on stderr and an exit code; click does so with its own."""
+    """Convert errors to one line on stderr and an exit code; click does so with its own errors."""
     try:
         yield
         return
@@ -116,7 +116,7 @@ def _one_line_errors() -> Iterator[None]:
 
 
 def _explain(error: Exception) -> str:
-    """Put an error that is none of neurocal's own into words."""
+    """Describe an error that is not one of neurocal's own."""
     if isinstance(error, MemoryError):
         return "not enough memory; use fewer points"
     if isinstance(error, RecursionError):

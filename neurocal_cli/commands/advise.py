@@ -20,14 +20,14 @@ from neurocal_cli.commands.streams import print_summary
 def advise(calibration: str, count: int, plot: str | None, as_json: bool) -> None:
     """Advise which views of the target to photograph next.
 
-    About 900 views in which the camera would see the whole target are weighed: 25 positions in the image,
-    3 distances, 17 tilts and 2 turns. Each time the view is chosen that lowers the uncertainty of the camera
-    most, given those before it. The number behind each view is the uncertainty that is left.
+    The command compares about 900 views that show the whole target: 25 positions in the image, 3 distances,
+    17 tilts and 2 rotations. It chooses the view that lowers the uncertainty of the camera most, then the
+    best next one, and so on. The number after each view is the remaining uncertainty.
 
-    The uncertainty is the largest standard deviation of a projected pixel, all over the image, for points at
-    half to ten times the distance of the views. A change of the camera that a motion of its frame makes up
-    for does not count. Systematic errors, such as a wrong distortion model, are not part of it; see the
-    verdict of neurocal evaluate camera.
+    The uncertainty is the largest standard deviation of a projected pixel in the image, for points at half to
+    ten times the distance of the views. A change of the camera that a motion of its frame compensates does
+    not count. Systematic errors, such as a wrong distortion model, are not included; see the verdict of
+    neurocal evaluate camera.
 
     \b
     Examples:

@@ -24,7 +24,7 @@ def board_options(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
     Parameters
     ----------
     unit_help, unit_default : str
-        What is said of ``--unit``.
+        Help and default of ``--unit``.
     """
 
     def add(f: F) -> F:
@@ -55,14 +55,14 @@ def board_options(unit_help: str, unit_default: str = "mm") -> Callable[[F], F]:
 def given_board(
     path: str | None, cols: int | None, rows: int | None, square: float | None, unit: str | None
 ) -> Board | None:
-    """Read the board, None where no option describes one.
+    """Read the board; None if no option describes one.
 
     Raises
     ------
     UsageError
-        A file and numbers, or a part of the numbers.
+        A file and numbers are given, or only some of the numbers.
     FormatError
-        A file that is no board.
+        The file is not a board file.
     """
     from neurocal_cli.board import Board
 

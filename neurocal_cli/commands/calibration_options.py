@@ -1,4 +1,4 @@
-"""The options that say how a camera is estimated: which problem, what is given, how to train."""
+"""The options of a calibration: problem type, given parameters, training, distortion, outliers, target."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _BACKPROP_ONLY = {"epochs": "--epochs", "rate": "--rate", "rate_gamma": "--rate-
 
 @frozen_dataclass
 class Estimation:
-    """What the user asked for; file names are not read yet."""
+    """The values of the options; files are not read yet."""
 
     type: str
     image_center: tuple[float, float] | None
@@ -88,9 +88,9 @@ class Estimation:
         Raises
         ------
         InputError
-            A given camera that cannot be used with these points.
+            The given camera cannot be used with these points.
         UsageError
-            Type 2 without any image centre.
+            Type 2 has no image centre.
         """
         if self.image_size is not None:
             if points.image_size not in (None, self.image_size):
@@ -128,7 +128,7 @@ class Estimation:
         return BackpropOptions(**given)
 
     def _center(self, points: Correspondences) -> tuple[float, float]:
-        """Choose the image centre of type 2: as asked for, as in the points' header, or of the image."""
+        """The image centre of type 2: from the option, the points' header, or the middle of the image."""
         if self.image_center is not None:
             return self.image_center
         if points.image_center is not None:
@@ -155,7 +155,7 @@ def estimation_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def estimation_options_without_files(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add all of them but the files of known cameras and poses."""
+    """Add the options of `Estimation` without the files of known cameras and poses."""
     return _collecting(command, [option for option in _OPTIONS if option not in _FILES])
 
 

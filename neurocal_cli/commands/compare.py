@@ -61,20 +61,20 @@ def compare(
 ) -> None:
     """Compare calibration methods on the same points.
 
-    Every method calibrates the camera from the same points: the network, the methods that its paper
-    compares it with, and OpenCV's calibrateCamera. The table shows the rms reprojection error, the rms
-    error on points that were left out (a fifth of each view at a time), the time, and the parameters with
-    their standard deviations.
+    All methods calibrate the camera from the same points: the network, the methods that its paper
+    compares it with, and OpenCV's calibrateCamera. The table shows the rms reprojection error, the
+    cross-validation error (a fifth of the points of each view is left out at a time), the time, and the
+    parameters with their standard deviations.
 
-    The target is taken as it is given, also by the network. Measured directions of mid-points count for neuro
-    and backprop alone.
+    All methods use the target as given. Only neuro and backprop use the measured directions of mid-points.
 
-    With the points of a second camera, both cameras are calibrated by themselves, and the points that both
-    see are triangulated, as in the paper's Table 2: the rms error in space, and NSCE, which is 1 where the
-    error is that of rounding to whole pixels. The same is shown through one rig for all pairs of views.
+    With the points of a second camera, each camera is calibrated alone, and the common points are
+    triangulated, as in the paper's Table 2. The table shows the rms error in space and NSCE, which is 1 if
+    the error is that of rounding to whole pixels. The same errors are shown for one rig for all pairs of
+    views.
 
-    All numbers but the times are the same in every run. Lines below the tables name the methods with the
-    lowest errors. On clean points of a target that is not flat, several methods end at the same minimum.
+    All numbers except the times are the same in every run. Lines below the tables name the methods with the
+    lowest errors. On clean points of a target that is not flat, several methods reach the same minimum.
 
     \b
     Examples:

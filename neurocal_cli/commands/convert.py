@@ -79,8 +79,8 @@ def convert(
 ) -> None:
     """Convert cameras, rigs and points to the formats of other programs.
 
-    The format of FILE is recognised by its content, never by its name. Where programs count pixels in
-    different ways the principal point is shifted, so that both projections are equal.
+    The format of FILE is recognised by its content, never by its name. If programs use different pixel
+    conventions, the principal point is shifted, so that both projections are equal.
 
     \b
       --to      the output
@@ -94,14 +94,14 @@ def convert(
       json      dictionary with OpenCV's names
       npz       the same for NumPy
 
-    A distortion model that the format does not have is an error, which says how many pixels the nearest
-    camera is off. --force writes that camera; --model writes the nearest one of a chosen model, for programs
-    that know that one only. Programs of OpenCV, ROS, Kalibr, COLMAP and mrcal ignore
-    skew, so the nearest camera without skew is written for them, and a warning says how many pixels that
-    makes. What the format has no place for is listed on standard error.
+    If the format lacks the distortion model, the command fails and says how many pixels the nearest camera
+    differs. --force writes that camera; --model writes the nearest camera of a chosen model, for programs
+    that support only that one. OpenCV, ROS, Kalibr, COLMAP and mrcal ignore skew, so the nearest camera
+    without skew is written for them, and a warning says how many pixels it differs. Information that the
+    format cannot store is listed on standard error.
 
-    Points become a CSV file with --to neurocal. Corners without their places on the board need --board, or
-    --cols, --rows and --square. Points of neurocal are also written as opencv, matlab, json, npz or mrcal.
+    With --to neurocal, points become a CSV file. Corners without positions on the board need --board, or
+    --cols, --rows and --square. Points of neurocal can also be written as opencv, matlab, json, npz or mrcal.
 
     \b
     Examples:
@@ -150,7 +150,7 @@ def convert(
 def _write_cameras(
     cameras: CameraSet, target: str, model: str | None, force: bool, output: str
 ) -> dict[str, Any]:
-    """Write cameras; what there is to say of them, for programs."""
+    """Write cameras; return the summary for programs."""
     from neurocal_cli.io.exchange.fitting_in import fitted_in
     from neurocal_cli.io.exchange.formats import FORMATS
 
@@ -181,7 +181,7 @@ def _write_cameras(
 def _points(
     files: tuple[str, ...], board: Board | None, unit: str | None, size: tuple[int, int] | None
 ) -> Correspondences | None:
-    """The points of the files, None where they hold cameras."""
+    """The points of the files; None if the files hold cameras."""
     from dataclasses import replace
 
     from neurocal_cli.io.exchange.colmap import is_folder
@@ -200,7 +200,7 @@ def _points(
 
 
 def _write_points(points: Correspondences, target: str, output: str) -> dict[str, Any]:
-    """Write points; what there is to say of them, for programs."""
+    """Write points; return the summary for programs."""
     from neurocal_cli.io.exchange.corner_texts import corner_text, points_lost
     from neurocal_cli.io.writing import write_whole
 
@@ -212,12 +212,12 @@ def _write_points(points: Correspondences, target: str, output: str) -> dict[str
 
 
 def _completed(cameras: CameraSet, unit: str | None, size: tuple[int, int] | None) -> CameraSet:
-    """Add what the file does not say.
+    """Add values that the file lacks.
 
     Raises
     ------
     InputError
-        What it says, and differently.
+        The file has another value.
     """
     from dataclasses import replace
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
     from neurocal_cli.detection.measuring import Points
 
-_SECOND = 2  # images of another size, from which on it is no single one that strayed in
+_SECOND = 2  # images of another size that are no longer a single stray one
 
 
 @click.command(cls=options.Command)
@@ -110,8 +110,8 @@ def detect(
     the direction (nu,nv) across its edge. Images in which no board is detected are listed on standard
     error with the reason.
 
-    Of a video (mp4, avi, mov, mkv and what else OpenCV decodes) those frames are examined that are sharp and
-    differ from each other; each is a view VIDEO_NUMBER.
+    A video (mp4, avi, mov, mkv and other formats that OpenCV decodes) is reduced to frames that are sharp and
+    differ from each other; each becomes a view VIDEO_NUMBER.
 
     \b
     Examples:
@@ -202,7 +202,7 @@ def _examined(
 def _watched(
     words: tuple[str, ...], wanted: DetectionOptions, board_file: str | None, output: str, seconds: float
 ) -> list[tuple[str, Outcome]]:
-    """Outcomes of the images that have come, with the names of their views."""
+    """Outcomes of the images that have arrived, with the names of their views."""
     from neurocal_cli.commands.watching import watch
     from neurocal_cli.io.image_paths import find_images, view_names
 
@@ -218,7 +218,7 @@ def _watched(
 
 
 def _mixed_sizes(paths: Sequence[str]) -> list[str]:
-    """Tell of images of different sizes before any work: points of one camera are of one size."""
+    """Warn of images of different sizes before any work, because one camera has one image size."""
     from collections import Counter
 
     from neurocal_cli.io.image_headers import stated_sizes
@@ -247,7 +247,7 @@ def _check_overlay(folder: str, paths: Sequence[str]) -> None:
 
 
 def _report(outcomes: Sequence[tuple[str, Outcome]], board: Board, as_json: bool) -> None:
-    """Say what is wrong with which image, and once what is to be known of several."""
+    """Report failed images with the reason, and remarks common to several images once."""
     for _, outcome in outcomes:
         if outcome.problem:
             complain(outcome.problem)
@@ -286,7 +286,7 @@ def _summary(outcomes: Sequence[tuple[str, Outcome]]) -> dict[str, Any]:
 
 
 def _another_board(shown: Sequence[tuple[int, int] | None], board: Board) -> list[str]:
-    """Tell of one other size of board that most images show: mostly squares were counted, not vertices."""
+    """Suggest another board size that most images show: often squares were counted instead of vertices."""
     from collections import Counter
 
     (size, count), *_ = Counter(shown).most_common(1)

@@ -61,14 +61,14 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
     is sqrt(mean(du^2 + dv^2)); the bias is the mean of du and of dv.
 
     Without POINTS.csv the points of the calibration itself are used, and the error is too optimistic.
-    With POINTS.csv a view of the calibration keeps its calibrated pose where most of its points are
-    seen as in the calibration. The pose of any other view is fitted first, with the intrinsic
-    parameters fixed, and the view is marked `fitted`; so is a view of another image that only has the
-    same name. Points behind the camera are counted but are not part of any average.
+    With POINTS.csv a view of the calibration keeps its calibrated pose if that pose fits most of its points.
+    The pose of any other view is fitted first, with the intrinsic parameters fixed, and the view is
+    marked `fitted`; so is another image that only has the name of a calibrated view. Points behind the
+    camera are counted, but all averages leave them out.
 
-    A calibration also gets a verdict. It rests on the points of the calibration: the cross-validation
-    error, the noise floor, the agreement of two halves of the data, the coverage of the image and the
-    uncertainty of predicted pixels. With POINTS.csv the error on these points is part of it.
+    A calibration also gets a verdict. It uses the points of the calibration: the cross-validation error,
+    the noise floor, the agreement of two halves of the data, the coverage of the image and the uncertainty
+    of predicted pixels. With POINTS.csv it also includes the error on these points.
 
     \b
     Examples:
@@ -102,7 +102,7 @@ def camera(calibration: str, points: str | None, plots: Plots, as_json: bool) ->
 def _evaluate(
     name: str, points: Correspondences | None
 ) -> tuple[CameraEvaluation, Verdict | None, Calibration | Camera]:
-    """Evaluate a calibration or, given points, any camera file: then all poses are fitted."""
+    """Evaluate a calibration or, if points are given, any camera file, with all poses fitted."""
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.evaluation import evaluate_camera
     from neurocal_cli.verdict.assessment import assess

@@ -71,7 +71,7 @@ def stereo(
     Without --points the points of the calibrations themselves are used, and the errors are too optimistic.
     With --points the poses of views that are not in the calibrations are fitted.
 
-    The rig also gets a verdict, as by neurocal stereo. It rests on the points of the calibrations.
+    The rig also gets a verdict, as in neurocal stereo. It uses the points of the calibrations.
 
     \b
     Examples:
@@ -140,7 +140,7 @@ def _evaluate(
 
 
 def _camera(name: str, points: Correspondences) -> Calibration:
-    """Read a calibration, or any camera file: where that holds no poses, they are fitted to the points."""
+    """Read a calibration, or any camera file; poses that the file does not hold are fitted to the points."""
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.methods import calibrate
 

@@ -1,4 +1,4 @@
-"""Videos among the images of a command: their frames stand in for them."""
+"""Replace videos among the images of a command by selected frames."""
 
 from __future__ import annotations
 
@@ -13,14 +13,13 @@ from neurocal_cli.commands.streams import note
 
 @contextmanager
 def videos_as_frames(paths: Sequence[str], most: int) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Put the frames of each video that are worth measuring into its place.
+    """Replace each video by its frames that are worth measuring.
 
     Yields
     ------
     paths : tuple of str
     folder : str
-        With a separator, where the frames are until the end of the block, which is of no interest to users;
-        empty without videos.
+        Temporary folder of the frames, with a separator, to be cut from messages; empty without videos.
     """
     from neurocal_cli.io.video import is_video
 

@@ -1,4 +1,4 @@
-"""Points, and a camera that the user has a file of, with the points that it is used on."""
+"""Read points, and known cameras for them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def given_points(names: str | Sequence[str]) -> Correspondences:
-    """Read points, and tell what of their files was left out."""
+    """Read points, and report rows of their files that were left out."""
     from neurocal_cli.io.points_csv import read_points
 
     notes: list[str] = []
@@ -32,7 +32,7 @@ def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, C
     Raises
     ------
     InputError
-        A camera of another image size.
+        The camera has another image size.
     """
     from neurocal_cli.io.camera_files import read_intrinsics
 
@@ -52,12 +52,12 @@ def given_camera(path: str, points: Correspondences) -> tuple[Correspondences, C
 def calibration_or_camera(
     name: str, points: Correspondences | None, besides: str = ""
 ) -> tuple[Calibration | Camera, Correspondences | None]:
-    """A calibration or, to be used on points, any camera file, which may know the size of their images.
+    """Read a calibration or, for use with points, any camera file; both may hold the image size.
 
     Raises
     ------
     FormatError
-        The file is neither; it tells why it is no calibration.
+        The file is neither; the message says why it is no calibration.
     """
     from neurocal_cli.io.calibration_yaml import read_calibration
 

@@ -254,9 +254,9 @@ def evaluate(lens_file: str, points: str, plot: str | None, as_json: bool) -> No
     at once. If the camera stood still during the calibration, its pose is used; otherwise the pose of
     each view is fitted with the intrinsic parameters fixed.
 
-    The lens also gets a verdict: good, usable or poor, with the reasons. It rests on the settings that were
-    left out, on the error at these points and at settings predicted from all others, both over the noise
-    floor, and on the uncertainty of the focal length between the settings. `neurocal lens fit` prints it too.
+    The lens also gets a verdict: good, usable or poor, with the reasons. It uses the rejected settings, the
+    error at these points and the cross-validation error over the settings (both compared with the noise
+    floor), and the uncertainty of the focal length between the settings. `neurocal lens fit` prints it too.
 
     \b
     Examples:

@@ -1,4 +1,4 @@
-"""Man pages out of the commands' own help, so that the two cannot differ."""
+"""Man pages generated from the commands' help, so that both always agree."""
 
 from __future__ import annotations
 
@@ -46,8 +46,8 @@ _FILES = (
     ),
 )
 
-_WIDTH = 78  # of lines of the source
-_DATE = "2026-11-22"  # of the manual of this version; not today's, so that pages stay the same
+_WIDTH = 78  # of the source lines
+_DATE = "2026-11-22"  # date of this version's manual, not the current one, so that the pages are reproducible
 _ENVIRONMENT = (("NEUROCAL_DEBUG", "If set to 1, an unexpected error shows where in the program it arose."),)
 
 
@@ -75,7 +75,7 @@ def man(ctx: click.Context, directory: str) -> None:
 
 
 def man_pages(root: click.Command) -> dict[str, str]:
-    """File names and texts of the man pages of a command and all below it.
+    """File names and texts of the man pages of a command and its subcommands.
 
     Hidden commands have none.
     """
@@ -209,12 +209,12 @@ def _terms(rows: tuple[tuple[str, str], ...] | list[tuple[str, str]]) -> list[st
 
 
 def _fill(text: str) -> list[str]:
-    """Lines of running text, none of which troff would read as a request."""
+    """Wrap running text into lines that troff does not mistake for requests."""
     lines = textwrap.wrap(_escape(text), _WIDTH, break_long_words=False, break_on_hyphens=False)
     return [rf"\&{line}" if line.startswith((".", "'")) else line for line in lines]
 
 
 def _escape(text: str) -> str:
-    """Protect what troff would read as its own, and keep `-` a plain minus to copy."""
+    """Escape characters that are special in troff, and keep `-` as a plain minus for copying."""
     text = text.replace("\\", r"\(rs").replace("-", r"\-").replace("`", r"\(ga").replace("^", r"\(ha")
     return rf"\&{text}" if text.startswith((".", "'")) else text

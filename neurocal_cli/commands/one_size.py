@@ -1,4 +1,4 @@
-"""Images of one size, as those of one camera are."""
+"""Keep images of one size, because one camera has one image size."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def of_one_size(outcomes: list[tuple[str, Outcome]]) -> list[tuple[str, Outcome]]:
-    """Leave out boards in images of another size than most have; of two sizes alike, none.
+    """Leave out boards in images whose size differs from the most common one; none if two sizes tie.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""Arguments and options of commands: the kinds that there are, and those that several commands share.
+"""Kinds of arguments and options, and those that several commands share.
 
-Commands write them as ``@options.path(...)``, so that two with the same meaning cannot diverge.
+Commands use them as ``@options.path(...)``, so that options with the same meaning are the same everywhere.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _PICTURES = (".png", ".pdf", ".svg")
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-# What is there and may be read or written is found by who does it: that is exit code 1, not wrong usage.
+# Whether a file can be read or written is checked by the code that does so: exit code 1, not wrong usage.
 PATH = click.Path(readable=False, allow_dash=True)
 
 
@@ -28,7 +28,7 @@ METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 
 
 class Argument(click.Argument):
-    """An argument that says what it is, in ``--help`` and in the man page."""
+    """An argument with a description for ``--help`` and the man page."""
 
     def __init__(self, *args: Any, description: str, **attributes: Any) -> None:
         super().__init__(*args, **attributes)
@@ -39,7 +39,7 @@ class Command(click.Command):
     """A command whose help lists its arguments before its options."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Parse, and say where --quiet and --verbose stand."""
+        """Parse, and explain where --quiet and --verbose belong."""
         try:
             return super().parse_args(ctx, args)
         except click.NoSuchOption as error:
@@ -59,7 +59,7 @@ class Command(click.Command):
 
 
 class FiniteNumber(FloatParamType):
-    """A number that can be computed with: neither nan nor infinite.
+    """A finite number: neither nan nor infinite.
 
     Parameters
     ----------
@@ -96,9 +96,9 @@ class _MethodNames(click.ParamType):  # type: ignore[type-arg]
 
 
 def path(name: str, metavar: str, help: str, without: str = "none", **more: Any) -> Callable[[F], F]:
-    """An option that names a file or a folder, or as many as its metavar has words.
+    """An option that names a file or folder, or as many as its metavar has words.
 
-    In this and the following, `without` is what ``--help`` says of the option's absence.
+    Here and below, `without` describes in ``--help`` what happens without the option.
     """
     return _option(name, help, without, metavar=metavar, type=PATH, **more)
 
@@ -125,7 +125,7 @@ def count(
 
 
 def choice(name: str, words: str, help: str, without: str | None = None, **more: Any) -> Callable[[F], F]:
-    """An option that is one of some words."""
+    """An option with a choice of words."""
     return _option(name, help, without, type=click.Choice(words.split()), **more)
 
 
@@ -142,7 +142,7 @@ def _option(
     to: str | None = None,
     **attributes: Any,
 ) -> Callable[[F], F]:
-    """An option whose value goes to the argument `to` of the command, that of its own name by default."""
+    """An option whose value is passed to the parameter `to` of the command; default: its own name."""
     if without is not None:
         attributes["show_default"] = without
     if "metavar" in attributes:
@@ -152,7 +152,7 @@ def _option(
 
 
 def argument(name: str, metavar: str, description: str, **more: Any) -> Callable[[F], F]:
-    """Add an argument that names what is read."""
+    """Add an argument that names an input."""
     return click.argument(name, metavar=metavar, type=PATH, cls=Argument, description=description, **more)
 
 
@@ -167,7 +167,7 @@ points = argument(
 
 
 def output(metavar: str, help: str, *, required: bool = False) -> Callable[[F], F]:
-    """Add ``-o``, where the result goes; stdout unless it is given or has to be."""
+    """Add ``-o``, the output; stdout by default, unless it is required."""
     usual = {"required": True} if required else {"default": "-"}
     without = "required" if required else "standard output"
     return _option(("-o", "--output"), help, without, metavar=metavar, type=PATH, **usual)
@@ -179,7 +179,7 @@ camera_name = click.option(
 
 
 def check_camera_name(name: str) -> None:
-    """Refuse a name that no file can hold.
+    """Refuse a name that cannot be stored in a file.
 
     Raises
     ------
@@ -190,7 +190,7 @@ def check_camera_name(name: str) -> None:
 
 
 def alpha(default: str) -> Callable[[F], F]:
-    """Add ``--alpha``, how much of the original images is shown; see `check_alpha`."""
+    """Add ``--alpha``, the part of the original images that is shown; see `check_alpha`."""
     return number(
         "--alpha",
         "ALPHA",
@@ -200,7 +200,7 @@ def alpha(default: str) -> Callable[[F], F]:
 
 
 def check_alpha(alpha: float | None) -> None:
-    """Refuse an alpha that is no share.
+    """Refuse an alpha outside 0 to 1.
 
     Raises
     ------
@@ -251,7 +251,7 @@ lean = flag("--lean", "Leave the points, the poses and the network out of the fi
 
 
 def plot(what: str) -> Callable[[F], F]:
-    """Add ``--plot``, a picture of something; see `check_plot`."""
+    """Add ``--plot``, a picture of the result; see `check_plot`."""
     return path("--plot", "FILE.png", f"Plot {what} to this .png, .pdf or .svg file.")
 
 
@@ -261,7 +261,7 @@ def check_plot(plot: str | None, output: str | None = None) -> None:
     Raises
     ------
     UsageError
-        A name that is no picture's, or the output's.
+        The name has no ending of a picture, or is that of the output.
     NeurocalError
         matplotlib is not installed.
     """

@@ -1,4 +1,4 @@
-"""The option ``--html``: a page on what the command has just found."""
+"""The option ``--html``: a page about the command's result."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ html_option = options.path(
 
 
 def write_page(html: str | None, result: Calibration | Rig, *inputs: str | None) -> None:
-    """Write the page of a result that was made from these files; nothing without a name."""
+    """Write the page about a result from these input files; does nothing without a name."""
     if html is None:
         return
     import hashlib

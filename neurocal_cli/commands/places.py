@@ -1,4 +1,4 @@
-"""Where a command reads and writes, checked before its work."""
+"""Checks of a command's inputs and outputs before its work."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ def check_outputs(outputs: Iterable[str | None], inputs: Iterable[str | None]) -
     Raises
     ------
     UsageError
-        An output that is an input, or two outputs in one place.
+        An output is an input, or two outputs are the same file.
     NeurocalError
-        A place that cannot be written to.
+        An output cannot be written.
     """
     from neurocal_cli.io.outputs import held_back
     from neurocal_cli.io.writing import check_places

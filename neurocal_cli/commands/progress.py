@@ -1,4 +1,4 @@
-"""A progress bar for work that takes long enough to wonder, on a terminal only."""
+"""A progress bar for long work, on a terminal only."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-_PATIENCE = 0.5  # seconds before the bar appears; shorter work shows nothing
+_PATIENCE = 0.5  # seconds after which the bar appears
 
 
 class ProgressBar(AbstractContextManager["ProgressBar"]):
-    """Called with a stage and the fraction done, draws a bar on stderr once the work takes long.
+    """Draws a bar on stderr for long work; it is called with a stage and the completed fraction.
 
-    Without a terminal it does nothing, and rich is not imported. Where the user asked how the work goes, each
-    stage is a line instead.
+    Without a terminal it does nothing, and rich is not imported. With --verbose, each stage is a line
+    instead.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         self._task: TaskID | None = None
 
     def __call__(self, stage: str, fraction: float) -> None:
-        """Show how far the work is."""
+        """Show the progress of the work."""
         if stage != self._stage:
             self._stage = stage
             tell_more(f"{time.monotonic() - self._start:7.2f} s  {stage}")
@@ -65,26 +65,26 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
 
 
 def each_of(items: Sequence[T], work: Callable[[T], None], what: str, done: str) -> dict[int, str]:
-    """Do the work on each item; of several, those that fail are told and left out.
+    """Process each item; if there are several, those that fail are reported and left out.
 
     Parameters
     ----------
     items : sequence
     work : callable
     what, done : str
-        In words: what the items are, and what is done to them.
+        Words for the items and for what is done to them, for messages.
 
     Returns
     -------
     failed : dict of str by int
-        Why, by the item's place.
+        Reason of each failure, by the item's index.
 
     Raises
     ------
     InputError, FormatError
         The only item fails.
     NeurocalError
-        All of them do.
+        All items fail.
     """
     failed: dict[int, str] = {}
     with ProgressBar() as progress:

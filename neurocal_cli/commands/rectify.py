@@ -1,4 +1,4 @@
-"""``neurocal rectify``: pairs of images and points in, the same in corresponding rows out."""
+"""``neurocal rectify``: rectify pairs of images and points, so that their rows correspond."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ def rectify(
 ) -> None:
     """Rectify pairs of images and points of two cameras.
 
-    The results are what two cameras without distortion would have seen whose rows correspond: a point is in
-    the same row of both images. For cameras above each other it is in the same column. R1, R2, P1, P2 and Q
-    are those of OpenCV's stereoRectify.
+    The results are those of two cameras without distortion whose rows correspond: a point is in the same row
+    of both images. For cameras above each other it is in the same column. R1, R2, P1, P2 and Q are those of
+    OpenCV's stereoRectify.
 
-    The left images come first, then the right ones. Images become PNG files under the names of the inputs,
-    CSV files of points stay CSV files. The command prints by how many pixels the rows of the rig's own
-    points differ, and those of the points given. A pair with an image that cannot be used is reported and
+    The left images come first, then the right ones. Images become PNG files with the names of the inputs,
+    CSV files of points stay CSV files. The command prints the difference of corresponding rows in pixels, for
+    the rig's own points and for the given points. A pair with an image that cannot be used is reported and
     left out.
 
     \b
@@ -107,7 +107,7 @@ def rectify(
 
 
 def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The files of the left and of the right camera: the first half of the words, and the second."""
+    """The files of the left and of the right camera: the first and the second half of the arguments."""
     from neurocal_cli.io.image_paths import find_images, view_names
 
     if len(files) % 2:
@@ -126,7 +126,7 @@ def _sides(files: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _check_folders(sides: tuple[tuple[str, ...], tuple[str, ...]], output: str) -> None:
-    """Refuse to write over inputs."""
+    """Refuse to overwrite inputs."""
     check_outputs((), (*sides[0], *sides[1]))
     for side, paths in zip(_SIDES, sides, strict=True):
         folder = os.path.realpath(os.path.join(output, side))
@@ -150,7 +150,7 @@ def _read_rig(name: str) -> Rig:
 
 @dataclass
 class _Work:
-    """A rig, its rectified cameras, and where the results go."""
+    """A rig, its rectified cameras, and the folders of the results."""
 
     rig: Rig
     alpha: float | None
@@ -169,7 +169,7 @@ class _Work:
         self.summary["along"] = "rows" if self.pair.axis == 0 else "columns"
 
     def tell_rows_of_rig(self) -> None:
-        """Say how well the rows of the points agree from which the rig was found."""
+        """Report the difference of corresponding rows for the rig's own points."""
         from neurocal_cli.report import number_or_none
         from neurocal_cli.stereo.rectified_pair import row_error_of_rig
 
@@ -185,7 +185,7 @@ class _Work:
             warn([f"the rig is poor: {'; '.join(verdict.reasons[:1])}"])
 
     def rectify_points(self, sides: tuple[tuple[str, ...], tuple[str, ...]]) -> None:
-        """Move the points of both cameras and write them."""
+        """Rectify the points of both cameras and write them."""
         from neurocal_cli.io.points_csv import format_points, read_points
         from neurocal_cli.report import number_or_none
         from neurocal_cli.stereo.rectified_pair import rectify_points, row_error

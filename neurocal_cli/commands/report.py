@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from neurocal_cli.calibration import Calibration
     from neurocal_cli.io.tree_fields import Field
 
-_MOST_BYTES = 1_400_000  # of all photographs; as text in the page they take a third more
+_MOST_BYTES = 1_400_000  # of all photographs; encoded as text they take a third more
 
 
 @click.command(cls=options.Command)
@@ -36,14 +36,14 @@ _MOST_BYTES = 1_400_000  # of all photographs; as text in the page they take a t
 def report(result: str, images: tuple[str, ...], output: str) -> None:
     """Show a calibration, a rig or a zoom lens as one HTML page.
 
-    The page begins with the verdict. It has all parameters with their standard deviations, the residuals of
-    all points and of each view as drawings, a table of the views that can be sorted, what was left out, the
-    warnings, and how to repeat the result. With --images it shows the photographs too. It is one file, loads
-    nothing from elsewhere, and is readable in the dark, on a telephone and on paper.
+    The page begins with the verdict. It has all parameters with their standard deviations, drawings of the
+    residuals of all points and of each view, a sortable table of the views, the outliers, the warnings, and
+    how to repeat the result. With --images it also shows the photographs. It is a single file, loads nothing
+    from the network, and is readable in dark mode, on a phone and on paper.
 
     `neurocal calibrate --html` and `neurocal stereo --html` make the same page in the same run. Only they
-    know the command and the files that the result was made from. The result's own file does not hold them,
-    so that it is the same wherever it is made.
+    can name the command and the input files. The result file does not store them, so that it is the same
+    wherever it is made.
 
     \b
     Examples:
@@ -70,7 +70,7 @@ def report(result: str, images: tuple[str, ...], output: str) -> None:
 
 
 def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
-    """The page of what the file holds."""
+    """The page about the result in the file."""
     from neurocal_cli.html_report.origin import Origin
     from neurocal_cli.html_report.reports import calibration_page, lens_page, rig_page
 
@@ -100,13 +100,13 @@ def _page(root: Field, files: dict[str, str], images: tuple[str, ...]) -> str:
 
 
 def _versions(root: Field) -> dict[str, str]:
-    """The version that the file says it was written by."""
+    """The version with which the file was written, according to the file."""
     block = root["neurocal"]
     return {"neurocal": block["version"].text()} if "version" in block else {}
 
 
 def _photographs(calibration: Calibration, word: str, cameras: int) -> dict[str, bytes]:
-    """Small pictures of the views' photographs; the page is for all cameras."""
+    """Thumbnails of the views' photographs, for the page."""
     from neurocal_cli.io.thumbnails import photographs_of, thumbnails
 
     views = calibration.points.view_names

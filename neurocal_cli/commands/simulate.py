@@ -1,4 +1,4 @@
-"""``neurocal simulate``: known cameras calibrated again and again, with every error known."""
+"""``neurocal simulate``: Monte Carlo calibrations of known cameras, whose errors are known."""
 
 from __future__ import annotations
 
@@ -126,20 +126,19 @@ def simulate(
     plot: str | None,
     as_json: bool,
 ) -> None:
-    """Calibrate simulated cameras, and compare methods where the truth is known.
+    """Calibrate simulated cameras, and compare the methods' errors.
 
-    A camera looks at a target, and noise is added to the exact pixels. Each method calibrates from the
-    same points. The command prints each method's error without noise; its rms error over many trials for
-    each noise level beside the Cramer-Rao bound, the smallest that any unbiased method can have; its mean
-    error; and how many single random starts reach the minimum of the reprojection error, of the network
-    and of plain Levenberg-Marquardt. Without options it repeats the paper's section 5.1.
+    A camera looks at a target, and noise is added to the exact pixels. All methods calibrate from the same
+    points. The command prints each method's error without noise; its rms error over many trials for each
+    noise level, next to the Cramer-Rao bound, the smallest error of any unbiased method; its mean error;
+    and the share of single random starts that reach the minimum of the reprojection error, for the
+    network and for plain Levenberg-Marquardt. Without options it repeats the paper's section 5.1.
 
-    A method that takes something for given is told the truth: tsai the image centre and right angles,
-    opencv right angles. Its bound is that of the fewer unknowns. Parameters of poses are averaged over
-    all views.
+    A method that needs given parameters gets the true ones: tsai the image centre and zero skew, opencv
+    zero skew. Its bound is then that with fewer unknowns. Pose parameters are averaged over all views.
 
-    With --rates the paper's trainer learns from one random start on each of many varied data sets, with
-    each pair of a grid of learning rates.
+    With --rates, the paper's trainer is run from one random start on each of many data sets, with each pair
+    of a grid of learning rates.
 
     \b
     Examples:
@@ -207,7 +206,7 @@ def _check(rates: bool, save: str | None, images: bool, scene: tuple[object, ...
 def _scene(
     camera_file: str | None, board_file: str | None, views: int | None, seed: int
 ) -> tuple[SimulatedScene, bool]:
-    """The scene, and whether it is the paper's."""
+    """The scene, and whether it is that of the paper."""
     import numpy as np
 
     from neurocal_cli.errors import FormatError
@@ -252,7 +251,7 @@ def _rates(data_sets: int, seed: int, jobs: int, plot: str | None, as_json: bool
 
 
 def _save(scene: SimulatedScene, folder: str, sigma: tuple[float, ...], seed: int, images: bool) -> None:
-    """Write the truth and what follows from it; the noisy points are those of the first trial."""
+    """Write the truth and the data simulated from it; the noisy points are those of the first trial."""
     import numpy as np
 
     from neurocal_cli.io.board_yaml import write_board

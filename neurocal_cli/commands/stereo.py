@@ -82,10 +82,10 @@ def stereo(
     The command writes the rig as a YAML file: both calibrations, R, t, E, F, the baseline, and the
     rectification as OpenCV defines it. It prints a summary with standard deviations on standard error.
 
-    The summary ends with a verdict: good, usable or poor, with the reasons. It rests on the relative pose of
-    the cameras in each pair of views, on both cameras, on the error of pairs left out and on the uncertainty
-    of depth. It says where the rig moved, where a focal length changed, and where the images of a pair were
-    not taken at the same moment. Where the rig moved, the larger part of the pairs determines it.
+    The summary ends with a verdict: good, usable or poor, with the reasons. It uses the relative pose of the
+    cameras in each pair of views, the verdicts on both cameras, the cross-validation error over pairs and the
+    uncertainty of depth. It names the place where the rig moved or a focal length changed, and images that
+    were not taken at the same moment. If the rig moved, the larger part of the pairs determines it.
 
     \b
     Examples:
@@ -152,7 +152,7 @@ def stereo(
 
 
 def _side(estimation: Estimation, intrinsics: str | None) -> Estimation:
-    """What is asked for one camera."""
+    """The options for one camera."""
     if estimation.type == "4":
         raise UsageError(
             "with --type 4 the poses of all views are known, so there is no rig to estimate; use neurocal "

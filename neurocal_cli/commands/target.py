@@ -1,4 +1,4 @@
-"""``neurocal target``: the board as a calibration found it."""
+"""``neurocal target``: write the board with its estimated shape."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from neurocal_cli.errors import InputError
 @options.summary
 @options.output("BOARD.yaml", "Write the board to this file.")
 def target(camera: str, plot: str | None, as_json: bool, output: str) -> None:
-    """Write the board as it was found.
+    """Write the board with its estimated shape.
 
     No board is exactly as its file says: paper curls, and printers stretch. `neurocal calibrate --target
-    auto` finds where the points of the board really are, together with the camera. This command writes
-    them as a board file. `neurocal detect --board` takes it, and gives the points of other images of the
-    same board their measured places. So the next calibration, and every other camera, profits.
+    auto` estimates the true positions of the board's points together with the camera. This command writes
+    them as a board file. With that file, `neurocal detect --board` assigns the measured positions to the
+    points of other images of the same board, so that later calibrations and other cameras benefit.
 
-    Photographs do not tell the size of a board as a whole. It is kept as it was given.
+    Images do not determine the overall size of a board. It stays as given.
 
     \b
     Examples:

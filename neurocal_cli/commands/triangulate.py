@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from neurocal_cli.stereo.rig import Rig
     from neurocal_cli.stereo.triangulation import Triangulated
 
-_USUAL_SIGMA = 0.5  # of a rig without points [px]
+_USUAL_SIGMA = 0.5  # px; default for a rig without points
 _LARGEST_SIGMA = 1e6  # px; no image is that large
-_MANY_OFF = 0.5  # share of the points that no bad luck explains
+_MANY_OFF = 0.5  # share of the points that chance does not explain
 
 
 @click.command(cls=options.Command)
@@ -97,7 +97,7 @@ def triangulate(
     limit = usual_limit(sigma) if epipolar_limit is None else epipolar_limit
     notes: list[str] = []
     tally = _Tally(rig, limit)
-    # The first rows come before the file is touched, and with them all that may be wrong with the header.
+    # Read the first rows before the output is opened, so that errors in the header leave it untouched.
     matches = read_matches(inputs[-1], notes)
     matches = chain([next(matches)], matches)
     note(notes)
@@ -108,7 +108,7 @@ def triangulate(
 
 
 def _sigma(rig: Rig) -> float:
-    """The noise of the rig's own points; a usual one where it has none."""
+    """The noise of the rig's own points; a typical value if it has none."""
     if rig.sigma == rig.sigma:
         return rig.sigma
     note([f"the rig does not say how accurate its pixels are; {_USUAL_SIGMA} px is assumed; give --sigma"])
@@ -165,7 +165,7 @@ class _Tally:
             yield found, batch.point
 
     def tell(self, as_json: bool) -> None:
-        """Say what came out, on stderr; as JSON on stdout."""
+        """Report the outcome on stderr, or as JSON on stdout."""
         parts = [f"{self.points} point{'s' * (self.points != 1)}"]
         if self.off:
             parts.append(f"{self.off} more than {self.limit:.3g} px off their epipolar lines")

@@ -1,4 +1,4 @@
-"""``neurocal undistort``: images and points in, the same without the lens out."""
+"""``neurocal undistort``: remove the lens distortion from images and points."""
 
 from __future__ import annotations
 
@@ -74,9 +74,9 @@ def undistort(
     valid pixels, 1 shows all pixels of the original image and fills the rest with black. --camera writes
     the new matrix.
 
-    No plane shows 180 degrees, and from 120 on its rim is stretched beyond use. --to cylinder and
-    --to equirectangular show what fisheyes see beyond that. What is lost is said on standard error.
-    Pixels that see nothing are black.
+    A plane cannot show 180 degrees, and from 120 on its rim is stretched too much. --to cylinder and
+    --to equirectangular show the wider field of view of fisheyes. The part that is lost is reported on
+    standard error. Pixels without a source are black.
 
     Several images are written to a folder as PNG; a single image may go to a file of any of the
     kinds above. An image that cannot be undistorted, for example one of another size, is reported on

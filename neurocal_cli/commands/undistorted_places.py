@@ -1,4 +1,4 @@
-"""Where the results of ``neurocal undistort`` go."""
+"""The output files of ``neurocal undistort``."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from neurocal_cli.errors import UsageError
 
 
 def places_of(paths: Sequence[str], output: str) -> tuple[str | None, list[str]]:
-    """The folder that the output names, if it names one, and the place of each file's result.
+    """The output folder, if the output is one, and the output file of each input.
 
     Raises
     ------
     UsageError
-        Several files, or an image, where there can be none.
+        The output cannot hold several files or an image.
     """
     if not paths:
         return None, []
@@ -54,20 +54,20 @@ def _name(path: str) -> str:
 def check_distinct(
     inputs: Iterable[str], outputs: Sequence[str], paths: Sequence[str], others: Mapping[str, str | None]
 ) -> None:
-    """Refuse to overwrite inputs, or to write two files to one place.
+    """Refuse to overwrite inputs, or to write two results to the same file.
 
     Parameters
     ----------
     inputs : iterable of str
     outputs, paths : sequences of str of one length
-        Where the results go, and what they are made of.
+        Output files, and the inputs from which they are made.
     others : dict
-        Further places by what is written there.
+        Further output files by their content.
 
     Raises
     ------
     UsageError
-        The two that are in each other's way.
+        The message names the two files that collide.
     """
     read = {os.path.realpath(path) for path in inputs if path != "-"}
     taken: dict[str, str] = {}

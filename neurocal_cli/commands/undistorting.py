@@ -1,4 +1,4 @@
-"""The files of ``neurocal undistort``, corrected one by one, and what the results show."""
+"""Undistort the files of ``neurocal undistort`` one by one, and report the loss of field of view."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from neurocal_cli.io.writing import write_whole
 if TYPE_CHECKING:
     from neurocal_cli.distortion.remapping import Remapping
 
-_UNTOLD = 2.0  # degrees that nobody misses
+_UNTOLD = 2.0  # degrees of field of view whose loss is not reported
 
 
 @dataclass
 class Undistorting:
-    """One camera, what is prepared for its images, and what there is to say.
+    """One camera with the prepared tables for its images, and the notes for the user.
 
     Attributes
     ----------
@@ -33,11 +33,11 @@ class Undistorting:
         The camera of the results, from the size of the images.
     interpolation : str
     folder : str or None
-        Where the results go, if it is a folder.
+        Output folder, if the output is one.
     notes : dict
-        What was done to images, and to which.
+        Remarks about images, with the images concerned.
     left_out : int
-        Points that the result cannot show.
+        Number of points that the result cannot show.
     size : (width, height) or None [px]
         Of the images, once it is known.
     """
@@ -60,7 +60,7 @@ class Undistorting:
 
     def remap(self) -> Remapping:
         """The tables of images of the known size."""
-        from neurocal_cli.distortion.remapping import Remapping  # with OpenCV, which points do not need
+        from neurocal_cli.distortion.remapping import Remapping  # imports OpenCV, which points do not need
 
         if self.size is None:
             raise InputError(
@@ -71,7 +71,7 @@ class Undistorting:
         return self.remapping
 
     def correct_all(self, paths: Sequence[str], outputs: Sequence[str]) -> dict[str, str]:
-        """Correct all files; of several those that fail are told and left out. These, with the reasons."""
+        """Undistort all files; return those that failed, with the reasons. A single file raises."""
         if len(paths) > 1:
             failed = each_of(list(zip(paths, outputs, strict=True)), self._correct, "files", "undistorted")
             return {paths[k]: reason for k, reason in failed.items()}
@@ -80,12 +80,12 @@ class Undistorting:
         return {}
 
     def tell_notes(self) -> None:
-        """Say what was done to images, each thing once."""
+        """Report the remarks about images, each once."""
         for text, names in self.notes.items():
             note([f"{some_of(names)}: {text}"])
 
     def tell_loss(self) -> None:
-        """Say how much of a wide lens's field of view the results leave out."""
+        """Report the part of a wide lens's field of view that the results lose."""
         if not self.camera.distortion.wide or self.size is None:
             return
         parts = [
@@ -104,13 +104,13 @@ class Undistorting:
             say(f"{name} shows {' and '.join(parts)} that the images span; {more} shows more")
 
     def summary(self) -> dict[str, Any]:
-        """What the results are, for programs."""
+        """Summary of the results for programs."""
         shown, spanned = (None, None) if self.size is None else self._fields_of_view(self.size)
         camera = {key: getattr(x, "tolist", lambda x=x: x)() for key, x in self._described().items()}
         return {"n_left_out": self.left_out, "shown_deg": shown, "spanned_deg": spanned, "camera": camera}
 
     def write_camera(self, path: str) -> None:
-        """Write the camera of what was corrected."""
+        """Write the camera of the undistorted results."""
         from neurocal_cli.io.camera_info import format_camera_info, format_panorama
 
         new = self.new()
@@ -120,20 +120,20 @@ class Undistorting:
             write_whole(path, format_camera_info(replace(new, image_size=new.image_size or self.size)))
 
     def write_maps(self, path: str) -> None:
-        """Write the tables, and the camera of the pictures that they make."""
+        """Write the remapping tables, and the camera of the images that they produce."""
         from neurocal_cli.io.exchange.dictionary import npz_bytes
 
         u, v = self.remap().tables()
         write_whole(path, npz_bytes({"u": u, "v": v, **self._described()}))
 
     def _fields_of_view(self, size: tuple[int, int]) -> tuple[tuple[float, float], tuple[float, float]]:
-        """What the results show and what the images span, from left to right and top to bottom [degrees]."""
+        """Fields of view of the results and of the images, horizontally and vertically [degrees]."""
         new = self.new()
         whole = field_of_view(self.camera, size)
         return field_of_view(new, new.image_size or size).common(whole).degrees, whole.degrees
 
     def _described(self) -> dict[str, Any]:
-        """The camera of the results, by names."""
+        """The camera of the results as JSON values."""
         new = self.new()
         if isinstance(new, Panorama):
             return {"projection": new.shape, "f": new.f, "u0": new.u0, "v0": new.v0}

@@ -1,4 +1,4 @@
-"""Images that come one by one: after each, what the camera is worth by then, and which view helps most."""
+"""Watch a folder for new images: after each one, report the calibration so far and advise the next view."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from neurocal_cli.errors import FormatError, NeurocalError
 if TYPE_CHECKING:
     from neurocal_cli.detection.batch import DetectionOptions, Outcome
 
-_PAUSE = 0.3  # seconds between two looks; a file that is still copied grows in this time
+_PAUSE = 0.3  # seconds between two checks; a file that is still being copied grows in this time
 
 
 def watch(
     find: Callable[[], Sequence[str]], options: DetectionOptions, seconds: float
 ) -> list[tuple[str, Outcome]]:
-    """Detect boards in images as they come, until none has come for a while or the user interrupts.
+    """Detect boards in images as they arrive, until a timeout or an interrupt by the user.
 
     Parameters
     ----------
     find : callable
-        Gives the paths of the images that are there.
+        Returns the paths of the present images.
     options : DetectionOptions
     seconds : float
-        To wait for another image.
+        Time to wait for another image.
 
     Returns
     -------
     outcomes : list of (path, Outcome)
-        In the order in which the images came.
+        In the order in which the images arrived.
     """
     from neurocal_cli.detection.batch import detect_file
 
@@ -55,7 +55,7 @@ def watch(
 def _whole(
     find: Callable[[], Sequence[str]], sizes: dict[str, tuple[int, float]], known: dict[str, Outcome]
 ) -> list[str]:
-    """New images that have not changed since the last look."""
+    """New images that have not changed since the last check."""
     try:
         paths = find()
     except FormatError:  # an empty folder: the first image is still to come

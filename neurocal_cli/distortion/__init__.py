@@ -1,1 +1,1 @@
-"""Which lens the data support, jointly or from straight lines; and what a lens has bent, straightened."""
+"""Selection and estimation of the distortion model, also from straight lines; undistortion."""

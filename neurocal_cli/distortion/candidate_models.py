@@ -1,4 +1,4 @@
-"""Every distortion model fitted to the same points, each from the one before it."""
+"""Fit all candidate distortion models to the same points, each starting from a simpler one."""
 
 from __future__ import annotations
 
@@ -30,31 +30,30 @@ from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models) and
 # tests/test_multi_start.py (slow: 200 of each of five, no local minimum): steps, limits and thresholds are
-# the tightest with which all of these end as they do; penalties and tests against 0 are chi-squared levels,
-# as said beside them.
+# the tightest that give these results; penalties and significance tests are chi-squared levels, as noted.
 #
-# A fisheye's coefficients beyond the first few are of use only when the points reach far out.
+# Numbers of free fisheye coefficients with the fixed ones: higher ones need points far from the axis.
 _FISHEYES = ((1, {"k2", "k3", "k4"}), (2, {"k3", "k4"}), (4, set[str]()))
-# What each model has more than a simpler one.
+# Number of coefficients that each model adds to the next simpler one.
 _NEW = {"k1": 1, "k1k2": 1, "k1k2p1p2": 2, "plumb_bob": 1, "rational": 3}
-# Each with coefficients that the one before lacks.
+# Nested models, from simple to rich.
 _CHAIN = ("k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")
-_SHORT = 1.4  # times the rms error of free networks: the camera may be a wrong one
-# The same by the quadratics of the common camera alone: where they say less, all steps of the free networks
-# never made it more than 1.2. tests/test_free_networks.py repeats it.
+_SHORT = 1.4  # times the rms error of free networks: a worse camera may be at a wrong minimum
+# The same for the quadratic models of the free networks. Where these give less, full descents of the networks
+# never gave more than 1.2; tests/test_free_networks.py repeats it.
 _FAR_FROM_SHORT = 1.15
-_VIEWS_THAT_TELL = 60  # of it: 1000 views take as long as these
-_BEHIND = 1.5  # times the squared error
-_LEAST_PENALTY = 7.9  # chi-squared of one superfluous coefficient in two hundred
-# Of the gain that the criterion asks of the rational model; below, it was never chosen
-# (tests/test_model_selection.py, slow: 100 scenes).
+_MOST_VIEWS = 60  # views that are compared with free networks, to limit the time
+_BEHIND = 1.5  # times the squared error of a richer model, from which on a model is fitted again
+_LEAST_PENALTY = 7.9  # chi-squared of a superfluous coefficient, exceeded in one case of 200
+# Share of the gain required by the criterion that the rational model must predict; with less, it was never
+# selected (tests/test_model_selection.py, slow: 100 scenes).
 _PROMISING = 0.5
-_ROUNDING = 1e-12  # of a normal matrix: narrow fields of view leave combinations of coefficients untold
-_STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients all but compensate each other
-_SPARE = 1.3  # equations for each unknown
-_WIDE = 0.7  # radius from which on a model can be a fisheye's: 35 degrees off the axis
-_TOLD_APART = 4.0  # squared standard deviations, for each coefficient
-_LARGEST_TERM = 3.0  # of one coefficient at the farthest point; all terms together are about 1
+_ROUNDING = 1e-12  # relative cutoff: in narrow fields of view combinations of coefficients are undetermined
+_STEPS, _RATIONAL_STEPS = 60, 150  # the rational model's coefficients are nearly degenerate
+_SPARE = 1.3  # fewest equations per unknown
+_WIDE = 0.7  # least radius of the points for a fisheye model: 35 degrees from the axis
+_TOLD_APART = 4.0  # squared standard deviations per coefficient that differ significantly from 0
+_LARGEST_TERM = 3.0  # largest term of one coefficient at the farthest point; all terms together are about 1
 
 
 @frozen_dataclass(eq=False)
@@ -64,18 +63,18 @@ class Candidate:
     Attributes
     ----------
     problem : Problem
-        With the model to be estimated, and what keeps it monotonic.
+        With this model, and a restraint that keeps it monotonic if needed.
     adjusted : Adjusted
     lost : array
-        Squared error of each part of the data when it is left out.
+        Cross-validation: squared error of each part of the data when it is held out.
     noise : bool
-        Whether its coefficients are noise.
+        Whether its coefficients are only noise.
     not_monotonic : str or None
         Where it is not monotonic: within the "points" or within the "image".
     determined : bool
-        Whether the points leave no parameter open.
+        Whether the points determine all parameters.
     weak : bool
-        Whether they tell a focal length so badly that other minima may be lower.
+        Whether a focal length is so poorly determined that other local minima may be lower.
     """
 
     problem: Problem
@@ -88,12 +87,12 @@ class Candidate:
 
     @property
     def sound(self) -> bool:
-        """Whether it may be chosen."""
+        """Whether it may be selected."""
         return not self.noise and self.not_monotonic is None and self.determined
 
     @property
     def coefficients(self) -> int:
-        """How many distortion coefficients were estimated."""
+        """Number of estimated distortion coefficients."""
         return int(self.problem.free_camera[5:].sum())
 
     @property
@@ -102,13 +101,13 @@ class Candidate:
         return float(self.adjusted.cost.sum())
 
     def criterion(self, n: float) -> float:
-        """Bayesian information criterion (Schwarz 1978), n residuals being independent."""
+        """Bayesian information criterion (Schwarz 1978) for n independent residuals."""
         penalty = max(np.log(n), _LEAST_PENALTY) * self.coefficients
         return float(n * np.log(max(self.cost, 1e-300)) + penalty)
 
 
 def supported(problem: Problem, model: str) -> Problem | None:
-    """The problem with this model to be estimated; None when there are too few points for it."""
+    """The problem with this model; None if there are too few points for it."""
     with_model = problem.with_model(model)
     equations = problem.views.n_distinct_equations
     if model != "none" and equations < _SPARE * with_model.n_parameters + 4:
@@ -117,7 +116,7 @@ def supported(problem: Problem, model: str) -> Problem | None:
 
 
 def as_fisheye(problem: Problem, state: CameraState) -> tuple[Problem, Adjusted]:
-    """The fisheye, with all its coefficients, that begins with a state of any model."""
+    """Fit a fisheye with all its coefficients, starting from a state of any model."""
     fisheye = problem.with_model("fisheye")
     k = _coefficients(state, "fisheye", radius(problem.views, state))
     return fisheye, fisheye.adjust(replace(state, model="fisheye", k=k), _STEPS)
@@ -126,16 +125,16 @@ def as_fisheye(problem: Problem, state: CameraState) -> tuple[Problem, Adjusted]
 def fit_candidates(
     problem: Problem, state: CameraState, by_views: bool, wanted: str | None = None
 ) -> dict[str, Candidate]:
-    """Fit every model, beginning with a state of any of them.
+    """Fit every model, starting from a state of any of them.
 
     Parameters
     ----------
     problem : Problem
     state : CameraState
     by_views : bool
-        Whether views are left out in cross-validation, or points.
+        Whether cross-validation holds out views or points.
     wanted : str, optional
-        The model that counts; the others are only on the way to it, and need not be monotonic.
+        The only model of interest; the others serve as starts and need not be monotonic.
     """
     return _Chain(problem, by_views, radius(problem.views, state), wanted=wanted).all_from(state)
 
@@ -143,7 +142,7 @@ def fit_candidates(
 def judged_again(
     fitted: dict[str, Candidate], by_views: bool, repeated: RepeatedPoses
 ) -> dict[str, Candidate]:
-    """The same fits, views that repeat a pose being one view to what they are judged by."""
+    """Assess the same fits again, counting views that repeat a pose as one."""
     again = {}
     for model, candidate in fitted.items():
         reach = radius(candidate.problem.views, candidate.adjusted.state)
@@ -155,14 +154,14 @@ def judged_again(
 
 @frozen_dataclass(eq=False)
 class _Chain:
-    """What all fits have in common.
+    """Fits a chain of models to one problem.
 
     Attributes
     ----------
     problem : Problem
     by_views : bool
     reach : float
-        Of the points.
+        Normalised radius of the farthest point.
     repeated : RepeatedPoses, optional
     wanted : str, optional
     """
@@ -174,7 +173,7 @@ class _Chain:
     wanted: str | None = None
 
     def all_from(self, state: CameraState) -> dict[str, Candidate]:
-        """Fits of all models that the points support, each begun from the best of the simpler ones."""
+        """Fit all models that the points support, each from the best of the simpler ones."""
         fitted: dict[str, Candidate] = {}
         least = self._cost(state)
         for model in ("none", *_CHAIN):
@@ -196,9 +195,9 @@ class _Chain:
         return fitted if best is None else fitted | {"fisheye": best}
 
     def _promises_little(self, rational: Problem, fitted: dict[str, Candidate]) -> bool:
-        """Whether the rational model need not be fitted, because the criterion cannot be for it.
+        """Whether the rational model can be skipped, because the criterion will not select it.
 
-        Its descent is long, and what it gains is told by the quadratic around the minimum of `plumb_bob`.
+        Its descent is long, so its gain is predicted from the quadratic model at the minimum of `plumb_bob`.
         """
         simpler = fitted.get("plumb_bob")
         if simpler is None or self.wanted == "rational" or rational.restraint is not None:
@@ -217,13 +216,13 @@ class _Chain:
         )
 
     def _cost(self, state: CameraState) -> float:
-        """Of a state that has a distortion; a pinhole is no start to go back to."""
+        """Squared error of a state with distortion; infinite for a pinhole, so that any fit replaces it."""
         if state.model == "none":
             return np.inf
         return float((point_residuals(self.problem.views, state) ** 2).sum())
 
     def _fit_again(self, simple: str, more: str, fitted: dict[str, Candidate]) -> None:
-        """A model that is missing, or far behind one with more coefficients, lost its way: begin there."""
+        """Fit a model again from the next richer one if it is missing or far worse than that."""
         problem = supported(self.problem, simple)
         if problem is None or more not in fitted:
             return
@@ -235,9 +234,9 @@ class _Chain:
             fitted[simple] = candidate
 
     def _fisheyes(self, state: CameraState) -> list[Candidate]:
-        """With one, two and four coefficients, each from the one before it."""
+        """Fit fisheyes with one, two and four coefficients, each from the previous one."""
         problem = supported(self.problem, "fisheye")
-        # The pinhole that all began with may see a fisheye's points nearer to the axis than they are.
+        # The initial pinhole may underestimate the angles of a fisheye's points.
         if problem is None or max(self.reach, radius(problem.views, state)) < _WIDE:
             return []
         found = []
@@ -249,7 +248,7 @@ class _Chain:
         return found
 
     def _monotonic(self, fitted: list[Candidate]) -> list[Candidate]:
-        """The same models, monotonic in the corners which the points do not reach."""
+        """Fit promising models again that are not monotonic in image corners without points."""
         lowest = min((c.cost for c in fitted), default=0.0)
         near = [
             c.not_monotonic == "image"
@@ -266,11 +265,11 @@ class _Chain:
         found = fit_monotonic(candidate.problem, candidate.adjusted)
         if found is not None:
             return self.assessed(*found) or candidate
-        # The image of a wide lens may end within the picture.
+        # The image circle of a wide lens may end within the image.
         return replace(candidate, not_monotonic=None) if candidate.problem.distortion.wide else candidate
 
     def _fit(self, problem: Problem, state: CameraState, most: int = 4) -> Candidate | None:
-        """None when it did not settle, or too little is left for it without a part of the data."""
+        """Fit one model; None if it did not converge, or if a part of the data is indispensable."""
         model = problem.distortion.model
         if state.model in WIDE and state.model not in (model, "fisheye"):
             similar = similar_states(state, "fisheye", farthest_angle(self.problem.views, state))
@@ -283,7 +282,7 @@ class _Chain:
         return self.assessed(problem, adjusted)
 
     def assessed(self, problem: Problem, adjusted: Adjusted) -> Candidate | None:
-        """A fit with what it is judged by; None where too little is left without a part of the data."""
+        """A fit with the measures for the selection; None if a part of the data is indispensable."""
         views, state, free = problem.views, adjusted.state, problem.free_camera
         held = None if problem.restraint is None else normal_part(problem.restraint, state, free)
         if self.by_views:
@@ -305,13 +304,13 @@ class _Chain:
 
 
 def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
-    """Whether every view by itself fits far better than the best of the common cameras.
+    """Whether separate free networks fit the views far better than the best common camera.
 
-    Of many views, some that lie evenly among them tell.
+    Of many views, an evenly spaced subset is used.
     """
     best = min(fitted, key=lambda c: c.cost)
     n = views.n_views
-    some = np.linspace(0, n - 1, min(n, _VIEWS_THAT_TELL)).round().astype(np.intp)
+    some = np.linspace(0, n - 1, min(n, _MOST_VIEWS)).round().astype(np.intp)
     state, normal = best.adjusted.state, best.adjusted.normal[some]
     cost = float(normal[:, -1, -1].sum())
     if cost <= _FAR_FROM_SHORT**2 * float(least_of_free_networks(normal).sum()):
@@ -321,17 +320,16 @@ def falls_short(views: Views, fitted: Iterable[Candidate]) -> bool:
 
 
 def _fewest_coefficients(fisheyes: list[Candidate], views: Views) -> Candidate | None:
-    """The fisheye with as many coefficients as the criterion asks for."""
+    """The fisheye with the best criterion."""
     some = [candidate for candidate in fisheyes if candidate.sound] or fisheyes
     n = worth(views, some)
     return min(some, key=lambda candidate: candidate.criterion(n), default=None)
 
 
 def worth(views: Views, fitted: Collection[Candidate]) -> float:
-    """What the number of residuals is worth, when neighbours are alike.
+    """Effective number of residuals, given the correlation of neighbours.
 
-    In the fit that is closest: what a model that is too simple leaves is correlated in neighbours, too, but
-    tells of the model.
+    The correlation is that of the closest fit, because a model that is too simple adds correlation.
     """
     if not fitted:
         return 1.0
@@ -348,9 +346,9 @@ def _determined(problem: Problem, state: CameraState, cov: Covariance) -> bool:
 
 
 def _noise(model: str, state: CameraState, reach: float, cov: Array) -> bool:
-    """Whether coefficients are noise: large ones that cancel each other, or new ones not told from 0.
+    """Whether coefficients are noise: large ones that cancel, or insignificant new ones.
 
-    New ones are those that a simpler model does not have, taken together; a fisheye's may be 0.
+    New ones are those that the next simpler model lacks; they are tested together. A fisheye has none.
     """
     k = state.k
     if (np.abs(_terms(model, reach) * k) > _LARGEST_TERM).any():
@@ -365,7 +363,7 @@ def _noise(model: str, state: CameraState, reach: float, cov: Array) -> bool:
 
 
 def _terms(model: str, reach: float) -> Array:
-    """Size of each coefficient's term at the farthest point, per coefficient."""
+    """Derivative of the relative radius by each coefficient, at the farthest point."""
     if model == "fisheye":
         return np.asarray(np.arctan(reach) ** np.array([2.0, 4.0, 6.0, 8.0]))
     powers = np.array([2.0, 4.0, 1.0, 1.0, 6.0, 2.0, 4.0, 6.0])
@@ -373,22 +371,22 @@ def _terms(model: str, reach: float) -> Array:
 
 
 def _coefficients(state: CameraState, model: str, reach: float, most: int = 4) -> Array:
-    """Those of another model that distort nearly as this state does, of a fisheye the first `most`."""
+    """Coefficients of another model with nearly the same distortion; for a fisheye the first `most`."""
     names = coefficient_names(model)
     old = dict(zip(coefficient_names(state.model), state.k.tolist(), strict=True))
     fisheye = model == "fisheye"
     estimated = set(names[:most] if fisheye else names)
     if fisheye == (state.model == "fisheye") and {name for name, k in old.items() if k} <= estimated:
         return np.array([old.get(name, 0.0) for name in names])
-    # As far out as the points reach, by least squares: q (1 + k1 q^2 + k2 q^4 + ...) is the distorted
-    # radius of the undistorted one r, where q is r or a fisheye's angle.
+    # Least squares up to the farthest point: q (1 + k1 q^2 + k2 q^4 + ...) is the distorted radius of the
+    # undistorted radius r, where q is r or a fisheye's angle.
     r = np.linspace(0.05, 1, 60) * reach
     radial = [0.0 if name in NOT_RADIAL else k for name, k in old.items()]
     distorted = distort(state.model, radial, r, np.zeros_like(r))[0]
     q = np.arctan(r) if fisheye else r
     of_radius = [name for name in names if name in ("k1", "k2", "k3", "k4")][: most if fisheye else 3]
     powers = q[:, None] ** np.arange(3, 2 * len(of_radius) + 3, 2)
-    if not np.isfinite(distorted).all():  # beyond a pole
+    if not np.isfinite(distorted).all():  # there is a pole
         return pinhole_coefficients(model)
     found = np.linalg.lstsq(powers, distorted - q, rcond=1e-6)[0]
     new = {name: k for name, k in old.items() if name in NOT_RADIAL} | dict(

@@ -1,7 +1,7 @@
-"""k4, k5 and k6 of a lens with a prism or a tilted sensor: estimated only where the points tell them.
+"""k4, k5 and k6 of a thin-prism or tilted lens: estimated only if the points support them.
 
-In OpenCV they are a choice of their own (CALIB_RATIONAL_MODEL): beside an ordinary lens's k1, k2 and k3 they
-all but compensate each other. So they stay 0 unless the Bayesian information criterion is decidedly for them.
+In OpenCV they are optional (CALIB_RATIONAL_MODEL). In an ordinary lens they are nearly degenerate with k1, k2
+and k3. So they stay 0 unless the Bayesian information criterion decidedly favours them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.distortion.monotonic_fit import folds_back
 
 DENOMINATOR = frozenset({"k4", "k5", "k6"})
-_STEPS = 150  # the coefficients all but compensate each other
+_STEPS = 150  # many, because the coefficients are nearly degenerate
 # Repeated by tests/test_prism_and_tilt.py (slow): 100 lenses without a denominator and with one.
-_DECISIVE = 10.0  # of the criterion: odds of 150
+_DECISIVE = 10.0  # difference of the criterion: odds of 150
 
 
-def with_denominator_if_told(solution: Solution) -> Solution:
-    """The solution with k4, k5 and k6 too, if that explains decidedly more, or nothing else is monotonic."""
+def with_denominator_if_supported(solution: Solution) -> Solution:
+    """Add k4, k5 and k6 if that explains decidedly more, or if the model is not monotonic without them."""
     problem, views = solution.problem, solution.problem.views
     if views.n_equations - problem.n_parameters < 2 * len(DENOMINATOR):
         return solution

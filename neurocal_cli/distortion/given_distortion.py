@@ -1,8 +1,8 @@
-"""The end of every calibration with a distortion: on the pixels as they were seen, and monotonic.
+"""Final step of a calibration with distortion: observed pixels, and a monotonic model.
 
-The networks know a pinhole only. A distortion that is given is taken off the pixels before they train
-(`Problem`), and bundle adjustment ends on the pixels as they were seen. A distortion that is estimated
-joins in the bundle adjustment (`Problem.adjust`).
+The networks model a pinhole. A given distortion is removed from the pixels before training (`Problem`), and
+the final bundle adjustment uses the observed pixels. An estimated distortion is part of the bundle adjustment
+(`Problem.adjust`).
 """
 
 from __future__ import annotations
@@ -15,23 +15,22 @@ from neurocal_cli.errors import DegenerateGeometryError
 
 
 def check_distortion(solution: Solution) -> Solution:
-    """Put a given distortion back, and check that the distortion is monotonic.
+    """Restore a given distortion, and check that an estimated one is monotonic.
 
-    One that is not, where no point is seen, is fitted so that it is, unless the points deny it. One that is
-    given stays.
+    An estimated distortion that is not monotonic in parts of the image without points is fitted again so that
+    it is, unless the points contradict that.
 
     Raises
     ------
     DegenerateGeometryError
-        An estimated distortion that is not monotonic inside the points, or inside the image whatever one
-        does.
+        The estimated distortion is not monotonic among the points, or cannot be made so within the image.
     """
     problem = solution.problem
     distortion = problem.distortion
     if distortion.model == "none":
         return solution
     if not problem.free_distortion:
-        # It may fold the image's corners: `problem_for` took these points off it.
+        # A given distortion may fold the image's corners, but `problem_for` has checked these points.
         problem, start = problem.as_seen(solution.state)
         adjusted = problem.adjust(replace(solution.adjusted, state=start))
         return replace(solution, problem=problem, adjusted=adjusted)
@@ -42,7 +41,7 @@ def check_distortion(solution: Solution) -> Solution:
         found = fit_monotonic(problem, solution.adjusted)
         if found is not None:
             return replace(solution, problem=found[0], adjusted=found[1])
-        if distortion.wide:  # its image may end within the picture
+        if distortion.wide:  # its image circle may end within the image
             return solution
     raise DegenerateGeometryError(
         f"the distortion model {distortion.model} is not monotonic (maps two directions to one pixel) inside "

@@ -1,18 +1,18 @@
-"""``auto``: the simplest distortion model that the data support.
+"""``--distortion auto``: select the simplest distortion model that the data support.
 
-Every model is fitted, each from the one before it. The cross-validation error decides: five folds of
-the views, or of the points of a single view. The model with the lowest one is taken, unless others are as
-good: all whose error is within 0.9 % of the lowest, and simpler ones whose error is above it by no more than
-the standard error that the five folds have. Among them the Bayesian information criterion (Schwarz 1978)
-chooses, n log E + p log n, n being the effective number of residuals when neighbours are correlated, and when
-views repeat a pose (`repeated_poses`), which are one view to the folds, too.
+All models are fitted, each starting from a simpler one, and compared by their cross-validation error in five
+folds of the views (or of the points of a single view). The model with the lowest error is tied with all
+models whose error is within 0.9 % of it, and with simpler models whose error exceeds it by at most the
+standard error of the five folds. Among the tied models the Bayesian information criterion (Schwarz 1978)
+decides, n log E + p log n, where n is the effective number of residuals: it accounts for the correlation of
+neighbours and for views that repeat a pose (`repeated_poses`), which also share a fold.
 
-Models with more than two coefficients beyond what the criterion alone would choose take no part, unless they
-predict far better than all others. Neither do models that did not converge, that have too few points,
-or that are not monotonic (`monotonic_fit`). Models whose coefficients are strongly correlated are kept only
-when they lower the cross-validation error over several views by 5 %. A wide-angle lens's model (`WIDE`) is a
-candidate only where points reach far from the axis, and where the criterion is decidedly for it against all
-ordinary models: near the axis all lenses are alike.
+Models with over two coefficients more than the criterion alone would select are excluded, unless they predict
+far better than all others. Also excluded are models that did not converge, have too few points, or are not
+monotonic (`monotonic_fit`). Models whose coefficients are strongly correlated must lower the cross-validation
+error over several views by 5 %. Models of wide lenses (`WIDE`) are candidates only if points lie far from the
+axis and the criterion decidedly favours them over all ordinary models, because near the axis all lenses are
+alike.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from neurocal_cli.distortion.candidate_models import (
     judged_again,
     worth,
 )
-from neurocal_cli.distortion.multi_start import VIEWS_THAT_TELL
+from neurocal_cli.distortion.multi_start import FEW_VIEWS
 from neurocal_cli.geometry import Array
 
 Starts = Callable[[Problem], Iterable[CameraState]]
@@ -48,42 +48,43 @@ Starts = Callable[[Problem], Iterable[CameraState]]
 # Repeated by tests/test_model_selection.py (slow: 200 lenses of each of six models; the true one in 86 to
 # 100 %, never more than two coefficients too many, 1 % of the best error on new views) and
 # tests/test_rendered_sets.py.
-_TIE = 0.009  # of the rms error
-_CERTAIN = 2.0  # standard errors of five folds, and
-_DECIDEDLY = 1.03  # times the rms error, that something must be better by to be so decidedly
-_FAR_WORSE = 2.0  # times the rms error of a model that folds back
-_WORTH = 1.05  # times the rms error: what coefficients that cancel each other must be better by
-_FAR_BETTER = 1.25  # times the rms error, with more coefficients than the criterion asks for
-_MORE = 2  # coefficients
-_MOST_ORDINARY = 5  # coefficients: with eight, a rational model is a wide-angle lens's too
-_DECISIVE = 10.0  # of the criterion: odds of 150
-_CORRELATED = 0.3  # correlation of neighbours' residuals
-_BETTER, _MUCH_BETTER = 0.999, 0.8  # times the squared error
+_TIE = 0.009  # relative difference of rms errors that counts as equal
+# "Decidedly better" means by this number of standard errors over the five folds, and by this factor.
+_CERTAIN = 2.0
+_DECIDEDLY = 1.03
+_FAR_WORSE = 2.0  # times the rms error of a rejected model that is not monotonic: then the result is refused
+_WORTH = 1.05  # factor by which coefficients that cancel must lower the rms error
+_FAR_BETTER = 1.25  # factor that admits more coefficients than the criterion favours
+_MORE = 2  # number of coefficients beyond the criterion's choice that is admitted
+_MOST_ORDINARY = 5  # coefficients of an ordinary lens; a rational model with eight also fits wide lenses
+_DECISIVE = 10.0  # difference of the criterion: odds of 150
+_CORRELATED = 0.3  # correlation of neighbouring residuals from which on other starts are tried
+_BETTER, _MUCH_BETTER = 0.999, 0.8  # ratio of squared errors below which another start is better
 
 
 def select_model(solution: Solution, more_starts: Starts | None = None, preferred: str = "") -> Solution:
-    """Fit all models, from a solution with any of them, and choose.
+    """Fit all models, starting from a solution with any of them, and select one.
 
     Parameters
     ----------
     solution : Solution
     more_starts : callable, optional
-        Other states for a problem to begin with, where the first leads to nothing that explains the points.
+        Yields other starting states for a problem, in case the first leads to a local minimum.
     preferred : str
-        A model to take where no other predicts decidedly better.
+        A model to select unless another predicts decidedly better.
 
     Returns
     -------
     Solution
-        With the cross-validation error of the models that could be fitted, and with a refusal where the
-        distortion is strong and the model that fits is not monotonic inside the image.
+        With the cross-validation errors of all fitted models. It is a refusal if the distortion is strong and
+        the model that fits is not monotonic inside the image.
     """
     problem, views = solution.problem, solution.problem.views
     by_views = _views_can_spare_any(solution)
     fitted = fit_candidates(problem, solution.state, by_views)
     if more_starts is not None:
         _look_elsewhere(fitted, solution, more_starts, by_views)
-    if not fitted:  # not even the pinhole settled: as it is
+    if not fitted:  # not even the pinhole converged
         return replace(solution, model_errors={})
     fitted = {model: fitted[model] for model in MODELS if model in fitted}  # the simplest first
     if "none" in fitted and not fitted["none"].determined and _is_enough(views, fitted):
@@ -109,7 +110,7 @@ def select_model(solution: Solution, more_starts: Starts | None = None, preferre
 def _look_elsewhere(
     fitted: dict[str, Candidate], solution: Solution, more_starts: Starts, by_views: bool
 ) -> None:
-    """Take over what other starts lead to, as far as that is of interest."""
+    """Fit from other starts if the present fits may be local minima, and merge the results."""
     problem, views = solution.problem, solution.problem.views
     if (limit := _limit(views, fitted)) == 0 or not _may_lead_lower(fitted, limit, solution, more_starts):
         return
@@ -122,12 +123,12 @@ def _look_elsewhere(
 def _may_lead_lower(
     fitted: dict[str, Candidate], limit: float, solution: Solution, more_starts: Starts
 ) -> bool:
-    """Whether another start leads below the limit; of many views, a few tell."""
-    if not np.isfinite(limit) or solution.problem.points.n_views <= VIEWS_THAT_TELL:
+    """Whether another start leads below the limit; with many views, tested on a few of them."""
+    if not np.isfinite(limit) or solution.problem.points.n_views <= FEW_VIEWS:
         return True
     closest = min(fitted.values(), key=lambda c: c.cost)
     whole = replace(solution, problem=closest.problem, adjusted=closest.adjusted)
-    few = of_few_views(whole, VIEWS_THAT_TELL)
+    few = of_few_views(whole, FEW_VIEWS)
     if is_elsewhere(few, whole):
         return True
     limit *= float(few.adjusted.cost.sum()) / closest.cost
@@ -139,11 +140,11 @@ def _may_lead_lower(
 
 
 def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
-    """Squared error below which what another start leads to is of interest; 0: no start is.
+    """Squared error below which the result of another start is accepted; 0: no other start is needed.
 
-    Where every view by itself fits far better, or where no model is sound, any is; where the points tell a
-    focal length badly, one that explains more; where neighbours err alike, as they do on a board that is not
-    flat too, one that explains much more.
+    It is infinite if free networks fit far better or no model is sound. If a focal length is poorly
+    determined, another start must be better; if neighbouring residuals are correlated (as also on a board
+    that is not flat), much better.
     """
     if not any(c.sound for c in fitted.values()) or falls_short(views, fitted.values()):
         return np.inf
@@ -155,7 +156,7 @@ def _limit(views: Views, fitted: dict[str, Candidate]) -> float:
 
 
 def _join(fitted: dict[str, Candidate], others: dict[str, Candidate], limit: float) -> None:
-    """Take over what fits better, if any of the others is below the limit."""
+    """Merge other fits that are better, if any of them is below the limit."""
     if min((c.cost for c in others.values()), default=np.inf) >= limit:
         return
     for model, candidate in others.items():
@@ -164,7 +165,7 @@ def _join(fitted: dict[str, Candidate], others: dict[str, Candidate], limit: flo
 
 
 def _repeated(views: Views, fitted: dict[str, Candidate]) -> RepeatedPoses:
-    """Views that repeat a pose, as the fit that is closest has them."""
+    """Views that repeat a pose, according to the closest fit."""
     state = min(fitted.values(), key=lambda c: c.cost).adjusted.state
     return repeated_poses(views, state, point_residuals(views, state))
 
@@ -188,12 +189,12 @@ def _is_enough(views: Views, fitted: dict[str, Candidate]) -> bool:
 def _best(
     fitted: dict[str, Candidate], views: Views, repeated: RepeatedPoses
 ) -> tuple[str, AbstractSet[str]]:
-    """Of the models whose held-out error is as low as any, the one with the lowest criterion.
+    """The model with the lowest criterion among those tied for the lowest cross-validation error.
 
-    And all models than which none predicts decidedly better.
+    The second result are all models that no other predicts decidedly better than.
 
-    What is held out may ask for two coefficients more than the criterion does, but not for more: a few
-    folds tell the better of two models, but among many models one is better than it should be by chance.
+    Cross-validation may select at most two coefficients more than the criterion: a few folds can rank two
+    models, but among many models one is the best by chance.
     """
     eligible = _eligible(fitted, views.n_views > 1)
     n = worth(views, eligible.values()) * repeated.worth
@@ -203,7 +204,7 @@ def _best(
     finite = {name: candidate for name, candidate in sound.items() if np.isfinite(candidate.lost).all()}
     few = {name: candidate for name, candidate in finite.items() if candidate.coefficients <= most}
     if not few:
-        return next(iter(sound)), set()  # the simplest: nothing can be left out
+        return next(iter(sound)), set()  # cross-validation is impossible, so the simplest
     pool = {
         name: candidate
         for name, candidate in finite.items()
@@ -226,10 +227,7 @@ def _best(
 
 
 def _without_wide(fitted: dict[str, Candidate], n: float) -> dict[str, Candidate]:
-    """Without wide-angle lenses' models where ordinary ones do nearly as well.
-
-    An ordinary one need not be sound to tell that the lens may be ordinary.
-    """
+    """Exclude models of wide lenses if ordinary ones are nearly as good, even ones that are not sound."""
     ordinary = [c for name, c in fitted.items() if name not in WIDE and c.coefficients <= _MOST_ORDINARY]
     ordinary = [c for c in ordinary if c.not_monotonic is None and np.isfinite(c.lost).all()]
     if not ordinary:
@@ -249,18 +247,17 @@ def _decidedly(
 
 
 def predicts_decidedly_better(lost: Array, others: Array, repeated: RepeatedPoses, enough: float) -> bool:
-    """Whether a fit predicts better than another by enough to matter, and nearly everywhere.
+    """Whether a fit predicts held-out data better than another by a given factor, and significantly.
 
-    Everywhere by the mean logarithm of the ratio of what the parts of the data lose: a part that one of both
-    cannot do without has no more to say than others.
+    The significance is that of the mean log ratio over the folds, so that no single fold dominates.
 
     Parameters
     ----------
     lost, others : arrays
-        Squared error of each part of the data when it is left out.
+        Squared error of each part of the data when it is held out.
     repeated : RepeatedPoses
     enough : float
-        How many times larger the other's rms error must be.
+        Least ratio of the other's rms error to this one's.
     """
     by_fold = [np.maximum(_by_fold(array, repeated), 1e-300) for array in (lost, others)]
     if not by_fold[1].sum() > enough**2 * by_fold[0].sum():
@@ -274,7 +271,7 @@ def _lost(candidate: Candidate) -> float:
 
 
 def _by_fold(lost: Array, repeated: RepeatedPoses) -> Array:
-    """Sums of what each view or fold of points has lost, of those that were left out together."""
+    """Sum the held-out errors of views or parts of points by fold."""
     if len(lost) == len(repeated.group):
         return np.asarray(np.bincount(repeated.folds(FOLDS), lost))
     if len(lost) <= FOLDS:
@@ -283,9 +280,9 @@ def _by_fold(lost: Array, repeated: RepeatedPoses) -> Array:
 
 
 def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidate]:
-    """Sound models; the others too when they alone predict, which a single view cannot tell.
+    """Sound models; the other monotonic ones as well if they predict much better.
 
-    What is wrong with the target is alike in all the folds of one view.
+    A single view cannot tell that, because errors of the target are common to all of its folds.
     """
     monotonic = {name: c for name, c in fitted.items() if c.not_monotonic is None} or fitted
     sound = {name: c for name, c in monotonic.items() if c.sound}
@@ -296,7 +293,7 @@ def _eligible(fitted: dict[str, Candidate], several: bool) -> dict[str, Candidat
 
 
 def _refusal(fitted: dict[str, Candidate], chosen: Candidate) -> str:
-    """Say so where a simpler model was taken only because the one that fits folds back."""
+    """Why the result must be refused: the model that fits is not monotonic, the selected one far worse."""
     for model, candidate in fitted.items():
         bad = candidate.not_monotonic is not None and not candidate.noise and candidate.cost < chosen.cost
         if bad and chosen.lost.sum() > _FAR_WORSE**2 * candidate.lost.sum():

@@ -1,18 +1,17 @@
-"""A distortion that would not be monotonic where no point is seen, fitted so that it is.
+"""Fit a distortion that is monotonic over the whole image, also where there are no points.
 
-Points tell nothing of a corner that they do not reach, and the distortion that fits them best may turn
-back there by chance, so that two directions share a pixel. Among all that do not, the best one is
-sought: the reprojection error is minimised together with
+In a corner without points, the best-fitting distortion may turn back by chance, so that two directions share
+a pixel. The best monotonic one minimises the reprojection error together with the penalty
 
     sum_j (w max(0, s0 - s(r_j)))^2,
 
-where s(r) is the slope of the distorted radius at the undistorted radius r (`radial_slope`), s0 a small
-one, and the r_j lie between the axis and the radius that the image's farthest corner is seen from. Where
-that is follows from the distortion, so it is found step by step. The data contradict such a distortion
-when they fit it worse than chance would have it: then there is none.
+where s(r) is the slope of the distorted radius at the undistorted radius r (`radial_slope`) and s0 a small
+slope. The r_j lie between the axis and the undistorted radius of the image's farthest corner, which depends
+on the distortion and is found iteratively. If the fit is significantly worse, the data contradict every
+monotonic distortion, and there is no result.
 
-The standard deviations of what comes out are those of the points alone, as if the condition were not
-there: it can make them smaller, but its own bias is not in them.
+The standard deviations of the result are those from the points alone, without the penalty: it could make them
+smaller, but they would not contain its bias.
 """
 
 from __future__ import annotations
@@ -37,31 +36,31 @@ from neurocal_cli.points import Correspondences
 
 # Repeated by tests/test_monotonic_fit.py and, for the tie, tests/test_model_selection.py: lenses that are
 # not monotonic in unseen corners predict new views 5 to 16 % better with these.
-_BORDER = 17  # points along each side of the image at which it is checked
-_FARTHEST = 100  # points looked at
-_SLACK = 0.005  # of a slope, that costs as much as one standard deviation of a residual
+_BORDER = 17  # samples along each side of the image
+_FARTHEST = 100  # farthest points that are checked
+_SLACK = 0.005  # shortfall of a slope that costs as much as one standard deviation of a residual
 _NODES = 48
-# The least slope, how far it is asked for in units of the farthest corner's distance, and the slope that the
-# corner's radius is guessed with: first as much as lenses have, then hardly any.
+# The least slope s0, the radius up to which it is required in units of the farthest corner's distance, and
+# the slope for the first guess of that radius: at first as for typical lenses, then hardly any slope.
 _LEAST = ((0.1, 1.02, 0.5), (0.02, 1.0, 1.0))
 _GUESS = 0.5  # slope with which a corner's radius is corrected
 _ROUNDS, _STEPS, _MORE_STEPS = 12, 60, 600
-_CHANCE = 10.8  # chi-squared that one condition exceeds in one case of a thousand
-_TIE = 0.009  # of the rms error, that makes no difference
+_CHANCE = 10.8  # chi-squared of one condition, exceeded in one case of a thousand
+_TIE = 0.009  # negligible relative increase of the rms error
 
 
-# Steps that lead to a pole are told so by what they cost.
+# Steps that run into a pole get an infinite cost and are rejected.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @frozen_dataclass(eq=False)
 class MonotonicFit:
-    """The condition that a distortion is monotonic, as a `Restraint`.
+    """The penalty for a distortion that is not monotonic, as a `Restraint`.
 
     Attributes
     ----------
     radii : (m,) array
-        Straight radii, or a fisheye's angles.
+        Undistorted radii, or a fisheye's angles.
     weight : float
         w, in normalised pixels.
     least : float
@@ -74,7 +73,7 @@ class MonotonicFit:
 
     @_quietly
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
-        """Derivatives (m, 5 + K) and what the slopes lack (m,)."""
+        """Jacobian (m, 5 + K) and residuals (m,): the shortfall of the slopes."""
         slope, by_k = radial_slope(state.model, state.k, self.radii)
         lacking = np.maximum(self.least - slope, 0.0)
         rows = np.zeros((len(slope), 5 + len(state.k)))
@@ -83,22 +82,22 @@ class MonotonicFit:
 
 
 def normal_part(restraint: Restraint, state: CameraState, free: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """What a restraint adds to the free shared parameters' normal matrix (f, f) and right side (f,)."""
+    """Contribution of a restraint to the normal matrix (f, f) and right side (f,) of the free parameters."""
     rows, missing = restraint(state)
     rows = rows[:, free]
     return rows.T @ rows, rows.T @ missing
 
 
 def where_not_monotonic(distortion: Distortion, A: Array, points: Correspondences) -> str | None:
-    """Where a distortion is not monotonic: within the points, within the rest of the image, or nowhere.
+    """Where a distortion is not monotonic: "points", else "image", or None if it is everywhere.
 
-    The image is looked at where its size is known: at its corners, which nothing is farther out than,
-    and along its border where tangential terms may turn it back elsewhere first. What a wide lens that shows
-    90 degrees and more from its axis does not show, as the corners beyond its image circle, does not count.
+    The image is checked if its size is known: at the corners, which are farthest out, and along the border if
+    there are tangential terms. Pixels outside the image circle of a lens that covers 90 degrees or more from
+    its axis do not count.
     """
     if distortion.model == "none":
         return None
-    # The farthest points say it all.
+    # The farthest points suffice.
     away = np.hypot(points.pixels[:, 0] - A[0, 2], points.pixels[:, 1] - A[1, 2])
     farthest = points.pixels[np.argsort(-away, kind="stable")[:_FARTHEST]]
     border = np.zeros((0, 2))
@@ -135,23 +134,23 @@ def _sees(distortion: Distortion, A: Array, pixels: Array) -> bool:
 
 @_quietly
 def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted] | None:
-    """Fit a distortion that is not monotonic inside the image again, so that it is.
+    """Fit a distortion again so that it is monotonic inside the image.
 
     Parameters
     ----------
     problem : Problem
-        Of points with the image's size.
+        Its points know the image size.
     found : Adjusted
-        The best fit, which is monotonic within the points but not within the image.
+        The best fit, which is monotonic among the points but not within the image.
 
     Returns
     -------
     problem, adjusted
-        The problem with its restraint; None when the data contradict every such distortion.
+        The problem with its restraint; None if the data contradict every such distortion.
     """
     views, cost = problem.views, float(found.cost.sum())
     effective = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))
-    # The image of a wide lens may end within the picture, and its corners show nothing.
+    # The image circle of a wide lens may end within the image, and its corners show nothing.
     tie = 0.0 if found.state.distortion.wide else 2 * _TIE
     most = cost * (1 + max(tie, _CHANCE / effective))
     for least_slope in _LEAST:
@@ -164,7 +163,7 @@ def fit_monotonic(problem: Problem, found: Adjusted) -> tuple[Problem, Adjusted]
 def _with_slope(
     problem: Problem, found: Adjusted, most: float, least_slope: tuple[float, float, float]
 ) -> tuple[Problem, Adjusted] | None:
-    """The best distortion with some slope as far as the corners; None when it costs more than `most`."""
+    """The best distortion with a least slope up to the corners; None if it costs more than `most`."""
     least, beyond, guess = least_slope
     weight = float(np.sqrt(found.cost.sum() / problem.views.n_equations)) / _SLACK
     corner = beyond * _farthest(problem, found.state)
@@ -180,7 +179,7 @@ def _with_slope(
         if not adjusted.cost.sum() <= most:
             return None
         if folds_back(problem, state) is None:
-            # The descent creeps along the condition's edge where several coefficients share it.
+            # Along the edge of the penalty the descent is slow if several coefficients are involved.
             adjusted = adjusted if adjusted.converged else restrained.adjust(adjusted, _MORE_STEPS)
             return (restrained, adjusted) if adjusted.converged else None
         corner = beyond * _farthest(problem, state)

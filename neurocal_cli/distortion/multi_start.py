@@ -1,11 +1,11 @@
-"""A given choice of distortion model, fitted from other starts where the first ends in a local minimum.
+"""Multi-start for a given distortion model, against local minima.
 
-The minimum of a strong distortion is found only from a start that is near it. Where the residuals of
-neighbours are correlated, as a wrong distortion leaves them (and a board that is not flat), or where the
-points tell a focal length badly, every model is fitted, each from the one before it, from this start and
-from others; the best fit of the wanted model is the result. Wide lenses are reached through the fisheye, and
-a thin prism or a tilted sensor through the rational model. Of many views, a few tell whether another start
-leads to a lower minimum.
+The minimum of a strong distortion is found only from a start near it. If the residuals of neighbours are
+correlated (as a wrong distortion or a board that is not flat leaves them), or if a focal length is poorly
+determined, all models are fitted from this start and from others, each model from a simpler one. The best fit
+of the wanted model is the result. Wide lenses are reached from the fisheye, thin-prism and tilted models from
+the rational model. With many views, a few of them are used to test whether another start leads to a lower
+minimum.
 """
 
 from __future__ import annotations
@@ -27,27 +27,27 @@ from neurocal_cli.camera.distortion import WITH_PRISM
 from neurocal_cli.distortion.denominator import DENOMINATOR
 
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models): every local minimum there
-# showed more.
-_CORRELATED = 0.15  # correlation of neighbours' residuals
-VIEWS_THAT_TELL = 20  # whether there is a lower minimum; 1000 views take as long as these
-_LOWER = 0.999  # times the squared error of these views
+# had a larger correlation.
+_CORRELATED = 0.15  # correlation of neighbouring residuals
+FEW_VIEWS = 20  # most views with which other starts are tested, to limit the time
+_LOWER = 0.999  # ratio of squared errors below which a minimum is lower
 
 
 def with_more_starts(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Solution:
-    """The better of a solution and what other starts lead to, where it may be a local minimum.
+    """The better of a solution and the results of other starts, if it may be a local minimum.
 
     Parameters
     ----------
     solution : Solution
-        Of a problem whose distortion model is to be estimated; without one there is nothing to do.
+        Returned unchanged if no distortion is estimated.
     more_starts : callable
-        Other states for a problem to begin with.
+        Yields other starting states for a problem.
     """
     problem = solution.problem
-    # An xi that is held, and k4 to k6 that are left out, belong to this lens.
+    # A fixed xi and omitted k4 to k6 were chosen for this fit, so others do not compare.
     if not problem.free_distortion or problem.fixed & {"xi", *DENOMINATOR} or not _may_be_local(solution):
         return solution
-    few = of_few_views(solution, VIEWS_THAT_TELL)
+    few = of_few_views(solution, FEW_VIEWS)
     if few is solution or is_elsewhere(few, solution) or _is_lower(few, _lowest(few, more_starts)):
         return replace(solution, adjusted=_lowest(solution, more_starts))
     return solution
@@ -67,8 +67,8 @@ def _may_be_local(solution: Solution) -> bool:
 
 
 def _lowest(solution: Solution, more_starts: Callable[[Problem], Iterable[CameraState]]) -> Adjusted:
-    """The lowest minimum of the wanted model that any start leads to."""
-    # Most are at the lowest minimum, and need none of what follows.
+    """The lowest minimum of the wanted model from all starts."""
+    # Imported here, because most calibrations need no other starts.
     from neurocal_cli.distortion.candidate_models import fit_candidates
 
     problem, best = solution.problem, solution.adjusted
@@ -90,7 +90,7 @@ def _cost(adjusted: Adjusted) -> float:
 
 
 def _as(wanted: str, found: Adjusted, views: Views) -> list[Adjusted]:
-    """The fit itself where it is of the wanted model, else the most similar lenses of that model."""
+    """The fit itself if it has the wanted model, else the most similar lenses of that model."""
     if found.state.model == wanted:
         return [found]
     from neurocal_cli.distortion.similar_lens import similar_states

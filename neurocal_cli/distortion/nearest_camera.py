@@ -1,9 +1,9 @@
-"""The camera of another distortion model, or without skew, that is nearest to a given one.
+"""Convert a camera to another distortion model, or to one without skew, by least squares.
 
-Nearest means the smallest mean squared distance of pixels: the rays of pixels all over the image are
-projected by the new camera, and its parameters follow by least squares. Its pose does not change. A model
-that is not wide has no place for rays at the side or behind: it is fitted as far as 79 degrees from the axis,
-and the share of the image that it loses is told.
+The nearest camera has the smallest mean squared pixel distance: it projects the rays of a grid of pixels, and
+its parameters minimise the distance from these pixels. The pose does not change. A model that is not wide
+cannot project rays at 90 degrees and more: it is fitted up to 79 degrees from the axis, and the share of the
+image that it loses is reported.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_GRID = 25  # pixels along each side of the image
-_FEWEST = 50  # of them must see something
-_STEEPEST = 5.0  # tangent of 79 degrees, to which models that are not wide are fitted
+_GRID = 25  # grid pixels along each side of the image
+_FEWEST = 50  # fewest grid pixels with a ray
+_STEEPEST = 5.0  # tangent of 79 degrees, up to which models that are not wide are fitted
 _STARTS, _STEPS = 3, 100
-_FINE = 80  # pixels along each side of which the share that is lost is counted
+_FINE = 80  # grid pixels along each side for the lost share of the image
 
 
 @frozen_dataclass
@@ -38,17 +38,17 @@ class Distance:
 
 @frozen_dataclass(eq=False)
 class NearestCamera:
-    """A camera and what it differs by.
+    """A converted camera and its distance from the original.
 
     Attributes
     ----------
     camera : Camera
     over_image : Distance
-        All over the image, as far as the new camera shows it.
+        Over the part of the image that the new camera can represent.
     at_points : Distance, optional
-        At the pixels that were given.
+        At the given pixels.
     lost : float
-        Share of the pixels of the image that see something, and that the new camera does not show.
+        Share of the image's valid pixels that the new camera cannot represent.
     """
 
     camera: Camera
@@ -58,7 +58,7 @@ class NearestCamera:
 
 
 def with_model(distortion: Distortion, model: str) -> Distortion | None:
-    """The same distortion as a case of another model, None where it is none."""
+    """The same distortion expressed exactly in another model; None if that is impossible."""
     if distortion.model == model:
         return distortion
     if distortion.is_identity:
@@ -74,12 +74,12 @@ def with_model(distortion: Distortion, model: str) -> Distortion | None:
 
 
 def image_rays(camera: Camera) -> tuple[Array, Array]:
-    """Pixels all over the image, (N, 2), and the rays that they see, (N, 3), without those that see nothing.
+    """A grid of pixels over the image, (N, 2), and their rays, (N, 3), without pixels that have no ray.
 
     Raises
     ------
     InputError
-        Nearly none sees anything.
+        Nearly no pixel has a ray.
     """
     pixels, rays = _grid(camera, np.linspace(0, 1, _GRID))
     seen = np.isfinite(rays).all(axis=1)
@@ -99,9 +99,9 @@ def nearest_camera(camera: Camera, model: str, skew: bool, points: Array | None 
     model : str
         One of `MODELS`.
     skew : bool
-        Whether the new camera may have the skew of the old one; else its axes are perpendicular.
+        Whether the new camera keeps the skew of the old one; otherwise its image axes are perpendicular.
     points : (N, 2) array, optional [px]
-        Pixels, say those that the camera was calibrated with, at which the distance is told too.
+        Pixels at which the distance is also reported, such as those of the calibration.
 
     Returns
     -------
@@ -110,13 +110,13 @@ def nearest_camera(camera: Camera, model: str, skew: bool, points: Array | None 
     Raises
     ------
     InputError
-        A camera that maps nearly no pixel of its image, or nothing that the model can show.
+        Nearly no pixel of the camera has a ray, or the model can represent nearly none of the rays.
     """
     pixels, rays = image_rays(camera)
     ahead = _reached(model, rays)
     if ahead.sum() < _FEWEST:
         raise InputError(
-            f"the model {model} shows nearly nothing of what this camera sees; choose a wide one"
+            f"the model {model} covers nearly nothing of this camera's field of view; choose a wide one"
         )
     found = [
         _descended(camera, model, start, skew, rays[ahead], pixels[ahead])
@@ -136,7 +136,7 @@ def nearest_camera(camera: Camera, model: str, skew: bool, points: Array | None 
 
 
 def _reached(model: str, rays: Array) -> NDArray[np.bool_]:
-    """Which rays a model is fitted to."""
+    """Which rays a model is fitted to: all, or those within 79 degrees."""
     if model in WIDE:
         return np.ones(len(rays), dtype=bool)
     return np.asarray(np.hypot(rays[:, 0], rays[:, 1]) < _STEEPEST * rays[:, 2])
@@ -147,7 +147,7 @@ def _shown(near: Camera, rays: Array) -> NDArray[np.bool_]:
 
 
 def _lost(camera: Camera, near: Camera) -> float:
-    """Share of the image that the new camera does not show."""
+    """Share of the image that the new camera cannot represent."""
     rays = _grid(camera, (np.arange(_FINE) + 0.5) / _FINE)[1]
     seen = np.isfinite(rays[:, 0])
     return float(1 - _shown(near, rays[seen]).mean())
@@ -155,7 +155,7 @@ def _lost(camera: Camera, near: Camera) -> float:
 
 def _grid(camera: Camera, share: Array) -> tuple[Array, Array]:
     """Pixels at shares of the image's width and height, and their rays."""
-    # Without a size the principal point is taken for the middle.
+    # Without an image size, the principal point is assumed to be the middle.
     width, height = camera.image_size or tuple(2 * np.maximum(camera.A[:2, 2], 1.0) + 1)
     u, v = np.meshgrid(share * (width - 1), share * (height - 1))
     pixels = np.column_stack([u.ravel(), v.ravel()])
@@ -168,7 +168,7 @@ def _distance(camera: Camera, rays: Array, pixels: Array) -> Distance:
 
 
 def _starts(camera: Camera, model: str, rays: Array) -> list[Array]:
-    """A11, A12, A22, A13, A23 and the coefficients of cameras to begin with."""
+    """A11, A12, A22, A13, A23 and the coefficients of starting cameras."""
     exact = with_model(camera.distortion, model)
     k = pinhole_coefficients(model) if exact is None else exact.coefficients
     starts = [np.array([*camera.entries, *k])]
@@ -187,29 +187,29 @@ def _starts(camera: Camera, model: str, rays: Array) -> list[Array]:
 def _descended(
     camera: Camera, model: str, start: Array, skew: bool, rays: Array, pixels: Array
 ) -> tuple[Camera, float] | None:
-    """The nearest camera from a start, and its sum of squares; None where the start does not show all."""
+    """The nearest camera from a start, and its cost; None if the start cannot project all rays."""
     from scipy.optimize import least_squares
 
-    # The skew is no parameter, but a given share of A11.
+    # The skew is no parameter, but a fixed multiple of A11.
     slant = camera.A[0, 1] / camera.A[0, 0] if skew else 0.0
     free = [0, 2, 3, 4, *range(5, len(start))]
 
     def built(p: Array) -> Camera | None:
-        # A step may lead to what is no camera.
+        # A step may lead to an invalid camera.
         if not (p[:2] > 0).all():
             return None
         A = np.array([[p[0], slant * p[0], p[2]], [0.0, p[1], p[3]], [0.0, 0.0, 1.0]])
         return Camera(Intrinsics.from_matrix(A), Distortion(model, p[4:]), camera.image_size, camera.name)
 
     def entries(p: Array) -> Array:
-        # With xi the scale in the middle, p / (1 + xi), is what the image tells.
+        # With xi the parameter is the scale in the image centre, alpha / (1 + xi), which is well determined.
         p = p.copy()
         p[:2] *= 1 + p[4] if model in WITH_XI else 1.0
         return p
 
     def error(p: Array) -> Array:
         now = built(entries(p))
-        # What is not seen is nan, and the solver steps back.
+        # Rays outside the model's domain give nan, so that the solver steps back.
         return np.full(2 * len(rays), np.nan) if now is None else (now.project(rays)[0] - pixels).ravel()
 
     def slopes(p: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Pictures without distortion on a cylinder and on a sphere, for what no plane can show.
+"""Undistorted images on a cylinder or a sphere, for fields of view that no plane can show.
 
 A ray (X, Y, Z) has the longitude lambda = atan2(X, Z) and the latitude phi = atan2(Y, hypot(X, Z)):
 
@@ -27,14 +27,14 @@ PANORAMAS = ("cylinder", "equirectangular")
 
 @frozen_dataclass
 class Panorama:
-    """A picture on a cylinder or a sphere around the camera.
+    """An image on a cylinder or a sphere around the camera.
 
     Parameters
     ----------
     shape : {"cylinder", "equirectangular"}
     f : float [px/rad]
     u0, v0 : float [px]
-        Where the z axis is seen.
+        Pixel of the z axis.
     image_size : (width, height) [px]
     name : str
 
@@ -67,7 +67,7 @@ class Panorama:
             raise InputError(f"a panorama needs a positive scale, found {self.f:g} px per radian")
 
     def project(self, points: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Pixels of points (..., 3) of the camera's frame, and whether it shows them: all but its poles."""
+        """Pixels of points (..., 3) of the camera's frame, and whether they exist: not at the poles."""
         X, Y, Z = np.moveaxis(np.asarray(points, dtype=float), -1, 0)
         across = np.hypot(X, Z)
         shown = np.asarray(across > 0)

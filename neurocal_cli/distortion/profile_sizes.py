@@ -1,14 +1,14 @@
-"""What a rich lens is uncertain by because the sizes of its profile's processes are not known.
+"""Uncertainty of a rich lens that comes from the unknown prior sizes of its radial profile.
 
-Among the points they tell the profile g themselves. Farther out its prior has the say, whose sizes they may
-tell badly: where a polynomial follows the profile among the points, the most probable sizes are small, and
-larger ones are not much less probable. So the covariance is averaged over the sizes. The m-th of them have a
-weight w_m by their evidence and their prior. With P_m and g_m the posterior covariance and mean of g
-for them, g the reported profile, and T = dc/dg how all other unknowns c follow it,
+Among the points, these determine the profile g. Farther out its prior dominates, whose sizes may be poorly
+determined: if a polynomial fits the profile among the points, the most probable sizes are small, but larger
+ones are not much less probable. So the covariance is averaged over the sizes. Let w_m be the posterior weight
+of the m-th sizes, P_m and g_m the posterior covariance and mean of g for them, g the reported profile, and
+T = dc/dg the response of all other unknowns c. Then
 
-    E = sum_m w_m (P_m + (g_m - g) (g_m - g)^T),    cov(c, g) = cov(c, g | g) + [T; 1] E [T; 1]^T,
+    E = sum_m w_m (P_m + (g_m - g) (g_m - g)^T),    cov(c, g) = cov(c, g | g) + [T; 1] E [T; 1]^T
 
-which is what model averaging gives (Hoeting et al. 1999) around the parameters that are reported.
+is the result of Bayesian model averaging (Hoeting et al. 1999) around the reported parameters.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 def averaged_over_sizes(
     covariance: Array, H: Array, right: Array, profile: slice, value: Array, priors: tuple[Array, Array]
 ) -> Array:
-    """Covariance of all that is shared, averaged over what the profile's prior may be.
+    """Covariance of the shared parameters, averaged over the priors of the profile.
 
     Parameters
     ----------
     covariance : (f, f) array
         For one of the priors.
     H, right : (f, f) and (f,) arrays
-        Precision, and the gradient at the reported values, by all but the profile's prior.
+        Precision, and the gradient at the reported values, without the profile's prior.
     profile : slice
-        Of the f.
+        Places of the profile among the f parameters.
     value : (n,) array
         The reported profile.
     priors : (m, n, n) and (m,) arrays
-        Covariances, and the logarithms of how probable they are before any point is seen.
+        Prior covariances, and the logarithms of their prior probabilities.
     """
     is_profile = np.zeros(len(H), dtype=bool)
     is_profile[profile] = True
@@ -51,7 +51,7 @@ def averaged_over_sizes(
 def _second_moment(
     told: Array, information: Array, value: Array, covariances: Array, logarithm: Array
 ) -> Array:
-    """E, from J^T J and J^T r at 0."""
+    """E, from the profile's J^T J and J^T r at 0."""
     root = np.linalg.cholesky(covariances)
     turned = np.swapaxes(root, 1, 2)
     G = np.eye(len(told)) + turned @ told @ root

@@ -1,18 +1,18 @@
-"""A rich lens: a fisheye and a smooth displacement, of which there is as much as the points ask for.
+"""Fit a rich lens: a fisheye plus a smooth displacement with a Gaussian-process prior.
 
-The displacement's nodes w (see `rich_lens`) have a Gaussian prior: its profile and its field are sums of
-Gaussian processes, each of another length. Of a process of length l and size s, nodes that are d apart have
-the covariance s^2 exp(-d^2 / (2 l^2)); the profile's are odd. Where no point is, the band is as wide as that.
-k1 to k4 have a prior of real lenses' size, so that far from the points the fisheye goes on as a lens does. A
-has none: what the displacement can do of its work widens its standard deviation.
+The nodes w of the displacement (see `rich_lens`) have a Gaussian prior: its profile and its field are sums of
+Gaussian processes of different lengths. For a process of length l and size s, nodes at the distance d have
+the covariance s^2 exp(-d^2 / (2 l^2)); the profile is odd. Without points, the displacement has the prior
+variance. k1 to k4 have a prior of the size of real lenses, so that the fisheye extrapolates like a lens. A
+has no prior; its standard deviation contains its correlation with the displacement.
 
-The sizes have the largest evidence (MacKay 1992). With the inverse P of the prior's covariance,
-C = sum_j s_j^2 C_j, and the covariance S of w that the points leave,
+The sizes maximise the evidence (empirical Bayes, MacKay 1992). Let P be the inverse of the prior covariance
+C = sum_j s_j^2 C_j, and S the posterior covariance of w. Then
 
     gamma_j = s_j^2 tr(C_j (P - P S P)),    s_j^2 <- s_j^4 (w^T P C_j P w) / gamma_j.
 
-A wide lognormal prior keeps those in bounds that no point tells. The prior is a part of the covariance, which
-is averaged over the profile's sizes (see `profile_sizes`).
+A wide lognormal prior bounds sizes that the points do not determine. The covariance includes the prior, and
+it is averaged over the profile's sizes (see `profile_sizes`).
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
 _N = len(NODES)
-# Of the coefficients, k1 to k4 and the nodes; and the parts of these.
+# Indices of k1 to k4 and the nodes among the coefficients; and the parts of these unknowns.
 _UNKNOWNS = np.r_[:4, FIRST_NODE : FIRST_NODE + _N]
 _PROFILE, _FIELD_X, _FIELD_Y = (slice(4 + a, 4 + b) for a, b in pairwise((0, RADII, RADII + GRID**2, _N)))
-_MARGIN = 1.05  # of the reach, beyond the points or the image's corners
-_FARTHER = 1.5  # than the points: the largest reach
+_MARGIN = 1.05  # reach over the extent of the points or of the image's border
+_FARTHER = 1.5  # largest reach over the extent of the points
 _TINY, _NOTHING, _NEWTON = 1e-300, 1e-17, 8
-# Lengths of the processes, in reaches, and what keeps their sizes in bounds, in rms residuals of the fisheye.
-# Repeated by tests/test_rich_lens.py (slow): with these, errors where no point was seen are as large as their
-# standard deviations.
+# Lengths of the processes, in reaches, and bounds of their sizes, in rms residuals of the fisheye. Repeated
+# by tests/test_rich_lens.py (slow): with these, errors in parts without points match their standard
+# deviations.
 _OF_PROFILE, _OF_FIELD = (0.1, 0.25), (0.25, 0.5, 1.0)
-_LARGEST, _SMALLEST, _SPREAD = 10.0, 1e-3, 1.5  # the last one is a std of logarithms
-_LIKE_NOTHING, _SIZES = 1e-2, 10  # the sizes that are averaged over: the first one, and how many
-_ROUGH = 2e-3  # size of a process without length, likewise
-_LONGEST = 1.0  # of a step, in logarithms of the sizes
-_AT_FIRST, _EASED = 4, 0.7  # passes with whole steps; later shares of them, because lengths take turns
+_LARGEST, _SMALLEST, _SPREAD = 10.0, 1e-3, 1.5  # the last one is the prior std of the logarithm
+_LIKE_NOTHING, _SIZES = 1e-2, 10  # smallest size in the average over the profile's sizes, and their number
+_ROUGH = 2e-3  # size of an additional white-noise process, in the same unit
+_LONGEST = 1.0  # longest step, in logarithms of the sizes
+_AT_FIRST, _EASED = 4, 0.7  # number of passes with full steps, and damping of later ones against oscillation
 _ROUNDS, _PASSES = 4, 40
-_NO_GAIN, _SETTLED = 0.05, 0.02  # of the logarithm of the evidence; relative change of the variance
-_NEARLY = 0.1  # of the evidence's logarithm and its parts' weights, between rounds
+_NO_GAIN, _SETTLED = 0.05, 0.02  # passes end below this gain in log evidence and this change of the variance
+_NEARLY = 0.1  # change of the log evidence that ends the rounds
 
 
 def with_displacement(solution: Solution) -> Solution:
-    """Fit a rich lens, beginning with a fisheye or with a rich lens.
+    """Fit a rich lens, starting from a fisheye or a rich lens.
 
     Parameters
     ----------
@@ -69,7 +69,7 @@ def with_displacement(solution: Solution) -> Solution:
     Returns
     -------
     Solution
-        Its problem has the prior as the restraint; `shared` is the covariance with the prior.
+        The restraint of its problem is the prior; `shared` is the covariance with the prior.
     """
     solution = _by_evidence(_begun(solution))
     if solution.problem.points.covariance is not None:
@@ -78,14 +78,14 @@ def with_displacement(solution: Solution) -> Solution:
 
 
 def promised(solution: Solution, repeated: RepeatedPoses) -> Array:
-    """Squared error (V,) of views that are left out, as a rich lens promises it that is not yet adjusted.
+    """Predicted squared error (V,) of held-out views with a rich lens, without adjusting one.
 
     Parameters
     ----------
     solution : Solution
         A fisheye, at the minimum.
     repeated : RepeatedPoses
-        Views of one pose are left out together.
+        Views of one pose are held out together.
     """
     solution = _begun(solution)
     problem, state = solution.problem, solution.state
@@ -100,7 +100,7 @@ def promised(solution: Solution, repeated: RepeatedPoses) -> Array:
 
 
 def _begun(solution: Solution) -> Solution:
-    """A rich lens without a displacement, or the one that is there."""
+    """The solution as a rich lens: with zero displacement, unless it has one."""
     if solution.state.model == "rich":
         return replace(solution, shared=None)
     problem = solution.problem.with_model("rich")
@@ -111,7 +111,7 @@ def _begun(solution: Solution) -> Solution:
 
 
 def _reaches(problem: Problem, state: CameraState) -> Array:
-    """Of the points, and of the image's border unless that is much farther out: |s|, |sx| and |sy|."""
+    """Largest |s|, |sx| and |sy| of the points and of the image's border, unless that is much farther out."""
     views = problem.views
     seen = (state.R[views.index] @ views.local[..., None])[..., 0] + state.t[views.index]
     far, border = _extent(seen), np.zeros(3)
@@ -131,15 +131,16 @@ def _extent(directions: Array) -> Array:
 
 @frozen_dataclass(eq=False)
 class _Prior:
-    """The restraint: rows, of k1 to k4 and the nodes, whose squares are added to those of the residuals.
+    """The prior of k1 to k4 and the nodes as a `Restraint`.
 
     Attributes
     ----------
     rows : (n, n) array
+        Square root of the precision: extra residuals of k1 to k4 and the nodes.
     sizes : array
         Of the processes, in units of x'.
     scale : float
-        Rms residual of the fisheye, likewise.
+        Rms residual of the fisheye, in the same unit.
     """
 
     rows: Array
@@ -147,14 +148,14 @@ class _Prior:
     scale: float
 
     def __call__(self, state: CameraState) -> tuple[Array, Array]:
-        """Derivatives (m, 5 + K) and what is missing (m,)."""
+        """Jacobian (m, 5 + K) and residuals (m,)."""
         by_camera = np.zeros((len(self.rows), 5 + len(state.k)))
         by_camera[:, 5 + _UNKNOWNS] = self.rows
         return by_camera, -self.rows @ state.k[_UNKNOWNS]
 
 
 def _by_evidence(solution: Solution) -> Solution:
-    """Adjust, and find the sizes anew, until they stay."""
+    """Alternate between bundle adjustment and the estimation of the sizes until these converge."""
     problem, adjusted = solution.problem, solution.adjusted
     normal, _ = normal_blocks(problem.views.batches, adjusted.state)
     processes, sizes = _beginning(problem, adjusted.state, normal)
@@ -175,7 +176,7 @@ def _by_evidence(solution: Solution) -> Solution:
 
 
 def _averaged(processes: _Processes, found: _Found, x: Array) -> Array:
-    """Covariance of the free shared parameters, whatever the sizes of the profile's processes are."""
+    """Covariance of the free shared parameters, averaged over the sizes of the profile's processes."""
     held = found.precision.copy()
     held[_PROFILE, _PROFILE] = 0.0
     first = len(found.g) - len(x)
@@ -187,7 +188,7 @@ def _averaged(processes: _Processes, found: _Found, x: Array) -> Array:
 
 
 def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Processes, Array]:
-    """The processes and their first sizes."""
+    """The processes and their initial sizes."""
     reaches = state.k[FIRST_NODE - len(REACHES) : FIRST_NODE]
     if isinstance(problem.restraint, _Prior):
         return _processes(reaches, problem.restraint.scale), problem.restraint.sizes
@@ -197,13 +198,13 @@ def _beginning(problem: Problem, state: CameraState, normal: Array) -> tuple[_Pr
 
 @frozen_dataclass(eq=False)
 class _Processes:
-    """What the prior is made of.
+    """The Gaussian processes of the prior.
 
     Attributes
     ----------
     profile : (p, n, n) array
     field : (f, m, m) array
-        Covariances of processes of size 1, the same for both of the field's directions.
+        Covariances of processes of size 1; the field's are the same for both directions.
     of_fisheye : (4,) array
         Standard deviations of k1 to k4.
     scale : float
@@ -215,14 +216,14 @@ class _Processes:
     scale: float
 
     def inverses(self, sizes: Array) -> tuple[Array, Array]:
-        """Of the covariances of the profile and of the field, for sizes of all processes."""
+        """Inverse covariances of the profile and of the field, for given sizes of all processes."""
         rough, n = (_ROUGH * self.scale) ** 2, len(self.profile)
         both = (self.profile, sizes[:n] ** 2), (self.field, sizes[n:] ** 2)
         sums = [np.tensordot(s, C, axes=1) + rough * np.eye(C.shape[1]) for C, s in both]
         return _inverse(sums[0]), _inverse(sums[1])
 
     def profiles(self) -> tuple[Array, Array]:
-        """Covariances of the profile for all pairs of sizes, and the logarithms of their prior."""
+        """Covariances of the profile for all combinations of sizes, and their log prior."""
         some = np.geomspace(_LIKE_NOTHING, _LARGEST, _SIZES)
         sizes = np.array(list(product(some, repeat=len(self.profile))))
         sums = np.tensordot(sizes**2, self.profile, axes=1) + _ROUGH**2 * np.eye(self.profile.shape[1])
@@ -242,27 +243,27 @@ def _processes(reaches: Array, scale: float) -> _Processes:
 
 def _alike(distance: Array, length: float) -> Array:
     alike = np.exp(-0.5 * (distance / length) ** 2)
-    return np.where(alike < _NOTHING, 0.0, alike)  # numbers far below 1 are slow
+    return np.where(alike < _NOTHING, 0.0, alike)  # denormal numbers are slow
 
 
 @frozen_dataclass(eq=False)
 class _Found:
-    """Sizes of the processes, and what follows from them.
+    """Estimated sizes of the processes, with the resulting posterior.
 
     Attributes
     ----------
     sizes, gamma : arrays
-        In units of x', and how many unknowns the points determine of each process.
+        Size of each process in units of x', and its effective number of unknowns determined by the points.
     precision : (n, n) array
-        P, of k1 to k4 and the nodes, in units of the residuals' squares.
+        P, of k1 to k4 and the nodes, in units of the squared residuals.
     covariance : (f, f) array
         Of the free shared parameters.
     determined : float
-        How many of the nodes' unknowns the points determine.
+        Effective number of the nodes' unknowns that the points determine.
     variance : float
         Of the residuals.
     S, g : (f, f) and (f,) arrays
-        The residuals' quadratic around the state, poses eliminated.
+        Quadratic model of the squared error around the state, with the poses eliminated.
     """
 
     sizes: Array
@@ -278,7 +279,7 @@ class _Found:
 def _sizes(
     problem: Problem, state: CameraState, normal: Array, processes: _Processes, sizes: Array
 ) -> _Found:
-    """MacKay's steps on the quadratic around a state."""
+    """Estimate the sizes by MacKay's updates on the quadratic model around a state."""
     q = reduced(normal, problem.free_camera, problem.free_poses)
     S, g, cost = q.S.sum(axis=0), q.g.sum(axis=0), float(q.cost.sum())
     x = state.k[_UNKNOWNS]
@@ -320,7 +321,7 @@ def _sizes(
 def _evidence(
     covariances: Array, precision: Array, w: Array, after: Array, parts: tuple[slice, ...]
 ) -> Array:
-    """(2, n) what w has of each process, and what is expected of it, over its squared size."""
+    """(2, n) w^T P C_j P w and tr(C_j (P - P S P)) of each process; see the module's equations."""
     found = np.zeros((2, len(covariances)))
     for part in parts:
         a = precision @ w[part]
@@ -330,7 +331,7 @@ def _evidence(
 
 
 def _change(num: Array, den: Array, size: Array) -> Array:
-    """Change d of the logarithms of the sizes: den - num exp(-2 d) + (size + d) / _SPREAD^2 = 0."""
+    """Change d of the log sizes, by Newton's method: den - num exp(-2 d) + (size + d) / _SPREAD^2 = 0."""
     d = np.zeros_like(size)
     for _ in range(_NEWTON):
         rest = num * np.exp(-2 * d)
@@ -340,6 +341,6 @@ def _change(num: Array, den: Array, size: Array) -> Array:
 
 
 def _inverse(H: Array) -> Array:
-    """Of a positive matrix, scaled to a unit diagonal."""
+    """Inverse of a positive definite matrix, scaled to a unit diagonal."""
     scaled, scale = unit_diagonal(H)
     return np.asarray(np.linalg.inv(scaled) * np.outer(scale, scale))

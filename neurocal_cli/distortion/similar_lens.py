@@ -1,9 +1,9 @@
-"""Cameras of another distortion model whose images are nearly the same: where its adjustment begins.
+"""Starting cameras of another distortion model: those with nearly the same image.
 
-Two lenses must share the distorted radius as a function of the angle. Given xi, or a wide lens's alpha and
-beta, every model's radius is a linear function of the scale and of its other coefficients times the scale, so
-that a grid and linear least squares find the most similar lenses. A double sphere and an omnidirectional lens
-may have several that are about as similar; each is a start of its own.
+Similar lenses have nearly the same distorted radius as a function of the angle. For given xi, alpha and beta,
+the radius of every model is linear in the scale and in its other coefficients times the scale. So a grid
+search with linear least squares finds the most similar lenses. Models with xi may have several that are about
+equally similar; each of them is a start.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from neurocal_cli.camera.projection import ENTRIES, project_points
 from neurocal_cli.camera.tilt import sensor_rotation
 from neurocal_cli.geometry import Array
 
-# Repeated by tests/test_wide_lenses.py (slow): random lenses of all models arrive at the minimum from here.
+# Repeated by tests/test_wide_lenses.py (slow): random lenses of all models converge from these starts.
 _ANGLES = 60
 _LEAST_ANGLE, _SPARE = 0.05, 1e-3  # [rad]
-# Values of xi, and where its range is divided: each part may hold a minimum.
+# Grid of xi, and the boundaries of the parts of its range that may each contain a minimum.
 _XI = {"omnidir": np.linspace(0.1, 3.0, 30), "double_sphere": np.linspace(-0.6, 0.6, 25)}
 _PARTS = {"omnidir": (0.7, 1.1, 1.4, 1.8), "double_sphere": (-0.1, 0.15)}
 _TILTS = 0.06 * np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])  # rad
@@ -35,7 +35,7 @@ _BETA = np.geomspace(0.3, 3.0, 21)
 def similar_states(
     state: CameraState, model: str, farthest: float, xi: Array | None = None
 ) -> list[CameraState]:
-    """States whose image is nearly that of another one, the most similar first; same poses, same centre.
+    """States of another model with nearly the same image, the most similar first; same poses and centre.
 
     Parameters
     ----------
@@ -44,10 +44,10 @@ def similar_states(
     model : str
         A model with coefficients.
     farthest : float
-        Largest angle from the axis that counts [rad].
+        Largest angle from the axis that is compared [rad].
     xi : array, optional
-        Of a model with xi: one state for each of these values, in their order, instead; those for which no
-        lens is similar are left out.
+        For a model with xi: return one state for each of these values, in their order, without those that
+        have no similar lens.
     """
     if (same := _with_more_coefficients(state, model)) is not None:
         return [same]
@@ -75,7 +75,7 @@ def similar_states(
 
 
 def _with_more_coefficients(state: CameraState, model: str) -> CameraState | None:
-    """The same lens, where the model has all its coefficients in the same order."""
+    """The same lens in a model whose first coefficients are the same; None if there is none."""
     own, names = coefficient_names(state.model), coefficient_names(model)
     if model in WIDE or state.model == model or names[: len(own)] != own:
         return None
@@ -83,13 +83,14 @@ def _with_more_coefficients(state: CameraState, model: str) -> CameraState | Non
 
 
 def tilted_states(state: CameraState) -> list[CameraState]:
-    """States of a camera whose sensor is tilted otherwise, and whose image is the same but for the lens.
+    """States with other tilts of the sensor that give the same image except for lens distortion.
 
-    A pinhole's image through a sensor tilted by R is that of one turned by R, with another centre: but for
-    the lens, whose axis turns along, nothing tells the tilt, and it has several minima. One lies opposite.
+    A pinhole with a sensor tilted by R gives the same image as one rotated by R with another centre. Only the
+    distortion, whose axis rotates as well, determines the tilt, so it has several local minima; one of them
+    has the opposite tilt.
     """
     k = state.k.copy()
-    k[[2, 3, 8, 9, 10, 11]] = 0.0  # what made up for the tilt
+    k[[2, 3, 8, 9, 10, 11]] = 0.0  # coefficients that compensated the tilt
     found = []
     for tau in (-k[12:], *_TILTS):
         turn = sensor_rotation(*tau.tolist()) @ sensor_rotation(*k[12:].tolist()).T
@@ -103,12 +104,12 @@ def tilted_states(state: CameraState) -> list[CameraState]:
 
 
 def _radius(model: str, k: Array, theta: Array) -> Array:
-    """Distorted radii, without tangential terms; nan where the lens shows nothing."""
+    """Distorted radii without tangential terms; nan outside the model's domain."""
     names = coefficient_names(model)
     radial = [0.0 if name in NOT_RADIAL else value for name, value in zip(names, k, strict=True)]
     with np.errstate(all="ignore"):
         x, seen = _projected(model, radial, np.sin(theta), np.cos(theta))
-        # The image ends where it first ceases to grow.
+        # The domain ends where the radius first ceases to grow.
         grows = seen & (np.diff(x, prepend=0.0) > 0)
     return np.where(np.logical_and.accumulate(grows), x, np.nan)
 
@@ -116,13 +117,13 @@ def _radius(model: str, k: Array, theta: Array) -> Array:
 def _projected(
     model: str, k: Sequence[float | Array], sine: Array, cosine: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Normalised x of directions (sine, 0, cosine), and whether the lens shows them."""
+    """Normalised x of directions (sine, 0, cosine), and whether they are in the model's domain."""
     x, _, seen = project_points((1.0, 0.0, 1.0, 0.0, 0.0), model, k, sine, np.zeros_like(sine), cosine)
     return x, seen
 
 
 def _grid(model: str, xi: Array) -> Array:
-    """(G, n) values of the coefficients in which the radius is not linear."""
+    """(G, n) grid of the coefficients in which the radius is not linear."""
     if model == "omnidir":
         return xi[:, None]
     if model in ("double_sphere", "eucm"):
@@ -132,7 +133,7 @@ def _grid(model: str, xi: Array) -> Array:
 
 
 def _columns(model: str, grid: Array, theta: Array) -> Array:
-    """(G, m, c) what the scale, and the scale times each linear coefficient, add to the radius."""
+    """(G, m, c) derivatives of the radius by the scale and by the scale times each linear coefficient."""
     if model in WIDE and model != "fisheye":
         n_linear = 2 if model == "omnidir" else 0
         k = [*grid.T[:, :, None], *([0.0] * (4 if n_linear else 0))]
@@ -146,21 +147,21 @@ def _columns(model: str, grid: Array, theta: Array) -> Array:
 
 
 def _linear_names(model: str) -> list[str]:
-    """Radial coefficients of which the radius is a linear function, by rising power; no denominators."""
+    """Radial coefficients in which the radius is linear, by rising power; none of a denominator."""
     return [name for name in coefficient_names(model) if name in ("k1", "k2", "k3")] + (
         ["k4"] if model == "fisheye" else []
     )
 
 
 def _lowest(model: str, error: Array, grid: Array) -> list[int]:
-    """Places of the lowest errors, of a model with xi in each part of its range, the best first."""
+    """Indices of the lowest errors (for models with xi, one in each part of its range), the best first."""
     part = np.digitize(grid[:, 0], _PARTS[model]) if model in WITH_XI else np.zeros(len(grid), dtype=np.intp)
     best = [int(np.argmin(np.where(part == n, error, np.inf))) for n in np.unique(part)]
     return sorted((g for g in best if np.isfinite(error[g])), key=lambda g: float(error[g]))
 
 
 def _of_each(error: Array, grid: Array, xi: Array) -> list[int]:
-    """Places of the lowest error for each xi."""
+    """Indices of the lowest error for each xi."""
     best = [int(np.argmin(np.where(grid[:, 0] == value, error, np.inf))) for value in xi]
     return [g for g in best if np.isfinite(error[g])]
 
@@ -170,7 +171,7 @@ def _with(state: CameraState, model: str, scale: float, nonlinear: Array, linear
     names = coefficient_names(model)
     found = dict(zip([name for name in names if name in ("xi", "alpha", "beta")], nonlinear, strict=True))
     found |= dict(zip(_linear_names(model), linear, strict=False))
-    # The same shift in the image: p is by the square of a distorted radius.
+    # p1 and p2 multiply the square of a radius, so they scale like this for the same shift in the image.
     found |= {name: old[name] / scale for name in ("p1", "p2") if name in old and name in names}
     entries = state.entries.copy()
     entries[:, :3] *= scale

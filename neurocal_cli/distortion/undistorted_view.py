@@ -1,8 +1,8 @@
-"""What undistorted pictures show: on a plane, a cylinder or a sphere, and how much of the field of view.
+"""Choice of the projection of undistorted images: plane, cylinder or sphere, and field of view.
 
-The optical axis keeps its pixel, in proportion where the picture has another size; it is in the middle of a
-panorama whose field of view is given. A plane shows less than 180 degrees, and its scale grows outwards with
-1 / cos^2 of the angle.
+The optical axis keeps its pixel, scaled if the image size changes. In a panorama with a given field of view
+it lies in the middle. A plane shows less than 180 degrees, and its scale grows outwards with 1 / cos^2 of the
+angle.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _NARROW = 1e-3  # rad
 
 
 class Field(NamedTuple):
-    """How far a picture sees along the row and the column of its optical axis [rad].
+    """Field of view of an image along the row and the column of its optical axis [rad].
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ class Field(NamedTuple):
         return across, down
 
     def common(self, other: Field) -> Field:
-        """What both see."""
+        """The intersection of both fields of view."""
         return Field(
             max(self.left, other.left), min(self.right, other.right),
             max(self.top, other.top), min(self.bottom, other.bottom),
@@ -60,7 +60,7 @@ def field_of_view(camera: Undistorted, size: tuple[int, int]) -> Field:
     Raises
     ------
     InputError
-        A camera that sees nothing there.
+        The camera has no rays along that row or column.
     """
     u0, v0 = _axis(camera, size)
     share, ends = np.linspace(0, 1, _ALONG), []
@@ -83,12 +83,12 @@ def _axis(camera: Undistorted, size: tuple[int, int]) -> Array:
 
 
 def plane_like(camera: Camera) -> Intrinsics:
-    """The camera matrix of a plane with the scale of the middle of the image: for most lenses, their own."""
+    """Camera matrix of a plane with the scale of the image centre; the camera's own unless it is wide."""
     if not camera.distortion.wide:
         return camera.intrinsics
     A = camera.A.copy()
     A[:2, :2] = camera.project_jacobian(np.array([[0.0, 0.0, 1.0]]))[1][0, :, :2]
-    A[1, 0] = 0.0  # but for rounding
+    A[1, 0] = 0.0  # up to rounding
     return Intrinsics.from_matrix(A)
 
 
@@ -99,7 +99,7 @@ def undistorted_view(
     fov: float | None = None,
     new_size: tuple[int, int] | None = None,
 ) -> Undistorted:
-    """Choose what undistorted pictures show.
+    """Choose the projection of undistorted images.
 
     Parameters
     ----------
@@ -108,15 +108,15 @@ def undistorted_view(
         Of its images.
     shape : {"plane", "cylinder", "equirectangular"}
     fov : float, optional [degrees]
-        Field of view from left to right. By default a plane keeps the scale of the middle of the image; the
-        others show all that the image does from left to right.
+        Field of view from left to right. By default a plane keeps the scale of the image centre; the other
+        shapes show the whole field of view from left to right.
     new_size : (width, height), optional [px]
-        Of the pictures; by default the same.
+        Of the undistorted images; by default the same.
 
     Raises
     ------
     InputError
-        Another shape; a field of view that the shape cannot show.
+        The shape does not exist, or cannot show that field of view.
     """
     if shape not in SHAPES:
         raise InputError(f"the shape must be one of {', '.join(SHAPES)}, not {shape[:40]!r}")

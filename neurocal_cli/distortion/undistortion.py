@@ -1,12 +1,11 @@
 """Undistortion of points, and the source pixels of undistorted images.
 
-A pixel m of a camera with distortion becomes the pixel m' where its ray is seen on a plane, a cylinder or a
-sphere (`panorama`). On a plane, with A' without distortion, that is
+A pixel m of a camera with distortion becomes the pixel m' of its ray on a plane, a cylinder or a sphere
+(`panorama`). On a plane, with A' without distortion, that is
 
     x = undistort(A^-1 m),   m' = A' x
 
-A' is A itself, skew included, unless alpha says otherwise (`new_matrix`) or the lens is a wide one
-(`undistorted_view`).
+A' is A itself, skew included, unless alpha is given (`new_matrix`) or the lens is wide (`undistorted_view`).
 """
 
 from __future__ import annotations
@@ -276,7 +275,7 @@ def shown(
 def map_points(
     points: Correspondences, camera: Camera, new: Undistorted, R: Array | None = None
 ) -> Correspondences:
-    """Move points to where another camera at the same place sees them.
+    """Convert points to the pixels of another camera with the same centre.
 
     Parameters
     ----------
@@ -300,8 +299,8 @@ def map_points(
         u, v = points.pixels[row]
         if np.isfinite(camera.unproject(points.pixels[row])).all():
             raise InputError(
-                f"{points.place(row)}: the pixel ({u:g}, {v:g}) sees 90 degrees from the axis or more, which "
-                "no plane shows; choose a cylinder, or remove the row"
+                f"{points.place(row)}: the ray of the pixel ({u:g}, {v:g}) is 90 degrees or more from the "
+                "axis, which no plane shows; choose a cylinder, or remove the row"
             )
         raise InputError(
             f"{points.place(row)}: the distortion maps nothing to the pixel ({u:g}, {v:g}); correct "
@@ -316,7 +315,7 @@ def map_points(
         C = (M @ C @ np.swapaxes(M, 1, 2)).reshape(-1, 4)[:, [0, 1, 3]]
         undistorted = replace(undistorted, covariance=C)
     if points.across is not None:
-        # Only n . m is measured of a pixel m, so n^T M^-1 m' of the undistorted one.
+        # Only n . m is measured of a pixel m, and so n^T M^-1 m' of the undistorted pixel m'.
         n = (points.across[:, None, :] @ _distorted_by_undistorted(camera, new, pixels, R))[:, 0]
         undistorted = replace(undistorted, across=unit(n))
     if points.image_center is not None:

@@ -1,11 +1,11 @@
-"""All minima of a lens with xi, and how well every xi explains the points.
+"""Profile likelihood of xi: all local minima of models with xi, and the weight of each value of xi.
 
-The image of a unified or double-sphere lens depends on xi and on the other parameters together, so that
-several values of xi may explain the points about as well: around xi = 0 a double sphere's image depends on
-the square of xi only. So every xi of a grid is tried, from the most similar lens that has it, everything else
-being adjusted; the lowest minimum is the answer, and where others are nearly as low, more values of xi are
-looked at until the weight of each is known (`Ambiguity`). Beforehand all scales are as probable; xi, and what
-omnidir's k1, k2, p1 and p2 do to the radius, are spread as in published cameras.
+In a unified or double-sphere model xi is strongly correlated with the other parameters, so several values of
+xi may fit about equally well; near xi = 0 a double sphere depends only on the square of xi. So each xi of a
+grid is tried, starting from the most similar lens, with all other parameters adjusted. The lowest minimum is
+the result. If others are nearly as low, the grid is refined until the weight of each value is known
+(`Ambiguity`). The prior is uniform in the logarithm of the scale; that of xi and of the relative change of
+the radius by k1, k2, p1 and p2 of omnidir has the spread of published cameras.
 """
 
 from __future__ import annotations
@@ -32,21 +32,22 @@ from neurocal_cli.least_squares.normal_equations import ROUNDING, unit_diagonal
 _GRID = {"omnidir": np.linspace(0.0, 3.0, 31), "double_sphere": np.linspace(-0.6, 1.0, 33)}
 _SAME = 1e-6
 _STEPS = 30
-_NEAR = 1e4  # chi^2 above the best: what may lead to a lower minimum, between two values of the grid
-_POSSIBLE = 25.0  # chi^2 above the best: what may be true
-_AS_A_PARABOLA = 0.6  # standard deviations
-_LARGEST_MASS = 0.08  # of one interval
-_MOST = 60  # values of xi
-# A dozen published omnidirs have xi from 0.7 to 2.6: all values of the grid are as probable. There k1, k2, p1
-# and p2 change the farthest radius by shares of -0.19 to 0.05, -0.04 to 0.22 and up to 0.0013; of these the
-# powers of the radius, and the std. Seven published double spheres have xi from -0.27 to 0.18.
+_NEAR = 1e4  # largest excess of chi^2 over the best from which a lower minimum may still be reached
+_POSSIBLE = 25.0  # largest excess of chi^2 over the best of a possible camera
+_AS_A_PARABOLA = 0.6  # largest deviation of the profile from a parabola, in standard deviations
+_LARGEST_MASS = 0.08  # largest share of the probability in one interval of xi
+_MOST = 60  # most values of xi
+# A dozen published omnidir cameras have xi from 0.7 to 2.6: the prior is uniform over the grid. Their k1, k2
+# and p1, p2 change the farthest radius by shares of -0.19 to 0.05, -0.04 to 0.22 and up to 0.0013. Here are
+# the powers of the radius, and the prior std of these shares. Seven published double spheres have xi from
+# -0.27 to 0.18.
 _POWERS, _SHARES = np.array([2, 4, 1, 1]), np.array([0.15, 0.1, 0.0015, 0.0015])
-_SIZE_OF_XI = 0.25  # of a double sphere
-_VIEWS_THAT_TELL = 40  # of what is possible; 1000 views take as long as these
+_SIZE_OF_XI = 0.25  # prior std of xi of a double sphere
+_FEW_VIEWS = 40  # most views with which the grid is first tried, to limit the time
 
 
 def with_xi_held_if_flat(problem: Problem, adjusted: Adjusted) -> tuple[Problem, Adjusted]:
-    """A double sphere's xi is held at 0 where it is nearly that: to first order nothing depends on it."""
+    """Fix xi of a double sphere at 0 if it is nearly 0, because then nothing depends on it to first order."""
     state = adjusted.state
     if not xi_is_flat(state.model, state.k):
         return problem, adjusted
@@ -55,7 +56,7 @@ def with_xi_held_if_flat(problem: Problem, adjusted: Adjusted) -> tuple[Problem,
 
 
 def with_all_minima(solution: Solution) -> Solution:
-    """The lowest minimum of a lens with xi, and what others are as good; other lenses as they are."""
+    """The lowest minimum of a lens with xi, with its ambiguity; solutions of other models are unchanged."""
     problem = solution.problem
     if problem.distortion.model not in WITH_XI or not problem.free_distortion:
         return solution
@@ -72,7 +73,7 @@ def with_all_minima(solution: Solution) -> Solution:
 
 
 class _Profile:
-    """Cameras with given xi, everything else being adjusted, and the minima among them."""
+    """Cameras with given xi and all other parameters adjusted, and the minima among them."""
 
     def __init__(self, problem: Problem, adjusted: Adjusted) -> None:
         self.problem, self.best = problem, adjusted
@@ -84,12 +85,12 @@ class _Profile:
         self._descend()
 
     def _starts(self, state: CameraState) -> list[CameraState]:
-        """The most similar lens for each xi of the grid, of many views only where some of them allow it."""
+        """The most similar lens for each xi of the grid; with many views, only if some allow that xi."""
         views, model = self.problem.views, self.problem.distortion.model
         starts = similar_states(state, model, farthest_angle(views, state), _GRID[model])
-        if views.n_views <= _VIEWS_THAT_TELL:
+        if views.n_views <= _FEW_VIEWS:
             return starts
-        some = np.unique(np.linspace(0, views.n_views - 1, _VIEWS_THAT_TELL).round().astype(np.intp))
+        some = np.unique(np.linspace(0, views.n_views - 1, _FEW_VIEWS).round().astype(np.intp))
         few = replace(self.held, views=views.subset(some))
         found = [few.adjust(replace(s, R=s.R[some], t=s.t[some]), _STEPS) for s in starts]
         least = float(self.best.cost[some].sum())
@@ -104,7 +105,7 @@ class _Profile:
         return float(adjusted.cost.sum() - self.best.cost.sum()) / self.variance
 
     def _descend(self) -> None:
-        """From the lowest places of the grid to the minima."""
+        """Descend from the lowest points of the grid to the minima."""
         tried = list(self.tried)
         costs = [np.inf, *map(_cost, tried), np.inf]
         minima = []
@@ -117,7 +118,7 @@ class _Profile:
         if _is_lens(self.best):
             minima.append(self.best)
         lowest = min((_cost(a) for a in minima), default=np.inf)
-        # Where the lowest valley leads out of the model's range, the last cameras within it.
+        # If the lowest valley leads out of the model's range, keep the last cameras within it.
         self.at_the_end = [a for a in tried if _cost(a) < (1 - _SAME) * lowest]
         minima = [*minima, *self.at_the_end] or [self.best]
         self.best = min(minima, key=_cost)
@@ -128,7 +129,7 @@ class _Profile:
         self.tried = known[:1] + [b for a, b in pairwise(known) if _xi(b) - _xi(a) > _SAME]
 
     def ambiguity(self) -> Ambiguity | None:
-        """None where the best minimum tells everything."""
+        """The ambiguity; None if the covariance at the best minimum describes all possible cameras."""
         if self._is_parabola():
             return None
         while len(self.tried) < _MOST:
@@ -150,7 +151,7 @@ class _Profile:
         )
 
     def _volume(self, adjusted: Adjusted) -> float:
-        """Logarithm of the prior's share that is as good as a camera, of all with its xi."""
+        """Log posterior volume around a camera with fixed xi (Laplace approximation), up to a constant."""
         state, free = adjusted.state, self.held.free_camera
         S = reduced(adjusted.normal, free, self.held.free_poses).S.sum(axis=0) / self.variance
         known = _known(state, farthest_angle(self.held.views, state))
@@ -160,7 +161,7 @@ class _Profile:
         return float(share + width - free[:3].sum() * np.log(state.entries[0, 0]))
 
     def _is_parabola(self) -> bool:
-        """Whether all that is possible is as the covariance of the best minimum has it."""
+        """Whether the profile over all possible xi agrees with the covariance at the best minimum."""
         problem, best = self.problem, self.best
         free = problem.free_camera
         cov = covariance(best.normal, free, problem.free_poses, problem.views.n_equations)
@@ -179,7 +180,7 @@ class _Profile:
 
 
 def _known(state: CameraState, farthest: float) -> Array:
-    """(K,) inverse variances of the coefficients; 0 where all values are as probable."""
+    """(K,) prior inverse variances of the coefficients; 0 for a uniform prior."""
     if state.model == "double_sphere":
         return np.array([_SIZE_OF_XI**-2, 0.0])
     radius = np.sin(farthest) / (np.cos(farthest) + state.k[0])
@@ -187,7 +188,7 @@ def _known(state: CameraState, farthest: float) -> Array:
 
 
 def _is_lens(adjusted: Adjusted) -> bool:
-    """Whether coefficients are of the model's range: a double sphere beyond alpha = 0 is none."""
+    """Whether the coefficients are in the model's range; a double sphere needs alpha from 0 to 1."""
     state = adjusted.state
     low, high = _GRID[state.model][[0, -1]]
     return bool(low <= state.k[0] <= high and (state.model != "double_sphere" or 0 <= state.k[1] <= 1))
@@ -206,7 +207,7 @@ def _camera(state: CameraState) -> Array:
 
 
 def _moved(state: CameraState, xi: float) -> CameraState:
-    """With another xi, and the same scale in the middle of the image."""
+    """Change xi, keeping the scale in the image centre."""
     entries, k = state.entries.copy(), state.k.copy()
     entries[:, :3] *= (1 + xi) / (1 + k[0])
     k[0] = xi

@@ -1,1 +1,1 @@
-"""From random weights to a camera: a network for each view, one W for all, and other minima in doubt."""
+"""From random weights to a camera: a network for each view, one common W, and a check for other minima."""

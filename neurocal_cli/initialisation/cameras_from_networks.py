@@ -13,14 +13,14 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.initialisation.orthogonality import pose_from_product, shared_intrinsics
 from neurocal_cli.initialisation.view_networks import Group
 
-# Repeated by tests/test_convergence.py: the wrong minima of the conditions that its 1300 scenes show, and
-# depths that keep all their points in front of the first camera.
+# Repeated by tests/test_convergence.py: its 1300 scenes show how many local minima the conditions have, and
+# which depths keep all points in front of the first camera.
 _MOST_CANDIDATES = 4
-_NEAREST = 1.05  # depth of the nearest point's side, in units of what puts it into the focal plane
+_NEAREST = 1.05  # depth of the centroid, relative to that at which the nearest point reaches the focal plane
 
 
 def candidate_intrinsics(problem: Problem, groups: Sequence[Group], rng: np.random.Generator) -> Array:
-    """Entries of W that the orthogonality conditions of all views agree on, best first; (C, 1, 5)."""
+    """Candidates for W's entries, the minima of all views' orthogonality conditions; best first (C, 1, 5)."""
     flat, solid = np.zeros((0, 3, 2)), np.zeros((0, 3, 3))
     for group in groups:
         if group.flat:
@@ -49,8 +49,8 @@ def cameras_from_products(problem: Problem, groups: Sequence[Group], entries: Ar
 
 
 def _in_front(views: Views, R: Array, t: Array) -> Array:
-    """Push views that an inexact W puts partly behind the camera out along their ray."""
-    # The local coordinates are at most 1: a quick bound that nearly always decides.
+    """Move views that an inexact W puts partly behind the camera away along their ray; the new t."""
+    # Local coordinates are at most 1, which gives a quick bound that nearly always suffices.
     if (t[:, 2] > np.abs(R[:, 2]).sum(axis=1)).all():
         return t
     depth = (views.local * np.repeat(R[:, 2], views.counts, axis=0)).sum(axis=1)

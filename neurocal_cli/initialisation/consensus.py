@@ -1,14 +1,13 @@
-"""Which points each view's network can agree on: robust training from random weights.
+"""Consensus: robust training of each view's network from random weights, to detect gross outliers.
 
-A network that learns all points at once is drawn away by wrong ones. Here every start sees a few
-points only, drawn at random, and is judged by the median error of all of them (Rousseeuw 1984): a
-start whose points are all right has a small one, as long as most of the points are right. The best
-starts then learn from all points near them, a few times over, until two starts agree on the same
-points. What is far from their network is grossly wrong. A view whose points no network brings
-together is wrong as a whole.
+A network trained on all points is biased by outliers. Here each start is trained on a few random points and
+rated by the median error of all points (least median of squares, Rousseeuw 1984): it is small if the few
+points are inliers and most of all points are. The best starts are then trained repeatedly on all points near
+them, until two starts agree on the same points. Points far from that network are gross outliers. A view
+without such a network is wrong as a whole.
 
-A distorting lens makes the errors of all points larger, and with them what counts as far. What was
-left out here by mistake comes back when the camera is known (`outlier_rejection`).
+Lens distortion increases all errors and with them the threshold. Points left out here by mistake come back
+when the camera is known (`outlier_rejection`).
 """
 
 from __future__ import annotations
@@ -27,40 +26,41 @@ from neurocal_cli.training import Task
 from neurocal_cli.training.levenberg_marquardt import LMOptions, train_lm
 
 # Repeated by tests/test_outlier_rejection.py (slow: 200 scenes with a fifth of the points wrong, 105 sets
-# with one wrong view, each within 3 standard deviations of clean data): starts and rounds are what the last
-# scene needed, the limits lie between the clean and the wrong views of these sets.
+# with one wrong view, each within 3 standard deviations of clean data): the hardest scene needed this many
+# starts and rounds, and the limits lie between the clean and the wrong views of these sets.
 #
-# Of a flat and of a solid target: points that a start sees, and fewest points that can outvote others.
+# For flat (True) and solid targets: points on which a start is trained, and fewest points of a searched view.
 _SEEN = {True: 5, False: 7}
 _FEWEST = {True: 8, False: 11}
 _STARTS, _ROUNDS = 24, 5
-_FINALISTS = 4  # starts of each round that learn on
+_FINALISTS = 4  # starts of each round that are trained further
 _PASSES = 6
 _FAR = 6.0  # standard deviations
-_MOST_SEEN = 512  # points of a view that take part in the search
+_MOST_SEEN = 512  # most points of a view used in the search
 _AGREED = 0.97  # share of points on which two starts have to agree
-# A view is wrong as a whole when fewer points than this share agree, or only to this share of its size.
+# A view is wrong as a whole if at most this share of its points agree, or if their scatter exceeds this share
+# of the view's size.
 _MAJORITY, _TIGHT = 0.5, 0.05
-_LOOSE, _LOOSER = 0.01, 10.0  # or to this share, and so many times worse than most views
+_LOOSE, _LOOSER = 0.01, 10.0  # or if it exceeds this share, and so many times the median of the views
 _NETWORKS_AT_ONCE = 20_000
-# Angles from the axis [rad] at which the farthest point may be seen, and how much tighter networks must
-# become. A board is seen in a small part of the image, where a lens that is 20 % off bends it by 1 %.
+# Trial angles of the farthest point from the axis [rad], and the factor by which a lens must reduce the
+# scatter. A board covers a small part of the image, where a lens that is 20 % off displaces points by 1 %.
 _HALF_ANGLES = (0.8, 1.1, 1.4, 1.7)
 _TIGHTER = 0.5
 
 
 @frozen_dataclass(eq=False)
 class Consensus:
-    """What the views' networks agree on, sorted as the views are.
+    """Points that agree with the robust network of their view, in the order of the views.
 
     Attributes
     ----------
     kept : (N,) bool array
-        Points near their view's network; all points of views that have too few to tell.
+        Points near their view's network; all points of views that have too few for a search.
     hopeless : (V,) bool array
-        Views whose points agree on nothing.
+        Views whose points do not agree on any network.
     looseness : float
-        How far points are from their network, as a share of the view's size; the median of the views.
+        Scatter of the points around their network, as a share of the view's size; the median of the views.
     """
 
     kept: NDArray[np.bool_]
@@ -69,7 +69,7 @@ class Consensus:
 
 
 def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generator) -> Consensus:
-    """Look for the points of each view that one network explains.
+    """Find the points of each view that agree with one network.
 
     Parameters
     ----------
@@ -89,11 +89,11 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
             search = _Search(views, some, kind, rng)
             search.run()
             hopeless[some] = search.judge(kept)
-            # A view all of whose pixels are one tells nothing.
+            # If all pixels of a view coincide, its scatter is undefined.
             loose[some] = np.divide(
                 search.scale, search.spread, np.full(len(some), np.inf), where=search.spread > 0
             )
-    # Distortion may loosen all views, but one view far more than the others is another matter.
+    # Distortion increases the scatter of all views; a view far above the others is wrong.
     told = loose[~np.isnan(loose)]
     if len(told) > 2:
         with np.errstate(invalid="ignore"):
@@ -104,21 +104,19 @@ def find_consensus(views: Views, flat: NDArray[np.bool_], rng: np.random.Generat
 def find_consensus_through_wide_lens(
     pinhole: Consensus, views: Views, flat: NDArray[np.bool_], middle: Array, rng: np.random.Generator
 ) -> Consensus:
-    """The same where a wide lens bends boards by more than wrong points do.
+    """The same through a wide lens, which displaces points by more than outliers do.
 
-    The networks learn rays instead of pixels, through lenses whose image grows evenly with the angle, of
-    several focal lengths; the one that brings points together best tells.
+    The networks learn rays instead of pixels, through equidistant lenses of several focal lengths; the lens
+    with the smallest scatter is used.
 
     Parameters
     ----------
     pinhole : Consensus
-        What the networks agree on without a lens: the result, unless a lens brings points decidedly
-        nearer together.
+        The consensus without a lens: returned unless a lens reduces the scatter decidedly.
     views, flat, rng
-        As before.
+        As for `find_consensus`.
     middle : (2,) array
-        Where the axis is taken to be, in normalised pixels.
-
+        Assumed position of the optical axis, in normalised pixels.
     """
     away = views.pixels - middle
     radius = np.hypot(*away.T)
@@ -134,7 +132,7 @@ def find_consensus_through_wide_lens(
 
 
 class _Search:
-    """Starts on a few points each, for K views of one kind."""
+    """Search with starts on a few points each, for K views of one kind, flat or solid."""
 
     def __init__(self, views: Views, members: NDArray[np.intp], flat: bool, rng: np.random.Generator) -> None:
         self.views, self.members, self.flat, self.rng = views, members, flat, rng
@@ -149,7 +147,7 @@ class _Search:
         self.spread = np.sqrt(np.nanvar(seen, axis=1).sum(axis=1))
 
     def run(self) -> None:
-        """Search until two starts of each view agree, in a few rounds at most."""
+        """Search until two starts of each view agree, for a few rounds at most."""
         open_views = np.arange(len(self.members))
         for _ in range(_ROUNDS):
             if not open_views.size:
@@ -183,7 +181,7 @@ class _Search:
         return product.reshape(len(which), _STARTS, 3, few.n_inputs)
 
     def _learn_on(self, which: NDArray[np.intp], product: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """Learn from all points near each network, a few times over."""
+        """Train repeatedly on all points near each network."""
         K, S = product.shape[:2]
         view = np.repeat(which, S)
         patterns = self.patterns.take(view)
@@ -204,9 +202,9 @@ class _Search:
         return product, scale, real & (error < _FAR * scale[..., None])
 
     def _enter(self, which: NDArray[np.intp], product: Array, scale: Array, near: NDArray[np.bool_]) -> None:
-        """Enter one start of each view: the one with the lowest median stays."""
+        """Compare one start of each view with the best so far, and keep the one with the lower median."""
         same = ((near == self.near[which]) | ~self.real[which]).sum(1) >= _AGREED * near.shape[1]
-        # Starts that lost their way may agree too: that everything is near.
+        # Two failed starts with a large scatter also agree, because then all points are near.
         same &= self.scale[which] < _TIGHT * self.spread[which]
         better = scale < self.scale[which]
         self.agreed[which] = np.where(same, self.agreed[which] + 1, np.where(better, 1, self.agreed[which]))
@@ -214,7 +212,7 @@ class _Search:
         self.product[won], self.scale[won], self.near[won] = product[better], scale[better], near[better]
 
     def _errors(self, which: NDArray[np.intp], product: Array) -> Array:
-        """Distance between each point and where the networks put it; (K', S, n)."""
+        """Distance between each point and the output of its networks; (K', S, n)."""
         o = self.patterns.inputs[which][:, None] @ np.swapaxes(product, -1, -2)
         return self._distance(o, self.patterns.targets[which][:, None])
 
@@ -227,17 +225,17 @@ class _Search:
                 along = (o * targets).sum(axis=-1, keepdims=True)
                 across = o - along * targets
                 error = np.sqrt((across * across).sum(axis=-1) / (o * o).sum(axis=-1))
-                # A product has no sign of its own.
+                # The sign of a product is arbitrary.
                 same_side = along[..., 0] * along.sum(axis=-2) > 0
                 error = np.where(same_side, error, np.nan)
         return np.where(np.isfinite(error), error, 1e9)
 
     def _scale(self, error: Array, real: NDArray[np.bool_]) -> Array:
-        """Standard deviation by the median; of two coordinates' length it is 1.18."""
+        """Robust standard deviation from the median length, which is 1.18 sigma for two coordinates."""
         return _median(error, np.broadcast_to(real, error.shape)) / 1.1774 + 1e-9
 
     def judge(self, kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Enter what is near into `kept`; the views that agree on nothing."""
+        """Write the points near their network into `kept`; return the views that are wrong as a whole."""
         hopeless = np.zeros(len(self.members), dtype=bool)
         everything = self.views.targets
         for k, view in enumerate(self.members):
@@ -255,7 +253,7 @@ class _Search:
 
 
 def _trained(patterns: Patterns, product: Array, options: LMOptions) -> Array:
-    """Train the products themselves, W being the identity."""
+    """Train the products W V themselves, with W the identity."""
     n, inputs = len(product), product.shape[2]
     W = np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
     free = np.ones((3, 3), dtype=bool), np.ones((3, inputs), dtype=bool)

@@ -1,8 +1,8 @@
-"""Between stages 2 and 3, for trainers that can: the paper's constrained training, eq. (14).
+"""The paper's constrained training, eq. (14), between stages 2 and 3 for trainers that support it.
 
-The free network's product has been split into an upper triangular W and an orthonormal V. Training
-goes on by eq. (15), with W's structural zeros and given weights fixed and beta E_orth in the error;
-from random weights it would stall.
+It starts from an upper triangular W and an orthonormal V, into which the free network's product has been
+split; from random weights it would stall. Training follows eq. (15), with W's structural zeros and given
+weights fixed and beta E_orth added to the error.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ def train_constrained(problem: Problem, options: Options, state: CameraState) ->
     Returns
     -------
     state : CameraState
-        Unchanged where the trainer has no such training or it is of no use.
+        Unchanged if the trainer does not support it or the result is no valid camera.
     iterations : int
     """
     views = problem.views
     if options.constrained is None or views.n_views > 1 or views.nearly_flat[0]:
         return state, 0
     depth = float(state.t[0, 2])
-    # V is scaled so that depths, and with them every gamma, are about 1: E_orth's a takes that up.
+    # V is scaled so that depths, and so every gamma, are about 1; the constant a of E_orth compensates.
     V = np.concatenate([state.R, state.t[:, :, None]], axis=2) / depth
     free_W = np.zeros((3, 3), dtype=bool)
     free_W[ENTRIES] = problem.free

@@ -1,4 +1,4 @@
-"""Type 4: V is given, so all views together are one layer, W, with known inputs."""
+"""Type 4: V is given, so all views together train a single layer, W, with known inputs."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from neurocal_cli.initialisation.options import MOST_POINTS, Options
 from neurocal_cli.network import Patterns
 from neurocal_cli.training.starts import learn
 
-# With a wide lens: the depth of a point that trains the network, as a share of its distance (60 degrees from
-# the axis), and the fewest of them.
+# With a wide lens: least depth of a training point as a share of its distance (60 degrees from the axis), and
+# fewest training points.
 _LEAST_DEPTH, _FEWEST = 0.5, 12
 
 
@@ -28,7 +28,7 @@ def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generat
     Raises
     ------
     DegenerateGeometryError
-        A given pose puts points behind the camera, or only a mirrored camera could see them so.
+        A given pose puts points behind the camera, or the pixels fit only a mirrored camera.
     """
     views = problem.views
     R, t = _normalised_poses(problem)
@@ -38,11 +38,11 @@ def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generat
     rows = views.patterns(np.arange(views.n_views), False, MOST_POINTS, rng)
     # Hidden outputs Y = V Z, eq. (6): the camera's coordinates.
     hidden = rows.inputs @ np.swapaxes(np.concatenate([R, t[..., None]], axis=2), 1, 2)
-    # Each view has its own scale; gamma absorbs it, and starts at 1: depths should be about 1,
-    # "with appropriate scaling if necessary".
+    # Each view has its own scale, which gamma absorbs. Gamma starts at 1, so depths should be about 1, "with
+    # appropriate scaling if necessary".
     real = rows.weights > 0
     depth = np.where(real, hidden[..., 2], np.nan)
-    if wide:  # the network, a pinhole, learns from what is well in front
+    if wide:  # the network is a pinhole, so it is trained on points well in front only
         real &= depth > _LEAST_DEPTH * np.linalg.norm(hidden, axis=2)
         if real.sum() < _FEWEST:
             raise DegenerateGeometryError(
@@ -76,7 +76,7 @@ def solve_given_poses(problem: Problem, options: Options, rng: np.random.Generat
 
 
 def _check_in_front(views: Views, R: Array, t: Array) -> None:
-    """Every point, not only those that train the network."""
+    """Refuse given poses that put any point behind the camera, also points that do not train the network."""
     depth = (views.local * np.repeat(R[:, 2], views.counts, axis=0)).sum(axis=1)
     behind = np.minimum.reduceat(depth, views.first) + t[:, 2] <= 0
     if behind.any():

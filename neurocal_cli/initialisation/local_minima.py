@@ -1,8 +1,8 @@
-"""Whether a minimum is the right one, and what else it could be.
+"""Test whether a minimum is the global one, and try other starts if not.
 
-A free network has more freedom than a camera, so its pixel error bounds from below what the camera
-can reach. A camera that comes as near to the bound as noise allows is the right one. Otherwise its
-candidates are tried: other intrinsics, the mirrored pose of a flat board, random cameras.
+A free network has more freedom than a camera, so its pixel error is a lower bound for the camera's. A camera
+that reaches the bound up to noise is at the global minimum. Otherwise other starts are tried: other
+intrinsics, the mirrored pose of a flat board, random cameras.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ from neurocal_cli.initialisation.view_networks import Group
 from neurocal_cli.least_squares.leave_out import solve_or_nan
 
 # Repeated by tests/test_convergence.py (1000 solid and 300 flat scenes, three seeds) and
-# tests/test_refusals.py: in these no start that won was behind after so many steps, no mirrored pose won
-# from farther off, and no camera of right data was ever called mirrored.
-_TRIAL_STEPS = 15  # another start must be ahead after so many
-# A mirrored pose is a candidate while its rms error is below so many times the other's: at first, and
-# after a few steps.
+# tests/test_refusals.py: no start that won there was behind after so many steps, no mirrored pose won from
+# beyond this range, and no correct data were called mirrored.
+_TRIAL_STEPS = 15  # another start must be better after so many steps
+# A mirrored pose is a candidate while its rms error is below _FLIP_RANGE times the other's, and after
+# _FLIP_STEPS steps below _FLIP_CLOSE times.
 _FLIP_RANGE, _FLIP_STEPS, _FLIP_CLOSE = 10.0, 3, 2.0
-_FLIPS, _FLIPS_TOGETHER = 12, 3  # rounds of turning, and views tried in one
-# Data are taken for mirrored when a mirrored camera's rms error is so many times lower, and there
-# are enough points that chance does not do that.
+_FLIPS, _FLIPS_WITH_CAMERA = 12, 3  # rounds of flipping poses, and views tried in each
+# Data count as mirrored if a mirrored camera's rms error is so many times lower, with at least so many
+# points, so that it is not by chance.
 _MIRRORED_BETTER, _MIRRORED_POINTS = 3.0, 12
-_FREEDOM = {True: 8, False: 11}  # of a flat and of a solid view's product, up to scale
+_FREEDOM = {True: 8, False: 11}  # degrees of freedom of the product of a flat (True) or a solid view
 
 
 class OnlyMirroredError(DegenerateGeometryError):
-    """Points that a free network fits well, but only as a mirrored camera; or a strong distortion."""
+    """A free network fits the points well only as a mirrored camera; strong distortion can cause it, too."""
 
 
 def reaches_bound(problem: Problem, adjusted: Adjusted, groups: Sequence[Group]) -> bool:
-    """Whether the camera fits as well as the free networks, up to what noise explains."""
+    """Whether the camera fits as well as the free networks, up to noise."""
     bound = sum(float(g.bound.sum()) for g in groups)
     freedom = sum(len(g.views) * _FREEDOM[g.flat] for g in groups)
     conditions = freedom - problem.n_parameters
@@ -60,9 +60,9 @@ def short_of_bound(problem: Problem, adjusted: Adjusted, groups: Sequence[Group]
 
 
 def _explained(cost: Array, bound: Array | float, conditions: int, spare: Array | float) -> NDArray[np.bool_]:
-    """Whether an excess over the bound is what `conditions` imposed on noise would cost.
+    """Whether the excess over the bound is what `conditions` constraints cost under noise.
 
-    The excess over the residual variance is chi-squared distributed; the limit is its mean and six
+    The excess over the residual variance has a chi-squared distribution; the limit is its mean plus six
     standard deviations.
     """
     limit = conditions + 6 * np.sqrt(2.0 * max(conditions, 1)) + 10
@@ -71,17 +71,17 @@ def _explained(cost: Array, bound: Array | float, conditions: int, spare: Array 
 
 
 def refuse_mirrored(problem: Problem, adjusted: Adjusted, groups: Sequence[Group]) -> None:
-    """Refuse points in space that a free network fits well, but as a mirrored camera.
+    """Refuse points in space that a free network fits well only as a mirrored camera.
 
     Raises
     ------
     OnlyMirroredError
-        X,Y,Z left-handed, two columns swapped, v upwards.
+        Causes are a left-handed X,Y,Z, two swapped columns, or v pointing upwards.
     """
     for group in groups:
         if group.flat:
             continue
-        # The normalised origin is the points' centroid: in front with P's right sign.
+        # The normalised origin is the points' centroid, which lies in front if the sign of P is right.
         mirrored = np.linalg.det(group.product[:, :, :3]) * group.product[:, 2, 3] < 0
         mirrored &= adjusted.cost[group.views] > _MIRRORED_BETTER**2 * group.bound + 1e-20
         mirrored &= problem.views.distinct[group.views] >= _MIRRORED_POINTS
@@ -94,7 +94,7 @@ def refuse_mirrored(problem: Problem, adjusted: Adjusted, groups: Sequence[Group
 
 
 def try_start(problem: Problem, best: Adjusted, state: CameraState) -> Adjusted:
-    """The better of a result and what another start leads to, given a few steps to show it."""
+    """The better of a result and that of another start, which must be better after a few steps."""
     trial = problem.adjust(state, _TRIAL_STEPS)
     if trial.cost.sum() >= best.cost.sum():
         return best
@@ -102,7 +102,7 @@ def try_start(problem: Problem, best: Adjusted, state: CameraState) -> Adjusted:
 
 
 def better_by_view(problem: Problem, one: Adjusted, two: Adjusted) -> Adjusted:
-    """View by view the better of two results; for views that are independent (type 3)."""
+    """The better of two results for each view; for independent views (type 3)."""
     better = two.cost < one.cost
     R = np.where(better[:, None, None], two.state.R, one.state.R)
     t = np.where(better[:, None], two.state.t, one.state.t)
@@ -110,23 +110,23 @@ def better_by_view(problem: Problem, one: Adjusted, two: Adjusted) -> Adjusted:
 
 
 def try_mirrored(problem: Problem, adjusted: Adjusted) -> Adjusted:
-    """Far flat boards have a second pose, tilted the other way, that fits nearly as well.
+    """Try the mirrored pose of each flat view: far boards have a second pose that fits nearly as well.
 
-    All views whose second pose fits better as the camera is are turned at once. Others are turned one by one,
-    where the camera that goes with the second pose fits all views better: a camera that was found with the
-    wrong pose is drawn towards it. Poses that are given stay.
+    First, all views whose mirrored pose fits better with the current camera are flipped at once. Then others
+    are flipped one by one if all views together fit better with the camera adjusted to the flipped pose,
+    because the current camera is biased towards the wrong pose. Given poses stay.
     """
     if not problem.free_poses:
         return adjusted
     for _ in range(_FLIPS):
-        found = _turned_alone(problem, adjusted)
+        found = _flip_alone(problem, adjusted)
         if found is None:
             return adjusted
         turned, others = found
         if turned is not None:
             adjusted = turned
             continue
-        turned = _turned_together(problem, adjusted, others)
+        turned = _flip_with_camera(problem, adjusted, others)
         if turned is None:
             return adjusted
         adjusted = turned
@@ -136,8 +136,8 @@ def try_mirrored(problem: Problem, adjusted: Adjusted) -> Adjusted:
 _Second = tuple[NDArray[np.intp], Adjusted]  # views, and their second poses with the camera as it is
 
 
-def _turned_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, _Second] | None:
-    """With every view turned whose second pose is better as the camera is; and all second poses near."""
+def _flip_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None, _Second] | None:
+    """Flip all views whose mirrored pose fits better with the current camera; and all near mirrored poses."""
     views, state = problem.views, adjusted.state
     flat = np.flatnonzero(views.nearly_flat)
     if not flat.size:
@@ -160,8 +160,8 @@ def _turned_alone(problem: Problem, adjusted: Adjusted) -> tuple[Adjusted | None
     return again, (candidates, posed)
 
 
-def _turned_together(problem: Problem, adjusted: Adjusted, second: _Second) -> Adjusted | None:
-    """With the view turned that promises most when the camera goes along; None when none keeps it."""
+def _flip_with_camera(problem: Problem, adjusted: Adjusted, second: _Second) -> Adjusted | None:
+    """Flip the view with the largest predicted gain if the camera is adjusted, too; None if none improves."""
     views, posed = second
     if not problem.free_camera.any() or not problem.free_poses or problem.restraint is not None:
         return None
@@ -171,7 +171,7 @@ def _turned_together(problem: Problem, adjusted: Adjusted, second: _Second) -> A
     gain = (g * solve_or_nan(S, g)).sum(axis=1)
     promised = adjusted.cost.sum() - adjusted.cost[views] + posed.cost - gain
     order = np.argsort(promised)
-    for place in order[:_FLIPS_TOGETHER]:
+    for place in order[:_FLIPS_WITH_CAMERA]:
         if not promised[place] < adjusted.cost.sum() * (1 - 1e-9):
             return None
         again = _with_poses(problem, adjusted, views[[place]], posed, np.array([place]))
@@ -183,7 +183,7 @@ def _turned_together(problem: Problem, adjusted: Adjusted, second: _Second) -> A
 def _with_poses(
     problem: Problem, adjusted: Adjusted, views: NDArray[np.intp], posed: Adjusted, rows: NDArray[Any]
 ) -> Adjusted | None:
-    """Adjusted again with other poses of some views; None where that is no better."""
+    """Adjust again with other poses of some views; None if that is no better."""
     state = adjusted.state
     R, t = state.R.copy(), state.t.copy()
     R[views], t[views] = posed.state.R[rows], posed.state.t[rows]
@@ -192,13 +192,13 @@ def _with_poses(
 
 
 def _pose_alone(problem: Problem, state: CameraState, views: NDArray[np.intp], steps: int) -> Adjusted:
-    """Refine some views' poses with the intrinsics as they are."""
+    """Refine some views' poses with the current camera."""
     batches = problem.views.subset(views).batches
     return adjust(batches, state, np.zeros(5 + len(state.k), dtype=bool), max_iterations=steps)
 
 
 def _mirrored(R: Array, t: Array, basis: Array) -> Array:
-    """The pose that a far flat board is mistaken for: its depths mirrored along the viewing ray."""
+    """The second pose of a far flat board: its depths mirrored along the viewing ray."""
     ray = t / np.linalg.norm(t, axis=1, keepdims=True)
     normal = basis[:, :, 2]
     across_ray = np.eye(3) - 2 * ray[:, :, None] * ray[:, None, :]

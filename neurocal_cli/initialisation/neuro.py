@@ -4,11 +4,11 @@
 2. The orthogonality conditions split the products into one W and a pose for each view
    (`cameras_from_networks`). The paper's trainer goes on with its orthogonality term
    (`constrained_training`).
-3. Bundle adjustment: all together on the reprojection error (3), with exact rotations (`adjust`), and
-   from other starts where another minimum may be lower (`local_minima`).
+3. Bundle adjustment minimises the reprojection error (3) over all parameters, with exact rotations
+   (`adjust`), also from other starts if another minimum may be lower (`local_minima`).
 
-Nowhere is there an initial guess. Views with too few points for a free network, and cameras that a
-free network cannot tell, begin at random cameras instead (`random_cameras`).
+No stage needs an initial guess. Views with too few points for a free network, and cameras that a free network
+does not determine, start from random cameras instead (`random_cameras`).
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from neurocal_cli.initialisation.view_networks import (
 # Repeated by tests/test_convergence.py: its scenes with hardly more equations than unknowns need up to 100
 # starts.
 _FEW_POINT_STARTS = 100
-_MANY_EQUATIONS = 12  # with so many more equations than unknowns there is one good minimum
+_MANY_EQUATIONS = 12  # with so many more equations than unknowns there is only one good minimum
 
 _Found = tuple[Adjusted, TrainingRecord]
 
@@ -57,7 +57,7 @@ def solve(problem: Problem, options: Options) -> Solution:
     Raises
     ------
     DegenerateGeometryError
-        The views cannot determine what is asked for.
+        The views do not determine the unknowns.
     """
     rng = np.random.default_rng(options.seed)
     if problem.type == 4:
@@ -87,7 +87,7 @@ class _Search:
         self.views = problem.views
 
     def _begin(self, state: CameraState, record: TrainingRecord) -> _Found:
-        """Bundle adjustment for the first time: what it starts from is recorded."""
+        """First bundle adjustment; the error of its start is recorded."""
         self.options.progress("refining", 0.0)
         before = float((point_residuals(self.views, state) ** 2).sum())
         return self.problem.adjust(state), replace(record, before=before)
@@ -117,7 +117,7 @@ class _Search:
     def _against_random_cameras(
         self, best: Adjusted, record: TrainingRecord, groups: Sequence[Group]
     ) -> _Found:
-        """One view: with hardly a spare equation, or off the bound, other minima may be lower."""
+        """One view: try random cameras if equations are scarce or the bound is not reached."""
         problem = self.problem
         spare = 2 * int(self.views.distinct.sum()) - problem.n_parameters
         if spare >= _MANY_EQUATIONS and reaches_bound(problem, best, groups):
@@ -148,7 +148,7 @@ class _Search:
         return self._begin(found.state, record)
 
     def camera_then_other_poses(self, able: NDArray[np.bool_]) -> _Found:
-        """Types 1 and 2, some views with too few points: they join once the others have told W."""
+        """Types 1 and 2 with some views of too few points, which are added once the others determine W."""
         views = self.views
         if not able.any():
             raise DegenerateGeometryError(

@@ -1,4 +1,4 @@
-"""How a calibration is computed: what trains the networks, from how many starts, and what is tried."""
+"""Options of a calibration: the trainer of the networks, the number of starts, the distortion selection."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from neurocal_cli.training.starts import Agreement
 if TYPE_CHECKING:
     from neurocal_cli.training.backprop import BackpropOptions
 
-# Of each view, that a network sees: beyond it nothing changes but the time (tests/test_convergence.py).
+# Most points of each view that train a network; more only take longer (tests/test_convergence.py).
 MOST_POINTS = 1024
 
-# Called with the name of a stage and the share of it that is done.
+# Called with the name of a stage and the completed share of it.
 Progress = Callable[[str, float], None]
 
 
@@ -29,22 +29,22 @@ class Options:
     Attributes
     ----------
     trainer : Trainer
-        Takes random starts to their minimum.
+        Trains random starts to their minimum.
     agreement : Agreement
-        When two starts count as one result.
+        Tolerance within which two starts have the same result.
     start_points : (int, int)
-        Points of each view that the starts see, for flat and for solid targets.
+        Points of each view on which the starts are trained, for flat and for solid targets.
     finish : Trainer or None
-        Takes the best start on to `MOST_POINTS`; None when the starts saw them.
+        Trains the best start on `MOST_POINTS` points; None if the starts used them already.
     starts : int
         Most random starts for each network.
     constrained : callable or None
-        Trains on E_tot, eq. (14), with some weights fixed, given the task and the constant a; None
-        where bundle adjustment alone imposes the constraints.
+        Trains on E_tot, eq. (14), with some weights fixed, given the task and the constant a; None if
+        bundle adjustment alone imposes the constraints.
     distortion : str
-        "auto": choose the model; "plumb-line": find it from straight lines first; else as the problem says.
+        "auto": select the model; "plumb-line": estimate it from straight lines first; else the problem's.
     preferred : str
-        With "auto", a model to take where no other predicts decidedly better.
+        With "auto", the model to select unless another predicts decidedly better.
     seed : int
         Of the random weights.
     progress : callable
@@ -74,8 +74,8 @@ def options_for(
 ) -> Options:
     """Options of a trainer: "lm", Levenberg-Marquardt, or "backprop", the paper's learning rule.
 
-    Starts see a few points of each view, as many as make their minimum that of all points; the best
-    goes on to `MOST_POINTS`.
+    Starts are trained on a few points of each view, enough for their minimum to be that of all points; the
+    best start is then trained on `MOST_POINTS`.
     """
     report = progress or (lambda stage, share: None)
     options = partial(
@@ -98,7 +98,7 @@ def options_for(
         return train_backprop(task, rates, lambda share: report("training the networks", share))
 
     def constrained(task: Task, a: float) -> Trained:
-        # Lower rates than from random weights, and every gamma where it belongs: it starts trained.
+        # It starts from trained weights: lower rates, and every gamma at its optimum.
         gentle = replace(rates, rate_weights=0.4 * rates.rate_weights, beta=10.0, a=a, resting_gamma=True)
         return train_backprop(task, gentle, lambda share: report("training with orthogonality", share))
 

@@ -1,9 +1,9 @@
-"""From free products W V to a camera: the orthogonality conditions (13) split them.
+"""Split the free products W V into one W and the poses by the orthogonality conditions (13).
 
-Every view's network has learnt a product B_k = W V_k up to scale. That W is shared and V_k's
-rotation part orthonormal are conditions on W^-1 B_k: its columns are perpendicular and of equal
-length. A view of a solid target gives five conditions, of a flat board two (Zhang 2000). W's five
-entries learn them from random values, again by Levenberg-Marquardt.
+Each view's network has learnt a product B_k = W V_k up to scale. All views share W, and the rotation part of
+V_k is orthonormal, so the columns of W^-1 B_k must be perpendicular and of equal length. A view of a solid
+target gives five conditions, a view of a flat board two (Zhang 2000). Levenberg-Marquardt solves them for W's
+five entries from random values.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array, nearest_rotation
 from neurocal_cli.least_squares.levenberg_marquardt import DescentOptions, LevenbergMarquardt
 
-# Bundle adjustment goes on from here, so a gain of 1e-4 of the loss is the last worth having. Starts are
-# random, so it is the real gain that counts; test_orthogonality.py holds the share of starts that arrive.
+# Bundle adjustment refines the result, so gains below 1e-4 of the loss are not worth a step. Starts are
+# random, so the actual gain counts; test_orthogonality.py checks the share of starts that converge.
 _OPTIONS = DescentOptions(
     damping=1e-2, shrink=0.1, by_ratio=False, least_damping=1e-12, largest_damping=1e8,
     tolerance=1e-4, by_promise=False, flat=0.0, max_iterations=50,
 )  # fmt: skip
-_FLOOR = 1e-28  # loss that rounding alone accounts for
-_LONGEST = 2.0  # step of any entry; in the logarithm a factor of 7
-_STARTS = 8  # at random, trained side by side
-_ENOUGH = 3  # starts that have ended at the same, lowest loss
+_FLOOR = 1e-28  # loss that rounding alone can cause
+_LONGEST = 2.0  # largest step of any entry; in the logarithm a factor of 7
+_STARTS = 8  # random starts, trained side by side
+_ENOUGH = 3  # starts at the same, lowest loss with which training ends
 
 
 @frozen_dataclass(eq=False)
@@ -40,7 +40,7 @@ class SharedIntrinsics:
     loss : (C,) array
         Half the sum of squared conditions.
     agreed : int
-        How many random starts ended at the best minimum.
+        Number of random starts that ended at the best minimum.
     """
 
     entries: Array
@@ -55,7 +55,7 @@ def shared_intrinsics(
     free: NDArray[np.bool_],
     rng: np.random.Generator,
 ) -> SharedIntrinsics:
-    """Learn W from the products of all views.
+    """Estimate W from the products of all views.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def shared_intrinsics(
 
 
 def _to_log(entries: Array) -> Array:
-    """W11 and W22 are learnt by their logarithms, which keeps them positive."""
+    """Replace W11 and W22 by their logarithms, which keeps them positive."""
     p = entries.astype(float).copy()
     p[[0, 2]] = np.log(np.maximum(p[[0, 2]], 1e-300))
     return p
@@ -125,7 +125,7 @@ class _Conditions:
 
 
 def _columns(group: Array, pairs: tuple[tuple[int, int], ...]) -> Array:
-    """What the conic is multiplied with for scalar products: of each column with itself, then of the pairs.
+    """Outer products of the columns, which the conic turns into scalar products: squares, then the pairs.
 
     Parameters
     ----------
@@ -160,7 +160,7 @@ def _conic(p: Array) -> tuple[Array, Array]:
     a, b = np.exp(-p[:, 0]), np.exp(-p[:, 2])
     ab = a * b
     skew = s * ab
-    # W^-1, behind its derivatives, whose sign is changed at the end.
+    # The derivatives of W^-1 with the sign reversed (mended at the end), followed by W^-1 itself.
     by = np.zeros((6, 3, 3, len(p)))
     inverse = by[5]
     inverse[0, 0], inverse[0, 1], inverse[0, 2] = a, -skew, skew * v - u * a
@@ -177,7 +177,7 @@ _Trial = tuple[Array, Array, Array]  # parameters, their residuals and derivativ
 
 
 class _Starts:
-    """The conditions as `least_squares` sees them: each of B parameter sets (B, 5) is a group."""
+    """The conditions as a `LeastSquaresProblem`: each of B parameter sets (B, 5) is a group."""
 
     def __init__(self, conditions: _Conditions, p: Array) -> None:
         self.conditions, self.p = conditions, p.copy()
@@ -190,7 +190,7 @@ class _Starts:
         return self.loss
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Steps damped by the mean of the diagonal, none too long, and what they promise."""
+        """Steps of limited length, damped by the mean of the diagonal, and their predicted gains."""
         J, f = self.J[active], len(self.conditions.free)
         H = J @ np.swapaxes(J, 1, 2)
         g = -(J @ self.r[active][..., None])[..., 0]
@@ -200,21 +200,21 @@ class _Starts:
         return step, (step * (g - 0.5 * (H @ step[..., None])[..., 0])).sum(axis=1)
 
     def move(self, step: Array, active: NDArray[np.intp]) -> tuple[_Trial, Array, NDArray[np.bool_]]:
-        """The parameters after a step; all of them are cameras."""
+        """The parameters after a step; all of them are valid."""
         trial = self.p[active]
         trial[:, self.conditions.free] += step
         r, J = self.conditions(trial)
         return (trial, r, J), 0.5 * (r * r).sum(axis=1), np.ones(len(trial), dtype=bool)
 
     def accept(self, trial: _Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Take over the starts that became better."""
+        """Accept the trial for the starts that improved."""
         kept = active[better]
         self.p[kept], self.r[kept], self.J[kept] = (values[better] for values in trial)
         self.loss[kept] = 0.5 * (self.r[kept] * self.r[kept]).sum(axis=1)
 
 
 def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
-    """Train parameter sets (B, 5) until all have ended, or enough at the same, lowest loss (B,)."""
+    """Train parameter sets (B, 5) until all have ended, or enough of them at the same, lowest loss (B,)."""
     starts = _Starts(conditions, p)
     descent = LevenbergMarquardt(starts, _OPTIONS, _FLOOR)
     with np.errstate(all="ignore"):
@@ -229,14 +229,14 @@ def _minimum(conditions: _Conditions, p: Array) -> tuple[Array, Array]:
 
 
 def _same_lowest(loss: Array, active: NDArray[np.intp]) -> int:
-    """How many starts have ended at the lowest loss of all (B,)."""
+    """Number of starts that have ended at the lowest of all losses (B,)."""
     same = np.abs(loss - loss.min()) <= _tie(loss.min())
     same[active] = False
     return int(same.sum())
 
 
 def _tie(loss: float) -> float:
-    """How near to a loss another one is the same."""
+    """Tolerance within which another loss equals this one."""
     return 1e-3 * loss + 1e-16
 
 
@@ -254,7 +254,7 @@ def pose_from_product(W: Array, product: Array) -> tuple[Array, Array]:
     -------
     R : (K, 3, 3) array
     t : (K, 3) array
-        With t_z > 0: the normalised origin is the points' centroid, which is in front.
+        With t_z > 0, because the normalised origin is the points' centroid, which lies in front.
     """
     D = cast("Array", np.linalg.solve(W, product))
     D = D * np.where(D[:, 2, -1] < 0, -1.0, 1.0)[:, None, None]

@@ -1,15 +1,14 @@
-"""A start for strong distortion: free networks that see the pixels through a radial model.
+"""A start for strong distortion: train the free networks on pixels undistorted by a radial model.
 
-The networks learn a pinhole, and where a lens bends its images much, what they learn is no product of a
-camera and a pose. The division model (Fitzgibbon 2001), with a second term, takes off a radial distortion:
+The networks model a pinhole. Under strong distortion their products are therefore no product of a camera and
+a pose. The division model (Fitzgibbon 2001), with a second term, removes radial distortion:
 
     m_u = c + (m - c) / (1 + lambda_1 (|m - c| / r)^2 + lambda_2 (|m - c| / r)^4),
 
-c being the middle of the image and r the distance of the farthest point. Of many values of the two numbers
-those are taken with which the free networks of all views fit best, as seen in the pixels that were given:
-every undistorted pixel has the noise of a given one, magnified. Nothing about the camera need be known for
-that. The camera that follows from these networks, with
-the distortion expressed by a model's coefficients, is a start for bundle adjustment.
+where c is the middle of the image and r the distance of the farthest point. A search finds the two numbers
+with which the free networks of all views fit best. The error is measured in the observed pixels, because
+undistortion magnifies the noise. Nothing about the camera need be known for that. The camera of these
+networks, with the distortion converted to a model's coefficients, is a start for bundle adjustment.
 """
 
 from __future__ import annotations
@@ -34,34 +33,34 @@ from neurocal_cli.initialisation.options import Options, options_for
 from neurocal_cli.initialisation.view_networks import train_networks
 from neurocal_cli.points import Correspondences
 
-# lambda_1 = -0.8 is a barrel that shows 5 times the radius of a pinhole at the farthest point, 0.3 a
+# lambda_1 = -0.8 is a barrel distortion whose farthest point has 5 times that radius in a pinhole; 0.3 is a
 # pincushion. Repeated by tests/test_radial_networks.py and the campaign of tests/test_campaign.py (slow).
 _STRENGTHS = (-0.8, -0.65, -0.5, -0.38, -0.27, -0.17, -0.08, 0.08, 0.17, 0.3)
-# The search around the best of them: from one place to the best of six, in steps that become smaller.
+# The pattern search around the best of them: the best of six neighbours, or else half the step.
 _STEP, _ROUNDS = 0.05, 5
 _WAYS = np.array([(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, -1.0), (-1.0, 1.0)])
-_SCAN_STARTS = 4  # random starts of each network, while the distortion is sought
-_VIEWS_THAT_TELL = 10  # of the distortion; all of them train the networks that the camera follows from
+_SCAN_STARTS = 4  # random starts of each network during the search
+_SEARCH_VIEWS = 10  # most views in the search; all views train the final networks
 
 
 def radial_start(problem: Problem, options: Options) -> Solution | None:
-    """A camera with a distortion, from networks that see undistorted pixels.
+    """A camera with distortion, from networks trained on undistorted pixels.
 
     Parameters
     ----------
     problem : Problem
-        Of a camera that is to be estimated.
+        With an unknown camera.
     options : Options
 
     Returns
     -------
     Solution or None
-        A minimum of the reprojection error, with the distortion model that was nearest to the division
-        model; None where it leads to no camera.
+        A minimum of the reprojection error, with the distortion model nearest to the division model; None if
+        no camera was found.
     """
     middle = middle_of_image(problem)
     reach = float(np.hypot(*(problem.points.pixels - middle).T).max())
-    few = problem.with_points(problem.points.of_few_views(_VIEWS_THAT_TELL))
+    few = problem.with_points(problem.points.of_few_views(_SEARCH_VIEWS))
     strength = _best_strength(_Radial(few, middle, reach), options.seed)
     best = None
     for pinhole in _pinholes(_Radial(problem, middle, reach).corrected(strength), middle):
@@ -76,7 +75,7 @@ def radial_start(problem: Problem, options: Options) -> Solution | None:
 
 
 def _pinholes(problem: Problem, middle: Array) -> Iterator[Problem]:
-    """The problem with the centre in the middle and no skew, which a long lens hardly tells; and as it is."""
+    """The problem with fixed centre and skew, which long lenses hardly determine; then the problem itself."""
     if problem.free[3:].all():
         entries, free = problem.entries.copy(), problem.free.copy()
         entries[3:], free[[1, 3, 4]] = middle, False
@@ -85,7 +84,7 @@ def _pinholes(problem: Problem, middle: Array) -> Iterator[Problem]:
 
 
 def middle_of_image(problem: Problem) -> Array:
-    """(2,) what the distortion is taken to be radial about [px]."""
+    """(2,) assumed centre of the radial distortion [px]."""
     points = problem.points
     if problem.given_centre is not None:
         return problem.given_centre
@@ -95,7 +94,7 @@ def middle_of_image(problem: Problem) -> Array:
 
 
 def _best_strength(radial: _Radial, seed: int) -> Array:
-    """lambda_1 and lambda_2: the best of a row, and from there in steps that become smaller."""
+    """lambda_1 and lambda_2 with the smallest error: a scan of lambda_1, then a pattern search in both."""
     row = [np.array([value, 0.0]) for value in _STRENGTHS]
     error, best = min(((_error(radial, one, seed), one) for one in row), key=lambda tried: tried[0])
     step = _STEP
@@ -111,7 +110,7 @@ def _best_strength(radial: _Radial, seed: int) -> Array:
 
 
 def _error(radial: _Radial, strength: Array, seed: int) -> float:
-    """Squared error of all free networks in the pixels that were given."""
+    """Squared error of all free networks in the observed pixels."""
     problem = radial.corrected(strength)
     able = np.ones(problem.views.n_views, dtype=bool)
     scan = options_for("lm", _SCAN_STARTS, seed)
@@ -139,7 +138,7 @@ class _Radial:
     reach: float
 
     def corrected(self, strength: Array) -> Problem:
-        """The problem of a pinhole that sees the pixels without this distortion."""
+        """The problem of a pinhole camera, with the pixels undistorted."""
         points = self.problem.points
         variance = self.magnification(strength)
         seen = Correspondences(
@@ -151,33 +150,33 @@ class _Radial:
         return self.problem.with_model("none").with_points(seen)
 
     def magnification(self, strength: Array) -> Array:
-        """(N,) by which an area of the image becomes larger: along the radius times across it."""
+        """(N,) magnification of area by undistortion: radial times tangential."""
         share = self._share()
         D, slope = _divisor(strength, share), strength[0] + 2 * strength[1] * share
         return np.asarray((D - 2 * share * slope) / D**3)
 
     def _share(self) -> Array:
-        """(N,) squared distances from the middle, those at the reach being 1."""
+        """(N,) squared distances from the middle, in units of the squared reach."""
         return np.asarray(((self.problem.points.pixels - self.middle) ** 2).sum(axis=1) / self.reach**2)
 
 
 def _divisor(strength: Array, share: Array) -> Array:
-    """Of the division model, at a share of the farthest point's squared distance."""
+    """Divisor of the division model, given squared radii in units of the squared reach."""
     return np.asarray(1 + share * (strength[0] + strength[1] * share))
 
 
 def _one_to_one(strength: Array) -> bool:
-    """Whether the undistorted radius grows with the distorted one, as far as the farthest point."""
+    """Whether the undistorted radius grows with the distorted one up to the farthest point."""
     share = np.linspace(0.0, 1.0, 20)
     D, slope = _divisor(strength, share), strength[0] + 2 * strength[1] * share
     return bool((D > 0).all() and (2 * share * slope < D).all())
 
 
 def _distorted(state: CameraState, strength: Array, reach: float) -> CameraState:
-    """The camera [px] that found the undistorted pixels, with coefficients that distort as the model does.
+    """The camera [px] of the undistorted pixels, with coefficients that reproduce the division model.
 
-    By least squares over the radii of the points, with the coefficients that a fisheye has or with those of
-    plumb_bob, whichever come closer.
+    They are fitted by least squares over the radii of the points, for fisheye and for plumb_bob; the closer
+    model is used.
     """
     distorted = np.linspace(0.02, 1, 60) * reach / float(np.sqrt(state.entries[0, 0] * state.entries[0, 2]))
     straight = distorted / _divisor(strength, (distorted / distorted[-1]) ** 2)

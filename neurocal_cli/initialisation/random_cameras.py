@@ -1,10 +1,9 @@
-"""Cameras from random weights when a free network cannot be trained.
+"""Random starting cameras, for data that cannot train a free network.
 
-A product W V has 11 degrees of freedom; with fewer points than it needs, or all but one in a
-plane, the points still determine a pose (type 3) or a camera with a given centre (type 2). Then
-random weights are made a camera at once, V's left block by the nearest rotation and its last
-column by the linear conditions that the pixels put on t, and each start is trained on the pixel
-error (3) directly.
+A product W V has 11 degrees of freedom. With fewer points than it needs, or with all points but one in a
+plane, the points may still determine a pose (type 3) or a camera with a given centre (type 2). Then random
+weights are converted to a camera at once: V's left block becomes the nearest rotation, and its last column
+follows from the linear conditions of the pixels on t. Each start minimises the reprojection error (3).
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from neurocal_cli.network import Patterns
 
 # Repeated by tests/test_convergence.py, whose scenes of 3 to 8 points begin here.
 _MOST_POINTS = 64
-_NEAREST = 1.2  # depth of the nearest point's side of the target, in target radii
-_TIE = 1e-4
-# With hardly more equations than unknowns several minima fit well, and two starts may agree on a
-# wrong one: so many are trained side by side, and all of them before any is believed.
+_NEAREST = 1.2  # least depth of the target's centre, in target radii
+_TIE = 1e-4  # relative difference within which two costs are equal
+# With hardly more equations than unknowns several minima fit well, and two starts may agree on a wrong one.
+# So this many starts are always trained, side by side, before their results are compared.
 _BATCH = 48
 
 
@@ -89,12 +88,12 @@ def find_camera(
     free : (5,) bool array
     rng : numpy.random.Generator
     starts : int
-        Another batch begins only below this many.
+        A new batch is started only after fewer starts than this.
 
     Returns
     -------
     Found or None
-        None when no start converged.
+        None if no start converged.
     """
     patterns = views.patterns(np.array([0]), flat=False, most=_MOST_POINTS, rng=rng)
     best, cost, agreed, iterations, used = None, np.inf, 0, 0, 0
@@ -141,7 +140,7 @@ def _as_batches(patterns: Patterns) -> PointBatches:
 
 
 def _translation(entries: Array, R: Array, patterns: Patterns) -> Array:
-    """The t that the pixels ask for, given R, by linear least squares; points put in front.
+    """Estimate t from the pixels by linear least squares, given R; the target is moved in front.
 
     With the ray (x, y) of a pixel: t1 - x t3 = x Y3 - Y1 and t2 - y t3 = y Y3 - Y2, Y = R M.
     """

@@ -18,14 +18,14 @@ from neurocal_cli.network import Patterns, residual_jacobian
 from neurocal_cli.training import Task
 from neurocal_cli.training.starts import learn
 
-# Eigenvalue of the product's normal matrix, as a share of the largest, that rounding leaves of 0.
+# Largest eigenvalue of the product's normal matrix, relative to the largest of all, that counts as 0.
 _NO_CONDITION = 1e-13
-_SMALL = 1500  # patterns in all up to which fewer of them save no time (tests/benchmarks/test_speed.py)
+_SMALL = 1500  # number of patterns below which subsampling saves no time (tests/benchmarks/test_speed.py)
 
 
 @frozen_dataclass(eq=False)
 class Group:
-    """Views of one kind, flat or solid, and what their networks learnt.
+    """Views of one kind, flat or solid, with their trained networks.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class Group:
     product : (K, 3, I) array
         W V; for flat views in the coordinates of the view's own plane.
     bound : (K,) array
-        Squared pixel error of the free networks: no camera can do better, but for noise.
+        Squared pixel error of the free networks, a lower bound for that of any camera.
     """
 
     views: NDArray[np.intp]
@@ -44,10 +44,10 @@ class Group:
 
 
 def begin_flat(problem: Problem) -> NDArray[np.bool_]:
-    """(V,) which views' networks take their target as a plane.
+    """(V,) which views' networks treat their target as a plane.
 
-    With other views to help or the intrinsics given, a nearly flat target is best begun as flat; the
-    last stage sees all its coordinates.
+    With other views or given intrinsics, a nearly flat target is best treated as flat at first; bundle
+    adjustment uses all its coordinates.
     """
     views = problem.views
     helped = views.n_views > 1 or problem.type == 3
@@ -57,7 +57,7 @@ def begin_flat(problem: Problem) -> NDArray[np.bool_]:
 def train_networks(
     problem: Problem, options: Options, rng: np.random.Generator, which: NDArray[np.bool_]
 ) -> tuple[list[Group], TrainingRecord]:
-    """Train the networks of some views (V,) from random weights; flat and solid targets apart."""
+    """Train the networks of some views (V,) from random weights, flat and solid targets separately."""
     options.progress("training the networks", 0.0)
     flat = begin_flat(problem)
     groups, record = [], TrainingRecord.empty(problem.views.n_views)
@@ -101,10 +101,10 @@ def _train_group(
 
 
 def refuse_few_conditions(problem: Problem, groups: Sequence[Group]) -> None:
-    """Refuse a single view whose points all but determine a plane.
+    """Refuse a single view whose points lie nearly all in one plane.
 
-    However many they are, points of a plane put 8 conditions on the product W V, and each point off
-    it 2 more, up to 11. With no more conditions than unknowns another camera fits as well.
+    Any number of points of a plane gives 8 conditions on the product W V, and each point off the plane 2
+    more, up to 11. With no more conditions than unknowns, other cameras fit equally well.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def _pixel_error(
     counts = problem.views.counts[members]
     if counts.max() <= every.weights.shape[1]:
         return _squared_error(product, every)
-    # A long view's patterns are a choice of its points; the bound is for all of them.
+    # The patterns of a large view are a subsample, but the bound must cover all of its points.
     total = np.empty(len(members))
     for k, count in enumerate(counts):
         whole = problem.views.patterns(members[k : k + 1], flat, int(count))

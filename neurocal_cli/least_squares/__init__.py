@@ -1,1 +1,1 @@
-"""Nonlinear least squares that knows no cameras: steps, Schur complements, covariances, leaving out."""
+"""Nonlinear least squares, independent of cameras: steps, Schur complements, covariances, leave-one-out."""

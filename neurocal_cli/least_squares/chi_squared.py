@@ -1,4 +1,4 @@
-"""Chi-squared of differences, and levels that chance exceeds; without SciPy, which takes long to load."""
+"""Chi-squared statistics and critical values, without SciPy, which takes long to import."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ _ROUNDING = 1e-15  # of the largest eigenvalue
 
 
 def chi_squared(difference: Array, covariance: Array) -> float:
-    """Differences in units of their covariance, squared: d^T C^-1 d.
+    """Squared Mahalanobis length d^T C^-1 d of a difference.
 
-    A direction in which rounding has left no variance, or less than none, does not count.
+    Directions whose variance is zero or negative by rounding are left out.
 
     Parameters
     ----------
@@ -27,10 +27,10 @@ def chi_squared(difference: Array, covariance: Array) -> float:
 
 
 def exceeded_by_chance(freedom: float | Array, sigmas: float) -> Array:
-    """What chi-squared over its degrees of freedom exceeds as rarely as a normal variable its mean + sigmas.
+    """Critical value of chi-squared over its degrees of freedom, for a one-sided normal level `sigmas`.
 
-    Wilson and Hilferty (1931): the cube root is nearly normal. For three and more degrees of freedom, and
-    levels down to one in 10,000, it is within 4 %.
+    Wilson and Hilferty (1931): the cube root is nearly normal. With three or more degrees of freedom and
+    levels down to one in 10,000, the error is below 4 %.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def exceeded_by_chance(freedom: float | Array, sigmas: float) -> Array:
     Returns
     -------
     float or array
-        Of mean chi-squared over freedom, 1.
+        Critical value, in units of the mean, which is 1.
     """
     part = 2.0 / (9.0 * np.asarray(freedom, dtype=float))
     return np.asarray((1.0 - part + sigmas * np.sqrt(part)) ** 3)

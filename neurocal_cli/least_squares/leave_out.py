@@ -1,12 +1,12 @@
-"""What a least-squares fit would be without some groups of its data, without fitting again.
+"""Leave groups of data out of a least-squares fit without fitting again.
 
 At the minimum the error of each group g is nearly a quadratic in the unknowns p that the groups share,
 
     E_g(p + d) = c_g - 2 g_g . d + d^T S_g d,
 
-with the group's own unknowns eliminated from it (Schur complement). The minimum without any set F of
-groups, d = (S - S_F)^-1 (g - g_F) with S and g summed over all, and the error that it makes on the groups
-left out follow from these few small matrices: exactly where the problem is linear, to second order else.
+with the group's own unknowns eliminated (Schur complement). With S and g summed over all groups, the minimum
+without a set F of groups is d = (S - S_F)^-1 (g - g_F). It and its error on the groups left out follow from
+these few small matrices: exactly if the problem is linear, otherwise to second order.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
-_REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal; below, rounding has the say
-# What nothing determines is infinite or nan, and told so by the results.
+_REGULAR = 1e-12  # smallest eigenvalue of a matrix scaled to a unit diagonal that is not mere rounding
+# Undetermined unknowns become inf or nan; the results are tested for that.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @frozen_dataclass(eq=False)
 class Quadratics:
-    """Errors of G groups as functions of the f unknowns that they share.
+    """Squared errors of G groups as quadratic functions of the f unknowns that they share.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Quadratics:
         member : (F, G) array
             1 where a group belongs to the set, 0 elsewhere.
         restraint : (f, f) array and (f,) array, optional
-            What is known besides: added to the matrix and to the right side.
+            Prior, added to the matrix and to the right side.
 
         Returns
         -------
@@ -70,7 +70,7 @@ class Quadratics:
 
     @_quietly
     def held_out(self, fold: NDArray[np.intp], restraint: tuple[Array, Array] | None = None) -> Array:
-        """(G,) error of each group where the unknowns come from all that are not in its fold (G,)."""
+        """(G,) error of each group with the unknowns estimated from all groups outside its fold (G,)."""
         member = (fold == np.arange(int(fold.max()) + 1)[:, None]).astype(float)
         return self.at(self.steps(1.0 - member, restraint)[fold])
 
@@ -81,13 +81,13 @@ class Quadratics:
 
     @_quietly
     def cost_without_each(self) -> Array:
-        """(G,) error of all the others when one group is left out and they are fitted again."""
+        """(G,) error of all other groups, fitted again without the group."""
         gained = ((self.g.sum(axis=0) - self.g) * self.moves_without_each()).sum(axis=-1)
         return np.asarray(self.cost.sum() - self.cost - gained)
 
 
 def folds_of(n_groups: int, n_folds: int) -> NDArray[np.intp]:
-    """(G,) fold of each group, dealt out in turn; each its own where there are no more than folds."""
+    """(G,) fold of each group, assigned in turn; with at most `n_folds` groups each is a fold of its own."""
     return np.arange(n_groups) % n_folds if n_groups > n_folds else np.arange(n_groups)
 
 

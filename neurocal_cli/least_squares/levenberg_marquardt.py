@@ -1,24 +1,24 @@
-"""The one Levenberg-Marquardt of the package: it knows costs, steps and promises, and no cameras.
+"""The Levenberg-Marquardt solver of the package, independent of cameras.
 
-Around a state p the sum of squares is nearly E(p + d) = c - 2 g.d + d.H d, with H = J^T J and
-g = J^T r. Far from the minimum that is trusted near p only, so each step is damped (Marquardt 1963):
+Around a state p the sum of squares is approximately E(p + d) = c - 2 g.d + d.H d, with H = J^T J and
+g = J^T r. Far from the minimum this model holds only near p, so each step is damped (Marquardt 1963):
 
-    (H + lambda D) d = g,  D = diag H,
+    (H + lambda D) d = g,  D = diag H.
 
-a Gauss-Newton step for small lambda and a short one straight down for large lambda. It promises a gain
-of 2 g.d - d.H d = d.(g + lambda D d). The ratio of the real gain to this promise says how well the
-model holds, and moves lambda (Nielsen 1999; Madsen, Nielsen and Tingleff 2004, section 3.2):
+This is a Gauss-Newton step for small lambda and a short gradient step for large lambda. Its predicted gain is
+2 g.d - d.H d = d.(g + lambda D d). The ratio of the actual to the predicted gain tells how well the model
+holds and controls lambda (Nielsen 1999; Madsen, Nielsen and Tingleff 2004, section 3.2):
 
     rho = (E(p) - E(p + d)) / (2 g.d - d.H d)
     a step that lowers E is accepted:  lambda <- lambda max(shrink, 1 - (2 rho - 1)^3),  nu <- 2
     any other is rejected:             lambda <- lambda nu,                              nu <- 2 nu
 
-Nielsen's smallest factor is 1/3; here it is an option, because starts that are already near have nothing
-to fear from a quick end of the damping. 2 rho - 1 is limited to 2: what gains far more than promised is
-no model either.
+Nielsen's smallest factor is 1/3. Here it is an option, because starts near the minimum can drop the damping
+quickly. 2 rho - 1 is limited to 2, because the model does not hold either if a step gains far more than
+predicted.
 
-Groups are problems side by side that share no unknowns, each with its own lambda, its own end, and no
-effect on the others; one problem is one group.
+Groups are independent problems solved side by side. They share no unknowns; each has its own lambda and its
+own end. A single problem is one group.
 
 Marquardt, An algorithm for least-squares estimation of nonlinear parameters, J. SIAM 11 (1963).
 Nielsen, Damping parameter in Marquardt's method, IMM-REP-1999-05, DTU (1999).
@@ -41,10 +41,10 @@ Trial = TypeVar("Trial")
 
 
 class LeastSquaresProblem(Protocol[Step, Trial]):
-    """G sums of squares as the solver sees them: linearised where they are, and moved.
+    """Interface of a problem with G groups, each a sum of squares with its current state.
 
-    `active` (A,) are the groups that still descend, in ascending order; the others must stay as they are.
-    All arrays are of these groups. A problem of one group need not look at it.
+    `active` (A,) are the groups that still descend, in ascending order; the others must stay unchanged. All
+    arrays hold only these groups. A problem of one group may ignore it.
 
     Attributes
     ----------
@@ -58,21 +58,21 @@ class LeastSquaresProblem(Protocol[Step, Trial]):
         ...
 
     def solve(self, damping: Array, active: NDArray[np.intp]) -> tuple[Step, Array]:
-        """Damped step from the present state, and the gain (A,) that it promises."""
+        """Damped step from the current state, and its predicted gain (A,)."""
         ...
 
     def move(self, step: Step, active: NDArray[np.intp]) -> tuple[Trial, Array, NDArray[np.bool_]]:
-        """Try a step: the trial, its cost (A,), and whether it is a sensible state at all (A,)."""
+        """Try a step: the trial, its cost (A,), and whether it is a valid state (A,)."""
         ...
 
     def accept(self, trial: Trial, better: NDArray[np.bool_], active: NDArray[np.intp]) -> None:
-        """Take over the trial in the groups (A,) that it made better, and linearise there."""
+        """Accept the trial in the groups (A,) that improved, and linearise there."""
         ...
 
 
 @frozen_dataclass
 class DescentOptions:
-    """How to descend and when to stop.
+    """Damping and stopping criteria.
 
     Parameters
     ----------
@@ -81,20 +81,20 @@ class DescentOptions:
     shrink : float
         Smallest factor of lambda after an accepted step.
     by_ratio : bool
-        Whether that factor follows rho, or is the smallest after every accepted step, as Marquardt had it:
-        bold, for many random starts of which some may fail.
+        Whether that factor follows rho. Otherwise it is `shrink` after every accepted step, as in Marquardt's
+        paper: bolder, for many random starts of which some may fail.
     least_damping, largest_damping : float
-        lambda does not fall below the one; where it exceeds the other no step of any length helps.
+        Lower limit of lambda, and the value above which the descent counts as stuck.
     tolerance : float
-        The last step is an accepted one with a gain of less than this share of the cost.
+        Converged when an accepted step gains less than this share of the cost.
     negligible : float
-        The same, as a gain in the cost's own unit.
+        Likewise as an absolute gain, added to that share.
     by_promise : bool
-        Whether that gain is the promised one, or the real one. Near the minimum both are the same; far
-        from it a small real gain may be an accident, and a small promise a saddle.
+        Whether this gain is the predicted or the actual one. Near the minimum both are equal. Far from it, a
+        small actual gain may be accidental, and a small predicted gain a saddle point.
     flat : float
-        A rejected step that promised less than this share of the cost: only rounding stands against it,
-        the bottom is reached.
+        The minimum is reached when a rejected step had predicted a gain of less than this share of the cost:
+        it failed by rounding only.
     max_iterations : int
     """
 
@@ -113,21 +113,21 @@ class DescentOptions:
 class Stop(IntEnum):
     """How the descent of a group ended."""
 
-    LIMIT = 0  # of iterations
+    LIMIT = 0  # limit of iterations
     STUCK = 1  # no step of any length lowers the sum of squares
-    CONVERGED = 2  # the last step gained next to nothing
-    FLAT = 3  # the last step promised next to nothing and gained nothing
-    EXACT = 4  # what is left of the sum of squares is rounding
+    CONVERGED = 2  # the last step had a negligible gain
+    FLAT = 3  # the last step had a negligible predicted gain and failed
+    EXACT = 4  # the remaining sum of squares is rounding
 
 
 @frozen_dataclass(eq=False)
 class Outcome:
-    """How the descent of each group ended; the state itself is the problem's.
+    """How the descent of each group ended; the problem holds the state itself.
 
     Attributes
     ----------
     iterations : (G,) int array
-        Steps that were tried.
+        Number of steps tried.
     stop : (G,) int array
         Values of `Stop`.
     """
@@ -149,10 +149,10 @@ def minimise(
     Parameters
     ----------
     problem : LeastSquaresProblem
-        At its start; at the minimum afterwards.
+        At its start; afterwards at the minimum.
     options : DescentOptions, optional
     floor : float or (G,) array
-        Cost that rounding alone accounts for.
+        Cost that rounding alone can cause.
     """
     descent = LevenbergMarquardt(problem, options or DescentOptions(), floor)
     descent.run()
@@ -160,7 +160,7 @@ def minimise(
 
 
 class LevenbergMarquardt:
-    """The descent itself, step by step, for those that do something in between.
+    """The descent step by step, for callers that act between steps.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ class LevenbergMarquardt:
     active : (A,) int array
         Groups that still descend.
     cost, damping : (A,) arrays
-        Theirs.
+        Of these groups.
     outcome : Outcome
         Of the groups that have stopped.
     """
@@ -193,7 +193,7 @@ class LevenbergMarquardt:
         self.damping, self.growth = np.full(G, options.damping), np.full(G, 2.0)
         self.floor = np.zeros(G) + floor
         self.limit = np.full(G, options.max_iterations) if limit is None else limit
-        self.soonest = int(self.limit.min(initial=options.max_iterations))  # that any group may end there
+        self.soonest = int(self.limit.min(initial=options.max_iterations))  # first iteration at a limit
         self.iteration = 0
         self.outcome = Outcome(np.zeros(G, dtype=np.int64), np.zeros(G, dtype=np.int8))
         exact, out = self.cost <= self.floor, self.limit <= 0
@@ -213,7 +213,7 @@ class LevenbergMarquardt:
         trial, after, sensible = problem.move(step, active)
         better = sensible & (after < before)
         problem.accept(trial, better, active)
-        del trial, step  # large arrays: gone before the next ones are made
+        del trial, step  # frees large arrays before the next ones are allocated
         self.iteration += 1
         gained = before - after
         shrink: float | Array = options.shrink
@@ -241,21 +241,21 @@ class LevenbergMarquardt:
             self._retire(done, stop)
 
     def _last_gain(self, cost: Array) -> Array:
-        """What an accepted step must gain to be followed by another."""
+        """Least gain of an accepted step after which the descent goes on."""
         share = self.options.tolerance * cost
         return share + self.options.negligible if self.options.negligible else share
 
     def renew(self) -> None:
-        """Take up the costs of a problem that has changed by itself; all groups must be active.
+        """Read the costs again after the problem has changed; all groups must be active.
 
-        Where the old one had come to its end, damping begins anew.
+        Damping above its initial value is reset.
         """
         self.cost = self.problem.cost.copy()
         self.damping = np.minimum(self.damping, self.options.damping)
         self.growth = np.full(len(self.cost), 2.0)
 
     def _retire(self, done: NDArray[np.bool_], stop: NDArray[np.int8]) -> None:
-        """Leave the groups that have stopped alone from now on."""
+        """Record the groups that have stopped, and remove them from the active ones."""
         ended, going = self.active[done], ~done
         self.outcome.iterations[ended], self.outcome.stop[ended] = self.iteration, stop[done]
         self.active, self.cost, self.floor = self.active[going], self.cost[going], self.floor[going]

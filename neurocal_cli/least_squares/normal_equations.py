@@ -6,9 +6,9 @@ import numpy as np
 
 from neurocal_cli.geometry import Array
 
-NOTHING = 1e-300  # keeps an empty diagonal from dividing by 0
-ROUNDING = 1e-14  # a ridge that holds off a singular system and does not show in a regular one
-_ABSENT = 1e-30  # an eigenvalue this far below the diagonal is not there
+NOTHING = 1e-300  # avoids a division by 0 for a zero diagonal
+ROUNDING = 1e-14  # a ridge that regularises a singular system and is negligible in a regular one
+_ABSENT = 1e-30  # an eigenvalue of the scaled matrix below this counts as 0
 
 
 def unit_diagonal(H: Array) -> tuple[Array, Array]:
@@ -25,7 +25,7 @@ def solve_scaled(H: Array, rhs: Array, ridge: float = 0.0) -> Array:
     H : (..., n, n) array
     rhs : (..., n, m) array
     ridge : float
-        Added to the unit diagonal: a little (`ROUNDING`) keeps what nothing determines from being infinite.
+        Added to the unit diagonal; `ROUNDING` keeps undetermined unknowns finite.
     """
     scaled, scale = unit_diagonal(H)
     if ridge:
@@ -33,13 +33,13 @@ def solve_scaled(H: Array, rhs: Array, ridge: float = 0.0) -> Array:
     try:
         return scale[..., :, None] * np.linalg.solve(scaled, scale[..., :, None] * rhs)
     except np.linalg.LinAlgError:
-        if H.ndim > 2:  # one of many: it must not spoil the others
+        if H.ndim > 2:  # solve one by one, so that a singular system does not spoil the others
             return np.stack([solve_scaled(one, right, ridge) for one, right in zip(H, rhs, strict=True)])
         return np.full(rhs.shape, np.nan)
 
 
 def damped_step(H: Array, g: Array, damping: Array) -> tuple[Array, Array]:
-    """Marquardt's step (H + lambda diag H) d = g of each group, and what it promises to gain.
+    """Marquardt's step (H + lambda diag H) d = g of each group, and its predicted gain.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def damped_step(H: Array, g: Array, damping: Array) -> tuple[Array, Array]:
     step : (G, n) array
         nan where the system is singular.
     promised : (G,) array
-        2 g.d - d.H d = d.(g + lambda diag(H) d), by which the sum of squares should fall.
+        Predicted drop of the sum of squares, 2 g.d - d.H d = d.(g + lambda diag(H) d).
     """
     places = range(H.shape[1])
     ridge = damping[:, None] * (np.diagonal(H, axis1=1, axis2=2) + NOTHING)
@@ -64,9 +64,9 @@ def damped_step(H: Array, g: Array, damping: Array) -> tuple[Array, Array]:
 
 
 def inverse_scaled(H: Array, reference: Array) -> tuple[Array, float]:
-    """Inverse of symmetric matrices (..., n, n), and their smallest eigenvalue by `reference`'s diagonal.
+    """Inverse of symmetric matrices (..., n, n), and their smallest eigenvalue in units of the reference.
 
-    The inverse is nan and the eigenvalue 0 where a matrix is singular.
+    The unit is the diagonal of `reference`. The inverse is nan and the eigenvalue 0 if a matrix is singular.
     """
     scale = 1.0 / np.sqrt(np.diagonal(reference, axis1=-2, axis2=-1) + NOTHING)
     outer = scale[..., :, None] * scale[..., None, :]

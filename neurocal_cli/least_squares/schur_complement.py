@@ -1,8 +1,8 @@
-"""Least squares with unknowns that all blocks share and unknowns of each block's own.
+"""Least squares with unknowns shared by all blocks and unknowns of each block's own.
 
-The normal matrix is an arrowhead: the own unknowns of different blocks (the poses of views) meet only
-in the shared ones (the cameras). Eliminating each block's own by its Schur complement leaves a small
-system, and the cost grows linearly with the blocks.
+The normal matrix is an arrowhead: the own unknowns of different blocks (the poses of views) are coupled only
+through the shared ones (the cameras). The Schur complement eliminates each block's own unknowns and leaves a
+small system, so the work grows linearly with the number of blocks.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class SchurCovariance:
     cross : (V, f, p) array
         Between the shared unknowns and each block's own.
     smallest : float
-        Smallest eigenvalue of the eliminated matrices scaled to a unit diagonal, 0 when singular.
+        Smallest eigenvalue of the eliminated matrices scaled to a unit diagonal; 0 if singular.
     """
 
     shared: Array
@@ -55,9 +55,9 @@ def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple
     by_own : (V, p) array
         nan where the system is singular.
     gain : float
-        By how much the step should lower the sum of squares.
+        Predicted drop of the sum of squares.
     """
-    # Own unknowns first, then what is left of the matrix without them.
+    # Eliminate the own unknowns first, then solve the reduced system of the shared ones.
     p, f = len(own), len(shared)
     columns = np.concatenate([own, shared, [N.shape[-1] - 1]])
     M = N[:, columns[:, None], columns]
@@ -80,13 +80,13 @@ def schur_step(N: Array, shared: Columns, own: Columns, damping: float) -> tuple
 
 
 def eliminate(N: Array, kept: Columns, own: Columns, ridge: float = 0.0) -> tuple[Array, Array]:
-    """Take a block's own unknowns out of its normal matrix: what is left when they follow the others.
+    """Eliminate a block's own unknowns from its normal matrix (Schur complement).
 
     Parameters
     ----------
     N : (..., D, D) array
     kept : (k,) int array
-        Columns that stay; with the residual's column the right side and the sum of squares stay as well.
+        Columns that stay; include the residual's column to keep the right side and the sum of squares.
     own : (p,) int array
     ridge : float
         As for `solve_scaled`.
@@ -96,7 +96,7 @@ def eliminate(N: Array, kept: Columns, own: Columns, ridge: float = 0.0) -> tupl
     reduced : (..., k, k) array
         N_kk - N_ko N_oo^-1 N_ok.
     solved : (..., p, k) array
-        N_oo^-1 N_ok: how the own unknowns follow the others, and for the residual their own step.
+        N_oo^-1 N_ok: the response of the own unknowns to the others; in the residual's column, their step.
     """
     cross = N[..., own[:, None], kept]
     solved = solve_scaled(N[..., own[:, None], own], cross, ridge)

@@ -1,1 +1,1 @@
-"""From a problem to a calibration: the fit with its distortion model, without outliers, and the result."""
+"""From a problem to a calibration: model selection, outlier rejection, the target's shape, the result."""

@@ -1,4 +1,4 @@
-"""The target that several cameras saw, of a rig or of a zoom lens's settings, found with all of them."""
+"""The target shared by the cameras of a rig or the settings of a zoom lens, estimated from all views."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from neurocal_cli.target_shape.surveyed import find_surveyed
 
 
 def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
-    """Find the target from all views of several cameras.
+    """Estimate the target's shape from the views of all cameras.
 
     Parameters
     ----------
     cameras : sequence of Calibration
-        Of one world unit. Where one holds a target already, all hold the same, and the search begins there.
+        All in the same world unit. Either none holds a target, or all hold the same one, which is then the
+        starting point.
     choice : {"auto", "given", "flat", "free"}
 
     Returns
     -------
     Target or None
-        None where it stays as given.
+        None if the target stays as given.
     """
     if choice != "given" and any(
         camera.target is not None and camera.target.stated is not None for camera in cameras
@@ -55,12 +56,12 @@ def common_target(cameras: Sequence[Calibration], choice: str) -> Target | None:
 
 
 def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:
-    """Whether the views of several cameras may tell of their target; see `common_target`."""
+    """Whether these cameras have the views and the freedom to estimate their target; see `common_target`."""
     fixed = any(camera.straight_lines is not None or camera.method != "neuro" for camera in cameras)
     if choice == "given" or fixed:
         return False
     if choice == "auto" and any(camera.type != 1 for camera in cameras):
-        return False  # what is given may be wrong, and a target would take the blame
+        return False  # a wrong given parameter would be absorbed by the target's shape
     known = cameras[0].target
     given, label, point = distinct_points([camera.points for camera in cameras])
     plane = planes_of(given, point) if known is None else known.plane
@@ -68,7 +69,7 @@ def can_tell(cameras: Sequence[Calibration], choice: str) -> bool:
 
 
 def _surveyed(cameras: Sequence[Calibration]) -> Target | None:
-    """Surveyed points, found with all cameras; each may have found them by itself."""
+    """Surveyed points, adjusted with all cameras, starting again from the survey."""
     stated = [
         camera if camera.target is None else replace(camera, points=camera.target.as_given(camera.points))
         for camera in cameras
@@ -81,10 +82,10 @@ def _surveyed(cameras: Sequence[Calibration]) -> Target | None:
 
 
 def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, Calibration]:
-    """Two cameras that were calibrated apart, with the points of both on one target.
+    """Refer the points of two separately calibrated cameras to one target.
 
-    Each may have found the target by itself. Then the mean of both is that of both. Bends of each view, which
-    a camera alone may have found, are left out.
+    If each camera has estimated the target by itself, the common one is the mean of both estimates. Bends of
+    single views are left out, because only one of the cameras may have estimated them.
     """
     if left.target is right.target and (left.target is None or left.target.bends is None):
         return left, right
@@ -101,7 +102,7 @@ def on_one_target(left: Calibration, right: Calibration) -> tuple[Calibration, C
 
 
 def _fit(calibration: Calibration) -> tuple[Problem, Adjusted]:
-    """A calibration as the problem that it solves, at its minimum."""
+    """The problem that a calibration solves, adjusted to its minimum."""
     camera, given = calibration.camera, calibration.intrinsics
     centre = (given.u0, given.v0) if calibration.type == 2 else None
     problem = problem_for(

@@ -1,4 +1,4 @@
-"""One fit of a problem: from random weights, or again with a few points more or less."""
+"""Fit a problem: from random weights, or again from a known solution with points added or left out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neurocal_cli.bundle_adjustment.reweighting import reweighted
 from neurocal_cli.bundle_adjustment.solution import Solution
 from neurocal_cli.camera.directions import WIDE
 from neurocal_cli.camera.distortion import WITH_PRISM
-from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_told
+from neurocal_cli.distortion.denominator import DENOMINATOR, with_denominator_if_supported
 from neurocal_cli.distortion.given_distortion import check_distortion
 from neurocal_cli.distortion.multi_start import with_more_starts
 from neurocal_cli.errors import DegenerateGeometryError
@@ -25,22 +25,23 @@ from neurocal_cli.initialisation.neuro import solve
 from neurocal_cli.initialisation.options import Options
 from neurocal_cli.points import Correspondences
 
-# Joins the pinhole's networks where a radial model leads to nothing, as with a centre of distortion far off.
+# Model of a second start, for when the radial start fails, for example because the distortion centre is far
+# from the image centre.
 # Repeated by tests/test_multi_start.py (slow: 200 lenses of each of five models, no local minimum).
 _FIRST_MODEL = "k1k2"
 _TILT_ROUNDS, _TILT_STEPS = 2, 60
-# Starts that lead to a pole of the distortion, or into the camera's plane, are told so by what they cost.
+# Starts that run into a pole of the distortion or into the camera's plane get an infinite cost and lose.
 _quietly = np.errstate(over="ignore", invalid="ignore", divide="ignore")
 
 
 @_quietly
 def fit(problem: Problem, options: Options) -> Solution:
-    """Fit a camera from random weights, with its distortion model.
+    """Fit a camera and its distortion model from random weights.
 
     Raises
     ------
     DegenerateGeometryError
-        The points cannot give an answer, with the reason.
+        The points do not determine the camera; the message says why.
     """
     if options.distortion == "plumb-line":
         return _plumb_line_first(problem, options)
@@ -51,7 +52,7 @@ def fit(problem: Problem, options: Options) -> Solution:
     if options.distortion == "auto":
         return _finished(first, options)
     solution = with_more_starts(first, lambda some: _distorted_starts(some, options))
-    # The poses of several views that share a camera have been turned where that is better.
+    # For several views that share a camera, the first solution has tried the mirrored poses already.
     if solution is not first or problem.type == 3 or problem.views.n_views == 1:
         solution = _turned(solution)
     return _finished(solution, options)
@@ -61,7 +62,7 @@ def fit(problem: Problem, options: Options) -> Solution:
 def fit_again(
     solution: Solution, points: Correspondences, options: Options, *, only_from_here: bool = False
 ) -> Solution:
-    """Adjust a solution to other points of the same views, or of some of them.
+    """Fit other points of the same views (or of some of them), starting from a solution.
 
     Parameters
     ----------
@@ -69,7 +70,7 @@ def fit_again(
     points : Correspondences
     options : Options
     only_from_here : bool
-        Whether no other start is tried, because the solution is near the answer.
+        Whether to try no other starts, because the solution is already near the minimum.
     """
     if options.distortion == "plumb-line":
         return _plumb_line_first(solution.problem.with_points(points), options)
@@ -80,7 +81,7 @@ def fit_again(
 
 
 def _finished(solution: Solution, options: Options, only_from_here: bool = False) -> Solution:
-    """With its distortion model, and weights that the residuals bear out."""
+    """Select the distortion model, and reweight the points as far as the residuals support that."""
     chosen = options.distortion == "auto"
     if chosen and only_from_here:
         from neurocal_cli.distortion.model_selection import select_model
@@ -89,7 +90,7 @@ def _finished(solution: Solution, options: Options, only_from_here: bool = False
     elif chosen:
         solution = _with_selected_model(solution, options)
     solution = reweighted(solution)
-    if not chosen or solution.problem.points.covariance is not None:  # weighed anew, it may have moved
+    if not chosen or solution.problem.points.covariance is not None:  # reweighting may have moved it
         solution = check_distortion(solution)
     return solution
 
@@ -109,17 +110,17 @@ def _with_selected_model(solution: Solution, options: Options) -> Solution:
 
 
 def _first_solution(problem: Problem, options: Options) -> Solution:
-    """A pinhole, or where points seem mirrored to it, as through a strong distortion, a camera with one.
+    """Fit a pinhole; if strong distortion makes the points look mirrored to it, a camera with distortion.
 
-    Where a distortion is no remedy, the pinhole's reason stands. Wide lenses begin as fisheyes, whose
-    coefficients are linear, and lenses with a prism or a tilt without these.
+    If distortion does not help either, the pinhole's error is raised. Wide lenses start from a fisheye, whose
+    coefficients enter linearly; thin-prism and tilted models start without the prism or tilt.
     """
     model = problem.distortion.model
     if problem.free_distortion and model in WIDE and model != "fisheye":
         return _from_simpler(problem, _first_solution(problem.with_model("fisheye"), options))
     if problem.free_distortion and model in WITH_PRISM:
         plain = _first_solution(problem.with_model("plumb_bob"), options)
-        return with_denominator_if_told(
+        return with_denominator_if_supported(
             _from_simpler(replace(problem, fixed=problem.fixed | DENOMINATOR), plain)
         )
     try:
@@ -132,7 +133,7 @@ def _first_solution(problem: Problem, options: Options) -> Solution:
 
 
 def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
-    """The best that the most similar lenses of the wanted model lead to."""
+    """Adjust the wanted model from its lenses that are most similar to a simpler one; the best result."""
     from neurocal_cli.distortion.similar_lens import similar_states, tilted_states
     from neurocal_cli.distortion.xi_profile import with_xi_held_if_flat
 
@@ -141,8 +142,8 @@ def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
     found = [problem.adjust(replace(simpler.adjusted, state=start)) for start in starts]
     if not found:
         raise DegenerateGeometryError(
-            f"no lens of the model {problem.distortion.model} is similar to what the points show; choose "
-            "another --distortion"
+            f"no lens of the distortion model {problem.distortion.model} fits these points; choose another "
+            "--distortion"
         )
     if problem.distortion.model == "tilted" and problem.free_poses and problem.free[3:].all():
         for _ in range(_TILT_ROUNDS):
@@ -156,7 +157,7 @@ def _from_simpler(problem: Problem, simpler: Solution) -> Solution:
 
 
 def _distorted_starts(problem: Problem, options: Options) -> Iterator[CameraState]:
-    """Other cameras to begin with, that have a distortion from the beginning."""
+    """Further starting cameras, which include distortion from the beginning."""
     from neurocal_cli.distortion.candidate_models import supported
     from neurocal_cli.initialisation.radial_networks import radial_start
 
@@ -170,7 +171,7 @@ def _distorted_starts(problem: Problem, options: Options) -> Iterator[CameraStat
 
 
 def _through_distortion(problem: Problem, options: Options) -> Solution | None:
-    """With the distortion from the beginning; None where none is to be estimated, or that fails too."""
+    """Fit with distortion from the beginning; None if none is to be estimated, or if that fails too."""
     wanted = problem.distortion.model
     if problem.type == 3 or (options.distortion != "auto" and not problem.free_distortion):
         return None
@@ -185,15 +186,15 @@ def _through_distortion(problem: Problem, options: Options) -> Solution | None:
 
 
 def _displaced(solution: Solution) -> Solution:
-    """A rich lens's displacement, which other models are spared."""
+    """Add the displacement of a rich lens. The import is local because other models do not need it."""
     from neurocal_cli.distortion.rich_fit import with_displacement
 
     return with_displacement(solution)
 
 
 def _plumb_line_first(problem: Problem, options: Options) -> Solution:
-    """The distortion from straight lines, then the pinhole camera, then both together."""
-    # A hundredth of a second that other models are spared.
+    """Estimate the distortion from straight lines, then the pinhole camera, then both together."""
+    # Imported here: it takes 0.01 s, which other models need not spend.
     from neurocal_cli.distortion.plumb_line import fit_plumb_line
     from neurocal_cli.distortion.plumb_line_camera import distortion_and_camera
 
@@ -207,7 +208,7 @@ def _plumb_line_first(problem: Problem, options: Options) -> Solution:
 
 
 def _turned(solution: Solution) -> Solution:
-    """With the other one of a flat board's two poses wherever that is better with the distortion."""
+    """Use the mirrored pose of a flat board in each view where it fits better with the distortion."""
     if solution.state.model == "none":
         return solution
     turned = try_mirrored(solution.problem, solution.adjusted)

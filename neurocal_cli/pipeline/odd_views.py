@@ -1,8 +1,8 @@
-"""Why a view of a flat target contradicts the camera of the others: the first explanation that fits it.
+"""Diagnose why a view of a flat target contradicts the camera of the other views.
 
-Each explanation changes the view's pixels, its world points or its camera. The pose that is then best is
-found as in a problem of type 3 and adjusted; an explanation holds when its error is that of the other
-views. What none explains keeps the reason that it was left out for.
+Each hypothesis changes the view's pixels, its world points or its camera. The view's pose is then estimated
+as in a problem of type 3 and adjusted. The first hypothesis whose rms error matches that of the other views
+is the explanation. If none does, the view keeps the reason for which it was left out.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from neurocal_cli.points import Correspondences
 _HOLDS = 2.0  # times the rms error of the other views
 _STEPS = 40
 _STARTS = 20
-_ALIKE = 0.01  # relative difference of the focal lengths along u and v that one zoom has
-_BLURRED = 0.08  # of the spread of a view's pixels: errors of measuring, not of pairing
-_CHANGED = 0.005  # relative
-_FOCAL, _CENTRE = (0, 2), (3, 4)  # of A's entries
+_ALIKE = 0.01  # largest relative difference between the scale changes along u and v that a zoom makes
+_BLURRED = 0.08  # of the pixels' spread: up to this rms error points are badly measured, not mixed up
+_CHANGED = 0.005  # smallest relative change of the focal length that counts as a zoom
+_FOCAL, _CENTRE = (0, 2), (3, 4)  # places among A's entries
 
 
 def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: str) -> str:
-    """Explain one view.
+    """Explain why one view contradicts the others.
 
     Parameters
     ----------
     points : Correspondences
-        Of this view alone.
+        The points of this view alone.
     camera : Camera
-        Of the other views.
+        The camera calibrated from the other views.
     rmse_px : float [px]
-        Of the other views.
+        Rms error of the other views.
     otherwise : str
-        The reason that is known already.
+        The reason to return if no hypothesis fits.
 
     Returns
     -------
@@ -69,30 +69,30 @@ def why_odd(points: Correspondences, camera: Camera, rmse_px: float, otherwise: 
     if zoomed is not None and zoomed.rmse < limit:
         scale = zoomed.entries[[0, 2]] / np.array(camera.entries)[[0, 2]]
         if abs(scale[0] / scale[1] - 1) < _ALIKE and abs(scale[0] - 1) > _CHANGED:
-            return f"it asks for another zoom or focus: a focal length of {zoomed.entries[0]:.5g} px"
+            return f"it fits another zoom or focus: a focal length of {zoomed.entries[0]:.5g} px"
     moved = _fit(points, start, _CENTRE)
     if moved is not None and moved.rmse < limit:
         u0, v0 = moved.entries[[3, 4]]
-        return f"it asks for another camera or crop: the centre ({u0:.0f}, {v0:.0f})"
+        return f"it fits another camera or crop: the image centre ({u0:.0f}, {v0:.0f})"
     free = _fit(points, start, (*_FOCAL, *_CENTRE))
     spread = float(np.sqrt(points.pixels.var(axis=0).sum()))
     if free is None or free.rmse > _BLURRED * spread:
         return otherwise
     if plain.rmse < _HOLDS * free.rmse:
         return (
-            f"its points err by {plain.rmse:.2g} px, {plain.rmse / rmse_px:.2g} times as much as the others: "
+            f"its rms error is {plain.rmse:.2g} px, {plain.rmse / rmse_px:.2g} times that of the others: "
             "blurred, or bent"
         )
     return "its points do not lie as in the other views: another target, a bent one, or another lens"
 
 
 def may_be_bent(reason: str) -> bool:
-    """Whether a reason of `why_odd` leaves it open that all views show a target of another shape."""
+    """Whether a reason of `why_odd` may have the target's shape as its cause."""
     return "bent" in reason
 
 
 def _other_points(points: Correspondences) -> Iterator[tuple[str, Correspondences]]:
-    """What may have been done to a view's rows, and the rows as they were before."""
+    """Hypotheses about errors in a view's rows, each with the rows corrected for it."""
     pixels, world = points.pixels, points.world
     yield "its u and v are exchanged", replace(points, pixels=pixels[:, ::-1])
     for scale, name in ((2.0, "half"), (0.5, "twice")):
@@ -114,7 +114,7 @@ class _Fit:
 
 
 def _pose(points: Correspondences, camera: Camera) -> CameraState | None:
-    """The camera and the pose of a view [px]; None where the points tell no pose."""
+    """The camera, and the view's pose estimated with it [px]; None if the pose cannot be estimated."""
     try:
         problem = problem_for(points, 3, intrinsics=camera.intrinsics, distortion=camera.distortion)
         groups, _ = train_networks(
@@ -127,7 +127,7 @@ def _pose(points: Correspondences, camera: Camera) -> CameraState | None:
 
 
 def _fit(points: Correspondences, start: CameraState | None, free: tuple[int, ...] = ()) -> _Fit | None:
-    """A view's pose, and what is free of its camera; None where there is none."""
+    """Adjust a view's pose and the free entries of its camera; None without a start or if that fails."""
     if start is None:
         return None
     views = arrange(points)

@@ -1,15 +1,14 @@
-"""Outliers, points and whole views: found, left out and named, so that they change nothing.
+"""Outlier rejection: find outlying points and whole views, leave them out, and report them.
 
-Points that fit their camera as normal noise would are left alone, to the last bit: a calibration of
-good data is the same with and without this. Otherwise
+If all residuals look like normal noise, nothing is left out: good data give the same calibration to the last
+bit with and without this module. Otherwise
 
-1. each view's network is trained again so that wrong points do not draw it away (`consensus`); what
-   is far from it is set aside, and views whose points agree on nothing;
-2. the rest is calibrated, and views that their own network explains but the common camera does not
-   are set aside (`outlier_views`);
-3. every point is judged by the camera; the ones beyond what the largest of so many normal errors
-   would be are set aside and the others, also those set aside before, calibrated together, until
-   nothing changes.
+1. each view's network is trained again robustly (`consensus`); points far from it are left out, and so are
+   views whose points do not agree on any network;
+2. the rest is calibrated, and views that fit a network of their own but not the common camera are left out
+   (`outlier_views`);
+3. the camera judges every point, including those left out before. Points whose error exceeds the largest
+   expected of so many normal errors are left out, and the rest is calibrated again, until nothing changes.
 """
 
 from __future__ import annotations
@@ -45,26 +44,26 @@ from neurocal_cli.points import Correspondences
 # with one wrong view; clean data are the same to the last bit with and without) and
 # tests/test_wrong_inputs.py.
 _CHANCE = 0.01  # of calling any point of a good data set wrong
-_FLOOR = 1e-7  # of the image's spread: rounding, not noise
-_ROUGH = 0.005  # an rms error of this share of the image's spread may hide anything
-_WORST_VIEW = 3.0  # standard deviations of a view, in those of all: more does not excuse its points
-_ENOUGH = 12  # points of a view that tell its standard deviation
+_FLOOR = 1e-7  # of the pixels' spread: errors below this are rounding, not noise
+_ROUGH = 0.005  # of the pixels' spread: an rms error this large may hide any outlier
+_WORST_VIEW = 3.0  # cap on a view's own noise level, in units of the noise level of all views
+_ENOUGH = 12  # fewest points of a view from which its noise level is estimated
 _PASSES = 12
-NO_WORSE = 1.05  # times the rms error with a view that is taken back
+NO_WORSE = 1.05  # factor by which taking a view back may raise the rms error
 _MAJORITY = 0.5  # share of the points that must be left
-_ORDINARY = 6.0  # times the median error: the points that tell whether stated sigmas hold
-_LOOKS = 2  # through a wide lens: the first may still be drawn away by wrong points
-_BACKWARDS = (0.0, 0.0, -1.0)  # the ray of a pixel at which the lens shows nothing
+_ORDINARY = 6.0  # times the median error: only points below test whether the stated sigmas hold
+_LOOKS = 2  # consensus passes through a wide lens: outliers may still bias the first
+_BACKWARDS = (0.0, 0.0, -1.0)  # stands for the ray of a pixel that the lens cannot have produced
 _LENGTH, _ONE = 1.1774, 0.6745  # median length of two normal errors, and of one
 
 
 def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected]:
-    """Fit a camera, with outliers left out.
+    """Fit a camera, leaving outliers out.
 
     Raises
     ------
     DegenerateGeometryError
-        Points that cannot give an answer, with the reason; more than half of them contradict the rest.
+        The points do not determine the camera (the message says why), or at least half of them are outliers.
     """
     failure: DegenerateGeometryError | None = None
     first: Solution | None = None
@@ -84,15 +83,16 @@ def fit_robustly(problem: Problem, options: Options) -> tuple[Solution, Rejected
 def judged_again(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options
 ) -> tuple[Solution, Rejected]:
-    """All points judged by another lens, which was fitted to those that an earlier one had kept.
+    """Judge all points again by a lens that was fitted to the points an earlier lens had kept.
 
     Parameters
     ----------
     problem : Problem
         With all points.
     solution : Solution
+        With the new lens.
     rejected : Rejected
-        Points that the earlier lens did not explain, and no views.
+        Points that the earlier lens rejected; no whole views.
     options : Options
     """
     search = _Search(problem, options)
@@ -104,7 +104,7 @@ def judged_again(
 
 
 def _among(points: Correspondences, some: Correspondences) -> NDArray[np.bool_]:
-    """(N,) which points are the same measurements as some others."""
+    """(N,) which of the points are the same measurements as those in `some`."""
 
     def keys(of: Correspondences) -> list[tuple[str, float, float]]:
         names = [of.view_names[v] for v in of.view_index]
@@ -115,7 +115,7 @@ def _among(points: Correspondences, some: Correspondences) -> NDArray[np.bool_]:
 
 
 class _Search:
-    """What is kept so far, and the solution for it."""
+    """State of the outlier rejection: which points are kept, and the solution fitted to them."""
 
     solution: Solution
 
@@ -128,9 +128,10 @@ class _Search:
         return fit(self.problem.with_points(self.points.select(kept)), options)
 
     def agree(self, first: Solution | None, failure: DegenerateGeometryError | None) -> None:
-        """Points that each view's network agrees on.
+        """Keep the points that agree with a robust network of their view, and fit the camera to them.
 
-        A wide lens bends boards by more than wrong points do: once it is known, points are looked at again.
+        A wide lens displaces points by more than outliers do. So once the lens is known, the consensus is
+        repeated on rays.
         """
         views = arrange(self.points)
         rng = np.random.default_rng(self.options.seed)
@@ -162,7 +163,7 @@ class _Search:
             self.solution, consensus = self._fit(self.kept, self.options), again
 
     def _rays(self, views: Views) -> Array:
-        """Rays of all pixels through the lens as it is known by now, in the order of the views."""
+        """Rays of all pixels through the current lens, in the order of the views."""
         solution = self.solution
         matrix = solution.problem.matrix(solution.state.entries[0])
         rays = Camera(Intrinsics.from_matrix(matrix), solution.state.distortion).unproject(self.points.pixels)
@@ -170,14 +171,14 @@ class _Search:
         return rays if views.order is None else rays[views.order]
 
     def _keep(self, views: Views, consensus: Consensus) -> None:
-        """Begin with what the networks of all views agree on."""
+        """Reset the kept points and the wrong views to a consensus."""
         self.kept[slice(None) if views.order is None else views.order] = consensus.kept
         self.wrong_views = {}
         for view in np.flatnonzero(consensus.hopeless):
             self._drop(views.names[view], "its pixels do not match its points")
 
     def _may_be_wide(self) -> bool:
-        """Whether the lens may be one that bends whole boards."""
+        """Whether the lens may be a wide one."""
         return self.options.distortion == "auto" or self.problem.distortion.wide
 
     def _drop(self, name: str, reason: str) -> None:
@@ -202,15 +203,15 @@ class _Search:
         )
 
     def without_outlier_views(self) -> None:
-        """Set aside views that are of another camera, or of another target than their points say.
+        """Leave out views of another camera, or of another target than their points say.
 
-        A distortion model that is chosen with the wrong views among the others hides them, so that a pinhole
-        looks for them first, unless the lens is a wide one.
+        A distortion model that is selected with the outlier views included can absorb and so hide them.
+        Therefore a pinhole looks for them first, unless the lens is wide.
         """
         if self.options.distortion == "auto" and not self.solution.state.distortion.wide:
             pinhole = replace(self.options, distortion="")
             before = len(self.wrong_views)
-            # The distortion may be so strong that there is no pinhole: then nothing is learnt from it.
+            # Under very strong distortion no pinhole can be fitted; this step is skipped then.
             with suppress(DegenerateGeometryError):
                 self._drop_outlier_views(pinhole, self._fit(self.kept, pinhole))
             if len(self.wrong_views) > before:
@@ -219,7 +220,7 @@ class _Search:
         self.solution = self._drop_outlier_views(self.options, self.solution)
 
     def _readmit(self, names: list[str]) -> None:
-        """Take back views that only a pinhole could not explain."""
+        """Take back views that fit the camera once it has a distortion model."""
         for name in names:
             kept = self.kept | (self.points.view_index == self.points.view_names.index(name))
             with suppress(DegenerateGeometryError):
@@ -229,7 +230,7 @@ class _Search:
                     del self.wrong_views[name]
 
     def _drop_outlier_views(self, options: Options, solution: Solution) -> Solution:
-        """Leave outlier views out one by one; the fit without them."""
+        """Leave outlier views out one by one; return the fit without them."""
         most = (self.points.n_views - 1) // 3
         while len(self.wrong_views) < most:
             outlier = find_outlier_view(solution)
@@ -240,7 +241,7 @@ class _Search:
         return solution
 
     def judge_all_points(self) -> None:
-        """Keep what the camera explains, of all points of the views that are kept."""
+        """Classify all points of the kept views by the camera and fit again, until nothing changes."""
         known = {tuple(np.packbits(self.kept))}
         for _ in range(_PASSES):
             kept = self._explained()
@@ -250,7 +251,7 @@ class _Search:
             self._enough()
             state = tuple(np.packbits(kept))
             self.solution = fit_again(self.solution, self.points.select(kept), self.options)
-            if state in known:  # a point on the border that comes and goes
+            if state in known:  # a cycle: a point near the limit is alternately kept and rejected
                 return
             known.add(state)
 
@@ -264,7 +265,7 @@ class _Search:
         return np.asarray(near & (share > _MAJORITY)[index])
 
     def rejected(self) -> Rejected:
-        """What was set aside."""
+        """The points and views that were left out."""
         error = _errors(self.solution, self.points).length
         rows = np.flatnonzero(~self.kept)
         self._explain()
@@ -274,7 +275,7 @@ class _Search:
         return Rejected(self.points.select(rows), known, dict(self.wrong_views))
 
     def _explain(self) -> None:
-        """Name what is wrong with each view that was left out, as far as its points tell."""
+        """Diagnose each view that was left out."""
         if not self.wrong_views:
             return
         matrix = self.solution.problem.matrix(self.solution.state.entries[0])
@@ -288,23 +289,21 @@ class _Search:
 
 @frozen_dataclass(eq=False)
 class _Errors:
-    """Errors of all points [px], weighted; infinite where the fit does not see the point.
-
-    It sees none behind the camera, and none of views that it leaves out.
+    """Weighted errors of all points [px]; infinite for points behind the camera or in views left out.
 
     Attributes
     ----------
     length : (N,) array
     parts : (N, 2) array
-        Two independent errors of a common standard deviation each. Of points that were measured across
-        an edge, the errors across and along it: the latter may be far smaller, but not larger.
+        Two independent errors of each point with the same standard deviation. For points measured across an
+        edge these are the errors across and along it; the latter may be far smaller, but not larger.
     """
 
     length: Array
     parts: Array
 
     def sigma(self, rows: NDArray[np.intp]) -> float:
-        """Standard deviation that the median error of some points tells."""
+        """Robust standard deviation of some points, from their median error."""
         return float(median(self.parts[rows]).max()) / _ONE
 
 
@@ -326,9 +325,9 @@ def _errors(solution: Solution, points: Correspondences) -> _Errors:
 
 
 def _borne_out(covariance: Array, residuals: Array) -> float:
-    """Share of the noise that is the same for all points, whatever sigma somebody stated for each.
+    """Share of the noise that is common to all points, estimated also for sigmas chosen by the user.
 
-    A point with too small a sigma is no outlier. Those that are do not count here.
+    A stated sigma that is too small must not make its point an outlier. Real outliers are excluded here.
     """
     length = np.hypot(residuals[:, 0], residuals[:, 1])
     finite = np.isfinite(length)
@@ -339,10 +338,10 @@ def _borne_out(covariance: Array, residuals: Array) -> float:
 
 
 def _eased(residuals: Array, covariance: Array, believed: Array, across: Array | None) -> Array:
-    """Errors along edges smaller by as much as the points are less certain there, at a board's ends.
+    """Scale down errors along edges where the points are less certain in that direction (at a board's ends).
 
-    What is alike for all points of the believed covariance is across the edges; along them the stated one
-    says how stiff the board's map is.
+    The common share of the noise in the believed covariance applies across the edges. Along the edges the
+    stated covariance applies: it comes from the smooth map of the board.
     """
     if across is None:
         return residuals
@@ -356,9 +355,10 @@ def _eased(residuals: Array, covariance: Array, believed: Array, across: Array |
 
 
 def _lengths(residuals: Array, stated: Array | None, across: Array | None) -> Array:
-    """Lengths of residuals (N, 2) [px], whitened where the points have covariances, on average unchanged.
+    """Lengths of residuals (N, 2) [px], whitened where the points have covariances, with the mean scale kept.
 
-    Along an edge the camera may miss a mid-point by as much as across it: what is wrong shows in both.
+    An edge's mid-point is given the same tolerance along the edge as across it: errors of the model show in
+    both directions.
     """
     if stated is None:
         return np.hypot(residuals[:, 0], residuals[:, 1])
@@ -373,7 +373,7 @@ def _lengths(residuals: Array, stated: Array | None, across: Array | None) -> Ar
 
 
 def _parts(length: Array, residuals: Array, across: Array | None) -> Array:
-    """Two independent errors of each point, of the same standard deviation; see `_Errors`."""
+    """Two independent errors of each point with the same standard deviation; see `_Errors`."""
     alike = np.repeat(length[:, None] * (_ONE / _LENGTH), 2, axis=1)
     if across is None:
         return alike
@@ -385,9 +385,9 @@ def _parts(length: Array, residuals: Array, across: Array | None) -> Array:
 
 
 def _limits(errors: _Errors, kept: NDArray[np.bool_], points: Correspondences) -> Array:
-    """(V,) length of error that no point of so many normal ones should exceed.
+    """(V,) largest error expected in each view among so many normally distributed points.
 
-    A view that is blurred has larger errors than others throughout, which is no fault of its points.
+    The noise level is estimated per view, because all errors of a blurred view are larger.
     """
     spread = np.sqrt(points.pixels.var(axis=0).sum())
     rows = np.flatnonzero(kept)
@@ -404,12 +404,12 @@ def _limits(errors: _Errors, kept: NDArray[np.bool_], points: Correspondences) -
 
 
 def rms(solution: Solution) -> float:
-    """Error [px], weighted."""
+    """Weighted rms error [px]."""
     return float(np.sqrt((_errors(solution, solution.problem.points).length ** 2).mean()))
 
 
 def _suspicious(solution: Solution) -> bool:
-    """Whether anything in a fit is not as normal noise would have it."""
+    """Whether anything in a fit is inconsistent with normal noise."""
     if solution.refusal:
         return True
     points = solution.problem.points

@@ -29,20 +29,20 @@ from neurocal_cli.target_shape.camera_covariance import CameraCovariance, Camera
 if TYPE_CHECKING:
     from neurocal_cli.bundle_adjustment.ambiguity import Ambiguity
 
-_XI = 5  # place of xi behind A's entries
-_TOLD = 0.1  # range of xi that is worth a warning
-_NAMED = 5  # wrong points that the warning names
+_XI = 5  # index of xi, after A's five entries
+_TOLD = 0.1  # width of the range of xi from which on a warning is given
+_NAMED = 5  # number of outliers that the warning names
 
 
 def calibration_of(
     solution: Solution, rejected: Rejected, *, method: str, trainer: str, seed: int, name: str
 ) -> Calibration:
-    """Put a solution into the user's units.
+    """Convert a solution to pixels and world units, with standard deviations and warnings.
 
     Raises
     ------
     DegenerateGeometryError
-        The points leave the answer open.
+        The points do not determine the camera.
     """
     problem, adjusted, record = solution.problem, solution.adjusted, solution.record
     views, state = problem.views, adjusted.state
@@ -114,7 +114,7 @@ def calibration_of(
 def _entries(problem: Problem, known: CameraCovariance, ambiguity: Ambiguity | None) -> Array:
     """(5 + K, 5 + K) covariance of A's entries and the distortion coefficients, normalised; 0 if given.
 
-    With what other cameras that explain the points as well add to it.
+    It includes the spread of other cameras that explain the points equally well (`ambiguity`).
     """
     free = problem.free_camera
     entries = np.zeros((len(free), len(free)))
@@ -128,7 +128,7 @@ def _entries(problem: Problem, known: CameraCovariance, ambiguity: Ambiguity | N
 
 
 def _view_results(solution: Solution, cov: Covariance, squared: Array) -> dict[str, ViewResult]:
-    """Poses in world units with their std, and the reprojection error of each view, unweighted."""
+    """Poses in world units with their standard deviations, and each view's unweighted reprojection error."""
     problem, state = solution.problem, solution.state
     views, R = problem.views, state.R
     centre = (R @ views.centre[..., None])[..., 0]
@@ -171,20 +171,20 @@ def _network_record(solution: Solution, rmse: float) -> NetworkRecord:
 
 
 def _xi_warning(ambiguity: Ambiguity | None, model: str) -> tuple[str, ...]:
-    """Many values of xi explain the points, each with its own alpha."""
+    """Warn if a wide range of xi explains the points equally well, each value with its own alpha."""
     if ambiguity is None or np.diff(ambiguity.range)[0] < _TOLD:
         return ()
     first, last = ambiguity.range
     with_it = "alpha_u, alpha_v and alpha" if model == "double_sphere" else "alpha_u, alpha_v, k1 and k2"
     return (
-        f"the points hardly tell xi, nor what goes with it ({with_it}): values of xi from {first:.2f} to "
-        f"{last:.2f} explain them as well; what is projected is nearly the same for all, and its std is "
-        "that of the verdict",
+        f"xi and the parameters correlated with it ({with_it}) are poorly determined: values of xi from "
+        f"{first:.2f} to {last:.2f} fit equally well; the projection is nearly the same for all of them, and "
+        "the verdict gives its std",
     )
 
 
 def _corner_warning(problem: Problem) -> tuple[str, ...]:
-    """Where no point is, a distortion is anyone's guess."""
+    """Warn if the distortion had to be kept monotonic in corners of the image without points."""
     if problem.restraint is None or problem.distortion.model == "rich":
         return ()
     return (
@@ -195,7 +195,7 @@ def _corner_warning(problem: Problem) -> tuple[str, ...]:
 
 
 def _repeated_warning(repeated: RepeatedPoses) -> tuple[str, ...]:
-    """Many views of few poses know less than they seem to."""
+    """Warn if views repeat a pose."""
     if repeated.none:
         return ()
     return (
@@ -205,7 +205,7 @@ def _repeated_warning(repeated: RepeatedPoses) -> tuple[str, ...]:
 
 
 def _mirrored_warning(views: list[str]) -> tuple[str, ...]:
-    """A flat target that is mirrored gives the right camera, but a wrong pose."""
+    """Warn of views in which a flat target is mirrored: the camera is right, but these poses are wrong."""
     if not views:
         return ()
     names = ", ".join(map(repr, views[:_NAMED])) + (
@@ -218,7 +218,7 @@ def _mirrored_warning(views: list[str]) -> tuple[str, ...]:
 
 
 def _rejection_warnings(rejected: Rejected, kept: int) -> tuple[str, ...]:
-    """Name wrong views, and the first of the wrong points by their line and id."""
+    """Name the views left out with their reasons, and the first outliers by line and id."""
     lines = [f"view {name!r} is left out: {reason}" for name, reason in rejected.views.items()]
     points = rejected.points
     if points is None:

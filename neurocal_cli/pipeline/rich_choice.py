@@ -1,9 +1,10 @@
-"""``auto`` takes a rich lens where no other lens, and no target, leaves noise.
+"""``--distortion auto``: choose the rich lens if no other lens and no target shape leaves only noise.
 
-A bent board, wrong points and a second camera bend residuals, too. So the rich lens comes last: for the
-target as it is given, against the best other lens with the target that was found. Both predict the same views
-left out, the rich lens with its prior in place. It is taken where it predicts decidedly better and leaves
-noise. What follows the board, or single views, is no lens: it is different in views left out.
+A bent board, outliers and a second camera leave systematic residuals as well. So the rich lens is tried last:
+it is fitted to the target as given and compared with the best other lens on the estimated target. Both
+predict the same held-out views, the rich lens with its prior. It is chosen if it predicts decidedly better
+and its residuals are noise. Errors that belong to the board or to single views do not pass this test, because
+they differ in the held-out views.
 """
 
 from __future__ import annotations
@@ -28,35 +29,36 @@ from neurocal_cli.initialisation.options import Options
 from neurocal_cli.pipeline.outlier_rejection import judged_again
 from neurocal_cli.verdict.view_groups import view_groups
 
-# Repeated by tests/test_rich_lens.py (slow): on views left out such lenses are better by 1.28 and more, with
-# residuals correlated by -0.05 and less; bent boards and two cameras by 1.0 at most; photographs of a board
-# that is not flat by up to 1.19, with residuals correlated by 0.5.
-_FEWEST = 20  # different views
-_BETTER = 1.1  # times the rms error on views left out
-_PROMISED = 1.05  # likewise, before it is adjusted: it is within a percent
-# Correlation of neighbours' residuals. Ordinary lenses leave 0.04 and less, a narrow bump 0.09.
+# Repeated by tests/test_rich_lens.py (slow). The rms error on held-out views drops by a factor of 1.28 or
+# more for such lenses (residual correlation -0.05 or less), of at most 1.0 for bent boards and two cameras,
+# and of up to 1.19 for photographs of a board that is not flat (residual correlation 0.5).
+_FEWEST = 20  # fewest different poses
+_BETTER = 1.1  # least factor by which the rms error on held-out views must drop
+_PROMISED = 1.05  # the same for its prediction before the adjustment, which is right to a percent
+# Correlation of neighbouring residuals: from _ALIKE on the rich lens is tried, and up to _NOISE its own
+# residuals count as noise. Ordinary lenses leave 0.04 or less, a narrow bump 0.09.
 _ALIKE, _NOISE = 0.05, 0.15
 
 
 def with_rich_lens(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
 ) -> tuple[Solution, Rejected]:
-    """Take a rich lens if it predicts decidedly better.
+    """Choose a rich lens if it predicts decidedly better.
 
     Parameters
     ----------
     problem : Problem
-        With all points, where their file has them.
+        With all points, at the world coordinates of their file.
     solution, rejected
-        The best of the other lenses, with the target where it was found.
+        The best other lens, with the target if it was estimated.
     options : Options
     choice : {"auto", "given", "flat", "free"}
-        How the target is found. Unless it is looked for, nobody knows whether it is bent.
+        How the target is estimated. Only with "auto" is it known that a bent target is not the cause.
 
     Returns
     -------
     solution, rejected
-        The ones given where the lens stays as it is.
+        Unchanged if the rich lens is not chosen.
     """
     looked_for = choice == "auto" and options.distortion == "auto" and problem.points.world_std is None
     if not looked_for or solution.refusal or rejected.views or not solution.problem.free_poses:
@@ -78,7 +80,7 @@ def with_rich_lens(
 
 
 def _rich(solution: Solution, repeated: RepeatedPoses) -> Solution | None:
-    """A rich lens for the target as it is given; None where it cannot be found, or promises too little."""
+    """Fit a rich lens on the given target; None if that fails or the predicted gain is too small."""
     problem, target = solution.problem, solution.target
     points = problem.points if target is None else target.as_given(problem.points)
     problem = problem.with_points(points)
@@ -108,7 +110,7 @@ def _held_out_rms(solution: Solution, repeated: RepeatedPoses) -> float:
 
 
 def _lost(solution: Solution, repeated: RepeatedPoses) -> Array:
-    """Squared error of each view when it is left out."""
+    """(V,) squared error of each view when it is left out."""
     problem, state, free = solution.problem, solution.state, solution.problem.free_camera
     held = None if problem.restraint is None else normal_part(problem.restraint, state, free)
     return held_out_views(solution.adjusted.normal, free, True, held, repeated)

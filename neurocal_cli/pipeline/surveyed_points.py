@@ -1,7 +1,7 @@
-"""A camera from surveyed points, whose standard deviations are stated.
+"""Calibrate a camera from surveyed points with stated standard deviations.
 
-At first every point is weighed, and judged, by the noise that its pixels have together with its place in
-space. Then the places are found with the camera, because all views of a point share its error.
+First, each point is weighted and tested for outliers with the sum of its pixel noise and its projected survey
+error. Then camera and points are adjusted together, because all views of a point share its survey error.
 """
 
 from __future__ import annotations
@@ -28,32 +28,32 @@ from neurocal_cli.target_shape.surveyed import find_surveyed
 
 _MEDIAN = 1.3863  # of chi-squared of two degrees of freedom
 _HALVINGS = 30
-_LEAST_NOISE = 1e-3  # of the residuals' level
+_LEAST_NOISE = 1e-3  # least pixel noise, as a share of the residuals' level
 
 
 def with_survey(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options
 ) -> tuple[Solution, Rejected]:
-    """Find camera and points together.
+    """Adjust camera and points together.
 
     Parameters
     ----------
     problem : Problem
-        With all points, where their survey has them.
+        With all points, at their surveyed coordinates.
     solution, rejected
-        As if they were exactly there.
+        Calibrated as if the survey were exact.
     options : Options
 
     Raises
     ------
     DegenerateGeometryError
-        Points that cannot give an answer, with the reason.
+        The points do not determine the camera; the message says why.
     InputError
-        A point with two standard deviations.
+        A point has two different standard deviations.
     """
     again, outliers = _judged(problem, solution, rejected, options, 1.0)
     factor = 1.0 if again.target is None else again.target.sizes["stated"]
-    if factor > 1.0 and len(outliers):  # a survey that is worse than it says has fewer outliers
+    if factor > 1.0 and len(outliers):  # the survey is worse than stated, so fewer points are outliers
         again, outliers = _judged(problem, again, outliers, options, factor)
     return again, outliers
 
@@ -61,7 +61,7 @@ def with_survey(
 def _judged(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options, factor: float
 ) -> tuple[Solution, Rejected]:
-    """Find camera and points, with outliers judged by so many times the stated standard deviations."""
+    """Adjust camera and points; outliers are judged by `factor` times the stated standard deviations."""
     points = problem.points
     covariance = _with_places(solution, points, factor)
     judged = replace(points, covariance=covariance, lines=np.arange(len(points)))
@@ -88,9 +88,9 @@ def _judged(
 
 
 def _with_places(solution: Solution, points: Correspondences, factor: float) -> Array:
-    """(N, 3) covariance of the pixels together with the places of their points [px^2].
+    """(N, 3) covariance of the pixels, including the projected survey errors of their points [px^2].
 
-    The noise of the pixels alone is as large as the median residual leaves it.
+    The level of the pixel noise follows from the median residual by bisection.
     """
     own = np.array([1.0, 0.0, 1.0]) if points.covariance is None else points.covariance
     own = np.broadcast_to(own, (len(points), 3))

@@ -1,8 +1,8 @@
-"""The target found with the camera, where the data ask for it: lens and target are chosen together.
+"""Estimate the target's shape with the camera if the data support it, and select lens and target together.
 
-A bent board looks like a lens. So the target is found under the lens that was chosen for the given target,
-the lens is chosen anew for the target that was found, and so on until the lens stays. The points that were
-set aside are judged anew, too: many of them contradict only the given target.
+Residuals of a bent board look like lens distortion. So the target is estimated with the lens selected for the
+given target, the lens is selected again for that target, and so on until the lens model stays the same. The
+outliers are judged again as well: many of them contradict only the given target.
 """
 
 from __future__ import annotations
@@ -26,32 +26,33 @@ from neurocal_cli.pipeline.odd_views import may_be_bent
 from neurocal_cli.pipeline.outlier_rejection import NO_WORSE, fit_robustly, rms
 from neurocal_cli.pipeline.surveyed_points import with_survey
 from neurocal_cli.target import Target, distinct_points, planes_of
-from neurocal_cli.target_shape.bent_anew import find_bends
 from neurocal_cli.target_shape.find import LEAST_GAIN, Found, enough_views, find_target
 from neurocal_cli.target_shape.lens_and_target import find_lens_and_target, named_lens_is_too_simple
-from neurocal_cli.verdict.given_parameters import asked_for
+from neurocal_cli.target_shape.view_bends import find_bends
+from neurocal_cli.verdict.given_parameters import reestimate_given
 from neurocal_cli.verdict.stated_noise import stated_noise
 from neurocal_cli.verdict.view_groups import OWN_STEPS, ViewGroups, view_groups
 
 _ROUNDS = 3
-_WORTH = 0.8  # of the views' number, where some repeat a pose
-_OF_LINES = "k1k2p1p2"  # as `plumb-line` finds
+_WORTH = 0.8  # least effective share of the views, where some repeat a pose
+_OF_LINES = "k1k2p1p2"  # the model that `plumb-line` estimates
 _TOLD_APART = 5.0  # standard deviations, as for the verdict
-# Of the variance by which views contradict each other, bends explain nine tenths, or leave but a little. With
-# eight tenths, a half of photographs of paper boards predicts the other half 3 % worse.
+# Bends per view are accepted if they explain nine tenths of the excess variance between views, or leave at
+# most 1.1 times the noise. With eight tenths, one half of the photographs of paper boards predicts the other
+# half 3 % worse.
 _SHARE, _NOISE = 0.9, 1.1
-_SETTLED = 0.01  # standard deviations by which a camera may move and still is the same
+_SETTLED = 0.01  # standard deviations by which a camera may move and still count as the same
 
 
 def with_target(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
 ) -> tuple[Solution, Rejected]:
-    """Find the target, and fit the camera to it.
+    """Estimate the target's shape, and fit the camera to it.
 
     Parameters
     ----------
     problem : Problem
-        With all points, where their file has them.
+        With all points, at the world coordinates of their file.
     solution, rejected
         For the given target.
     options : Options
@@ -60,11 +61,11 @@ def with_target(
     Returns
     -------
     solution, rejected
-        The ones given where the target stays as it is.
+        Unchanged if the target stays as given.
     """
     if choice != "given" and problem.points.world_std is not None and not solution.refusal:
         return with_survey(problem, solution, rejected, options)
-    rich = solution.state.model == "rich"  # it bends as a target does
+    rich = solution.state.model == "rich"  # flexible enough to absorb a bent target
     if choice == "given" or solution.refusal or options.distortion == "plumb-line" or rich:
         return solution, rejected
     known = _searched(problem, solution, rejected, options, choice)
@@ -82,7 +83,7 @@ def _taking_views_back(
     options: Options,
     choice: str,
 ) -> tuple[Solution, Rejected]:
-    """With a target that explains all views, where some contradict only the given one."""
+    """Try again with the rejected views, which may contradict only the given target."""
     try:
         found = _searched(problem, of_all or fit(problem, options), known[1], options, choice)
     except DegenerateGeometryError:
@@ -94,7 +95,7 @@ def _taking_views_back(
 def _searched(
     problem: Problem, solution: Solution, rejected: Rejected, options: Options, choice: str
 ) -> tuple[Solution, Rejected]:
-    """As `with_target`, beginning with the views of one solution."""
+    """Alternate between target and camera as `with_target` does, from the views of one solution."""
     if not _can_tell(solution, choice, None):
         return solution, rejected
     found = _found(solution, choice, None)
@@ -108,7 +109,7 @@ def _searched(
         if found is None:
             break
         (new, adjusted), *_ = found.fits
-        # A view that only contradicted the given target is back, with a record of its own.
+        # Views that contradicted only the given target have come back, so the record is the latest one.
         start = replace(solution, problem=new, adjusted=adjusted, record=best[0].record)
         again = _fitted_to(problem, found.target, (start, best[1]), options)
         if again is None:
@@ -129,9 +130,9 @@ def _searched(
 
 
 def lines_that_are_bent(solution: Solution, unit: str) -> str:
-    """What a bent board does to a distortion that was found from straight lines; empty where it is not bent.
+    """Warn that a bent board has biased a distortion found from straight lines; empty if it is not bent.
 
-    The bend is told by a free distortion, because the one from the lines has taken it in.
+    The bend is estimated with a free distortion, because the distortion from the lines has absorbed it.
     """
     problem = solution.problem.with_model(_OF_LINES)
     fit = problem, problem.adjust(solution.adjusted)
@@ -145,13 +146,13 @@ def lines_that_are_bent(solution: Solution, unit: str) -> str:
     off = float(np.sqrt((target.offsets**2).sum(axis=1).mean()))
     return (
         f"the target is bent by {target.bend():.2g} {unit}, and its points lie {off:.2g} {unit} rms from "
-        "where they are given; its lines are not straight, and the distortion that they tell has taken that "
-        "in; find it from the points instead (--distortion auto)"
+        "where they are given; its lines are not straight, which biases the distortion estimated from them; "
+        "estimate it from the points instead (--distortion auto)"
     )
 
 
 def _other_reason(solution: Solution, found: Found) -> bool:
-    """Whether stated sigmas, a named distortion, given parameters or several cameras are why."""
+    """Whether wrong sigmas, a too simple lens, wrong given parameters or several cameras are the cause."""
     problem, points = solution.problem, solution.problem.points
     place = np.array([problem.views.names.index(name) for name in points.view_names])
     predicted, _ = predicted_pixels(solution.in_pixels, points.world, place[points.view_index])
@@ -162,17 +163,18 @@ def _other_reason(solution: Solution, found: Found) -> bool:
         return True
     if not problem.free_poses:
         return False
-    asked = asked_for(problem.views, solution.state, problem.fixed, problem.free_poses)
+    asked = reestimate_given(problem.views, solution.state, problem.fixed, problem.free_poses)
     if any(abs(a.found - a.given) > _TOLD_APART * a.std for a in asked):
         return True
     return _are_two_cameras(solution, found)
 
 
 def _are_two_cameras(solution: Solution, found: Found) -> bool:
-    """Whether two cameras, or a zoom that moves, explain more with the given target than one with the found.
+    """Whether two cameras (or a moving zoom) on the given target fit better than one on the found target.
 
-    They still contradict each other where the target was found; a bent board looks like two before. One that
-    is bent anew in some views looks like two afterwards, too, but these explain less.
+    A bent board alone can look like two cameras on the given target, so two cameras must also show on the
+    found target. A board that bends differently in some views shows that as well, but then two cameras fit
+    worse than the found target.
     """
     if _groups(*found.fits[0]) is None:
         return False
@@ -182,16 +184,16 @@ def _are_two_cameras(solution: Solution, found: Found) -> bool:
 
 
 def _groups(problem: Problem, adjusted: Adjusted) -> ViewGroups | None:
-    """Two cameras among the views, or a zoom that moves."""
+    """Test for two cameras among the views, or a moving zoom."""
     if not problem.free.any():
         return None
     return view_groups(problem.views, adjusted.state, adjusted.normal, problem.free_camera)
 
 
 def _with_bends(solution: Solution, common: Found | None) -> Found | None:
-    """With bends of each view, if these explain why the views contradict each other.
+    """Add a bend to each view if that explains why the views contradict each other.
 
-    Of two cameras, or of a rolling shutter, they explain a part.
+    Two cameras or a rolling shutter are explained by bends only in part; then the common target stays.
     """
     fit = solution.problem, solution.adjusted
     found = find_bends(fit, common)
@@ -203,7 +205,7 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
     bent = _noise(*after, found.target.bends.determined(found.target.bends.coefficients))
     if bent > _NOISE * least and given - bent < _SHARE * (given - least):
         return common
-    # Two cameras of this lens leave no less than a camera for each view.
+    # No two cameras of this lens can fit better than a camera for each view.
     least_of_groups = float(free_networks(before[0].views, before[1].state, OWN_STEPS).sum())
     if float(after[1].cost.sum()) < least_of_groups:
         return found
@@ -213,20 +215,20 @@ def _with_bends(solution: Solution, common: Found | None) -> Found | None:
 
 
 def _noise(problem: Problem, adjusted: Adjusted, determined: float) -> float:
-    """Variance of the residuals, normalised."""
+    """Residual variance, normalised; `determined` unknowns are counted besides camera and poses."""
     unknowns = int(problem.free_camera.sum()) + 6 * problem.views.n_views + determined
     return float(adjusted.cost.sum()) / max(problem.views.n_equations - unknowns, 1.0)
 
 
 def _noise_of_views(problem: Problem, adjusted: Adjusted) -> float:
-    """The same where every view has a camera of its own."""
+    """Residual variance with a separate camera for each view."""
     unknowns = 6 + conditions_on_views(problem.views, adjusted.state)
     own = float(free_networks(problem.views, adjusted.state).sum())
     return own / max(problem.views.n_equations - float(unknowns.sum()), 1.0)
 
 
 def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
-    """Whether there are enough different views of the target."""
+    """Whether there are enough independent views to estimate the target."""
     problem, views = solution.problem, solution.problem.views
     points = problem.points if known is None else known.straightened(problem.points)
     given, label, point = distinct_points([points])
@@ -234,12 +236,12 @@ def _can_tell(solution: Solution, choice: str, known: Target | None) -> bool:
     plane = planes_of(given, point) if known is None else known.plane
     if not enough_views(label, repeated.n_poses, int(plane.max()) + 1):
         return False
-    # Errors that copies of a view share look like the target's.
+    # Errors common to repeated views look like errors of the target.
     return choice != "auto" or not repeated.worth < _WORTH
 
 
 def _is_where_it_was(found: Found, again: Solution) -> bool:
-    """Whether the camera that was fitted to a target again is the one that the target was found with."""
+    """Whether fitting the camera to the found target left it where it was when the target was found."""
     (problem, adjusted), new = found.fits[0], again.problem
     if problem.views.names != new.views.names or problem.distortion.model != new.distortion.model:
         return False
@@ -253,7 +255,7 @@ def _is_where_it_was(found: Found, again: Solution) -> bool:
 
 
 def _found(solution: Solution, choice: str, known: Target | None) -> Found | None:
-    # Only a lens that nobody named may change.
+    # The lens may change only if the user named none.
     find = find_lens_and_target if solution.model_errors is not None and known is None else find_target
     least = LEAST_GAIN if choice == "auto" else -np.inf
     return find([(solution.problem, solution.adjusted)], choice == "flat", known, least)
@@ -262,7 +264,7 @@ def _found(solution: Solution, choice: str, known: Target | None) -> Found | Non
 def _fitted_to(
     problem: Problem, target: Target, before: tuple[Solution, Rejected], options: Options
 ) -> tuple[Solution, Rejected] | None:
-    """The camera for a target, its lens and its outliers chosen anew; None where that fails."""
+    """Fit the camera to a target, with lens and outliers selected again; None if that fails."""
     solution, rejected = before
     try:
         if len(rejected) or rejected.views:

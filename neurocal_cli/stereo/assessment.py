@@ -1,10 +1,10 @@
-"""A verdict on a rig: what the data say of it beyond the error of the common fit.
+"""Measure the quality of a rig beyond the error of the common fit, and reach a verdict.
 
-Everything follows from the rig and its points, so a file can be judged as well as a result:
+Everything is computed from the rig and its points, so a file can be judged like a fresh result:
 
-* each camera by its own points, as `verdict.assessment` judges it;
+* the verdict on each camera by its own points (`verdict.assessment`);
 * whether the pairs of views agree on one rig (`contradiction`);
-* the error on pairs left out;
+* the cross-validation error over pairs;
 * the uncertainty of triangulated depth (`depth_uncertainty`).
 """
 
@@ -31,11 +31,11 @@ from neurocal_cli.stereo.sound_pairs import MOVED
 from neurocal_cli.verdict.assessment import assess
 
 _FOLDS = 5
-_MOST_POINTS = 400  # that are triangulated to find the uncertainty of depth
+_MOST_POINTS = 400  # most points that are triangulated for the uncertainty of depth
 
 
 def assess_rig(rig: Rig) -> Verdict | None:
-    """Good, usable or poor, with the reasons; None for a rig that holds no points of its own."""
+    """Good, usable or poor, with reasons and advice; None for a rig without points of its own."""
     pairs = (*rig.pairs, *rig.left_out)
     for side, camera in enumerate((rig.left, rig.right)):
         names = set(camera.points.view_names)
@@ -45,7 +45,7 @@ def assess_rig(rig: Rig) -> Verdict | None:
 
 
 def gather_rig_evidence(rig: Rig) -> RigEvidence:
-    """Measure how good a rig is.
+    """Compute all measures of a rig's quality.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ def gather_rig_evidence(rig: Rig) -> RigEvidence:
 
 
 def _share(of_points: Array) -> float:
-    """The median over the points that exist; nan where none does."""
+    """Median of the finite values; nan if there are none."""
     fine = np.isfinite(of_points)
     return float(median(of_points[fine])) if fine.any() else float("nan")
 
@@ -86,7 +86,7 @@ def _share(of_points: Array) -> float:
 def _moved(
     rig: Rig, poses: RelativePoses, used: NDArray[np.bool_], found: Contradiction
 ) -> Contradiction | None:
-    """The contradiction of all pairs, where it is that the rig moved."""
+    """The contradiction of all pairs if its explanation is that the rig moved."""
     reasons = [rig.left_out.get(pair, "") for pair in poses.names]
     either = np.array([reason == UNSYNCHRONISED or reason.startswith(MOVED) for reason in reasons])
     if either.any():
@@ -95,14 +95,14 @@ def _moved(
 
 
 def _displacement(poses: RelativePoses, used: NDArray[np.bool_]) -> float:
-    """Rms distance of the targets from where the rig says that the right camera sees them."""
+    """Rms distance between the targets' positions in the right camera and those predicted by the rig."""
     left = poses.offset - poses.design @ poses.solution(used)
     moved = np.cross(left[:, :3], poses.centre) + left[:, 3:]
     return float(np.sqrt((moved[used] ** 2).sum(axis=1).mean())) * poses.unit
 
 
 def _held_out(rig: Rig, poses: RelativePoses, used: NDArray[np.bool_]) -> float:
-    """Rms error of pairs left out, their poses fitted."""
+    """Cross-validation error: rms of held-out pairs, with their poses fitted."""
     at, places = poses.solution(used), poses.frame[used]
     S, g, cost = poses.cameras.S.copy(), poses.cameras.g.copy(), poses.cameras.at(at)
     S[places] += poses.pairs.S[used]
@@ -114,7 +114,7 @@ def _held_out(rig: Rig, poses: RelativePoses, used: NDArray[np.bool_]) -> float:
 
 
 def _some_points(rig: Rig) -> tuple[Array, Array]:
-    """Pixels of some points of both cameras, all over the pairs."""
+    """Pixels of some points in both cameras, evenly spaced over the pairs."""
     sides = rig.left.points, rig.right.points
     rows = pair_points(*sides, ViewPairs(rig.pairs, (), ()))
     step = max(1, len(rows.left) // _MOST_POINTS)

@@ -20,7 +20,7 @@ from neurocal_cli.target import Target
 Progress = Callable[[str, float], None]
 
 _SIDES = ("left", "right")
-_ROUNDS = 2  # of choosing lenses and target in turn
+_ROUNDS = 2  # rounds of selecting lenses and target alternately
 _OF_LEAST_SQUARES = ("neuro", "nonlinear")  # cameras of other methods are not refined
 
 
@@ -37,8 +37,8 @@ def calibrate_stereo(
 
     Each camera is calibrated alone, as by `calibrate`. The rig is then found from the views of both cameras,
     which are paired by name. A common bundle adjustment refines both cameras, the rig and all poses. Views of
-    one camera alone contribute to that camera. Where the distortion models are chosen, both cameras get the
-    same one unless the points insist on two.
+    one camera alone contribute to that camera. If the distortion models are selected automatically, both
+    cameras get the same one unless the points contradict that.
 
     Parameters
     ----------
@@ -90,9 +90,9 @@ def _on_one_target(
     sides: Sequence[Mapping[str, Any]],
     progress: Progress | None,
 ) -> tuple[list[Calibration], bool]:
-    """Both cameras on the target that was found with both of them where the points ask for it.
+    """Calibrate both cameras on one target, which is estimated from both if the points support that.
 
-    And whether it was kept as given, where it could have been found.
+    Also returns whether the given target was kept although it could have been estimated.
     """
     choice = sides[0].get("target", "auto")
 
@@ -126,9 +126,9 @@ def _on_one_target(
 
 
 def _others_model(cameras: Sequence[Calibration]) -> list[int]:
-    """Sides that would take the other camera's distortion model, first the one that it suits better.
+    """Sides that could take the other camera's distortion model, first the one that loses less by it.
 
-    Both cameras of a rig are mostly of one make, so their models differ only where the points insist on it.
+    Both cameras of a rig are mostly of the same type, so their models differ only if the points require it.
     """
     models = [camera.distortion_model for camera in cameras]
     choices = [camera.lens_choice for camera in cameras]

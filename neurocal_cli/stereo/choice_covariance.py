@@ -1,7 +1,7 @@
-"""What a rig and its cameras are uncertain by because their distortion models were chosen.
+"""Uncertainty of a rig and its cameras that comes from the selection of their distortion models.
 
-As for a camera alone (`bundle_adjustment.open_coefficients`): coefficients that a model was chosen without
-are open unknowns of the common bundle adjustment.
+As for a single camera (`bundle_adjustment.open_coefficients`), coefficients that the selected models leave
+out are open unknowns of the common bundle adjustment.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from neurocal_cli.stereo.reprojection import Columns, rig_normal_blocks
 
 
 def open_covariance(fit: RigFit) -> Array | None:
-    """Covariance of the free shared unknowns that the choice of the models adds; None where it adds none."""
+    """Covariance that the model selection adds to the free shared unknowns; None if it adds none."""
     problem, adjusted, free = fit.problem, fit.adjusted, fit.free
     own = Columns.of(adjusted.state)
     opened = [
@@ -59,7 +59,7 @@ def open_covariance(fit: RigFit) -> Array | None:
 def _opened(
     calibration: Calibration, adjusted: AdjustedRig, side: int, free: NDArray[np.bool_]
 ) -> OpenCoefficients | None:
-    """Of one camera; None too where the common bundle adjustment left it as it was."""
+    """Open coefficients of one camera; None also if the common bundle adjustment did not change it."""
     if not free.any():
         return None
     return open_of_calibration(calibration, free, adjusted.state.cameras[side].k)

@@ -1,4 +1,4 @@
-"""Whether the pairs of views agree on one rig, and what explains it best if they do not.
+"""Test whether the pairs of views agree on one rig, and find the best explanation if they do not.
 
 With one rig for all pairs the sum of squares of `relative_poses` is a chi-squared variable of 6 (P - 1)
 degrees of freedom. Each explanation adds a few unknowns: a second rig or a second focal length from some pair
@@ -6,8 +6,8 @@ on, or a share of the target's motion from pair to pair. The Bayesian informatio
 
     N log(s^2) + p log N,
 
-with N equations, p added unknowns and s^2 the sum of squares over its degrees of freedom, at least 1, as less
-is luck.
+with N equations, p added unknowns and s^2 the sum of squares over its degrees of freedom, but at least 1,
+because smaller values arise by chance.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from neurocal_cli.stereo.relative_poses import RelativePoses
 
 # Kass and Raftery (1995) call a difference of 10 in the criterion very strong evidence.
 _VERY_STRONG = 10.0
-_LEVEL = 3.09  # standard deviations of the normal law, which luck exceeds once in 1000
-# An explanation leaves no more than luck, or no more than this share of the rms. Relative poses that merely
-# scatter often fall into two unequal parts; test_scatter_is_not_taken_for_a_change repeats it.
+_LEVEL = 3.09  # standard deviations of a normal variable, exceeded by chance once in 1000
+# An explanation must leave no more than chance does, or no more than this share of the rms. Relative poses
+# that merely scatter often fall into two unequal parts; test_scatter_is_not_taken_for_a_change repeats it.
 _LEFT = 0.3
 _LEAST_PAIRS = 2  # of each part; a single pair that differs is an odd one
 
@@ -88,7 +88,7 @@ class _Explanation:
 
 
 def is_significant(squares: float, degrees: int) -> bool:
-    """Whether a sum of squares is larger than luck makes it, by a chi-squared test at the level of 0.001.
+    """Whether a sum of squares is larger than by chance: a chi-squared test at the level of 0.001.
 
     Examples
     --------
@@ -109,8 +109,8 @@ def contradiction(
     used : (P,) bool array, optional
         Pairs that are not known to be wrong; default all.
     seek_odd : bool
-        Whether pairs that contradict most others are one of the explanations. Once they are left out they are
-        not, as among what is left some would always be the oddest.
+        Whether pairs that contradict most others are one of the explanations. Not after such pairs have been
+        left out, because some of the remaining ones would always be the oddest.
     """
     used = np.ones(len(poses), dtype=bool) if used is None else used
     found = _best(poses, used)
@@ -118,11 +118,11 @@ def contradiction(
     if seek_odd and is_significant(_squares(poses, used), _degrees(used)):
         odd = odd_pairs(poses, used)
     if odd.any() and (_score(poses, used & ~odd, None, 6 * int(odd.sum())) < _score(poses, used, found)):
-        return _told(poses, used & ~odd, _best(poses, used & ~odd), odd)
-    return _told(poses, used, found, np.zeros_like(used))
+        return _as_contradiction(poses, used & ~odd, _best(poses, used & ~odd), odd)
+    return _as_contradiction(poses, used, found, np.zeros_like(used))
 
 
-def _told(
+def _as_contradiction(
     poses: RelativePoses, used: NDArray[np.bool_], found: _Explanation | None, odd: NDArray[np.bool_]
 ) -> Contradiction:
     n, squares = _degrees(used), _squares(poses, used)
@@ -166,19 +166,19 @@ def _score(poses: RelativePoses, used: NDArray[np.bool_], found: _Explanation | 
 
 
 def _best(poses: RelativePoses, used: NDArray[np.bool_]) -> _Explanation | None:
-    """The explanation of the lowest criterion, where it is very strong."""
+    """The explanation with the lowest criterion, if the evidence for it is very strong."""
     squares, n = _squares(poses, used), _degrees(used)
     found = [one for one in (*_changes(poses, used), *_motions(poses, used)) if _explains(one, squares, n)]
     if not found:
         return None
     best = min(found, key=lambda one: _score(poses, used, one))
-    # That a change is sought at all places costs as much as one unknown.
+    # The search over all places of a change counts as one more unknown.
     dear = _VERY_STRONG + (np.log(6 * len(poses)) if best.at else 0.0)
     return best if _score(poses, used, best) < _score(poses, used, None) - dear else None
 
 
 def _explains(one: _Explanation, squares: float, n: int) -> bool:
-    """Whether what an explanation leaves is luck, or little of what there was."""
+    """Whether the rest after an explanation is insignificant, or small compared with the whole."""
     left, spare = squares - one.gain, n - len(one.values)
     if spare < 1:
         return False
@@ -186,7 +186,7 @@ def _explains(one: _Explanation, squares: float, n: int) -> bool:
 
 
 def _changes(poses: RelativePoses, used: NDArray[np.bool_]) -> Iterator[_Explanation]:
-    """A second rig, or a second focal length, from each pair on: the best place of each."""
+    """A second rig, or a second focal length, from some pair on: the best place of each kind."""
     places = np.flatnonzero(used)
     if len(places) < 2 * _LEAST_PAIRS:
         return

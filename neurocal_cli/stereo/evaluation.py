@@ -50,7 +50,7 @@ class StereoEvaluation:
         Distortion models of the cameras.
     warnings : tuple of str
     judgement : Verdict or callable, optional
-        The verdict, or what reaches it; see `verdict`.
+        The verdict, or the function that computes it; see `verdict`.
     """
 
     unit: str
@@ -66,10 +66,7 @@ class StereoEvaluation:
 
     @cached_property
     def verdict(self) -> Verdict | None:
-        """What the data of the calibration say of the rig, reached when it is first read.
-
-        None where there is no rig with points of its own.
-        """
+        """Verdict on the rig, computed when it is first read; None without a rig with points of its own."""
         return self.judgement() if callable(self.judgement) else self.judgement
 
 

@@ -1,4 +1,4 @@
-"""What is measured of a rig before it is judged."""
+"""The measures of a rig from which its verdict follows."""
 
 from __future__ import annotations
 
@@ -10,25 +10,24 @@ from neurocal_cli.stereo.contradiction import Contradiction
 
 @frozen_dataclass(eq=False)
 class RigEvidence:
-    """What was measured.
+    """Measures of a rig's quality.
 
     Attributes
     ----------
     cameras : two of Verdict or None
-        On each camera by its own points.
+        Verdict on each camera by its own points.
     names : tuple of (left name, right name)
         All pairs in order of their names.
     size : (P,) array
         Of each pair's target [world unit].
     moved : Contradiction or None
-        Of all pairs, also those that were left out as taken before or after the rig moved; None where it
-        did not move.
+        Of all pairs, including those left out because the rig moved; None if it did not move.
     contradiction : Contradiction or None
-        Of the pairs that determine the rig; None where it cannot be told.
+        Of the pairs that determine the rig; None if a view does not determine its pose.
     displacement : float [world unit]
-        By how much, rms over the pairs, the target is elsewhere in the right camera than the rig says.
+        Rms distance of the targets from their positions predicted by the rig, in the right camera.
     held_out_px : float [px]
-        Rms error of pairs left out in five folds; nan where nothing can be left out.
+        Five-fold cross-validation error over pairs; nan if no pair can be left out.
     depth : float [world unit]
         Median depth of the points.
     depth_share : float

@@ -25,10 +25,10 @@ from neurocal_cli.stereo.sound_pairs import sound_pairs
 from neurocal_cli.stereo.stretch_covariance import stretched_rig
 from neurocal_cli.stereo.target_covariance import with_target_uncertainty
 
-# The common fit may leave so many times the rms residual of both cameras alone. Beyond, errors of the pairs
-# would spoil both cameras: test_pairs_that_scatter_do_not_spoil_the_cameras.
+# Largest rms residual of the common fit, in units of that of both cameras alone, with which the cameras are
+# refined; otherwise errors of the pairs spoil them: test_pairs_that_scatter_do_not_spoil_the_cameras.
 _SPOILS = 1.6
-_BASELINE_SIGMAS = 3.0  # a baseline below so many standard deviations is none
+_BASELINE_SIGMAS = 3.0  # a baseline below this number of standard deviations counts as 0
 
 
 def fit_rig(
@@ -50,7 +50,7 @@ def fit_rig(
     outliers : {"reject", "keep"}
         Whether pairs of views that contradict most others are left out of the rig with a warning, or raise.
     target_kept : bool
-        Whether the target was chosen as given, where both cameras could have found it.
+        Whether the given target was kept although it could have been estimated from both cameras.
 
     Returns
     -------
@@ -80,7 +80,7 @@ def fit_rig(
         kept = tuple(pair for pair in views.both if pair not in sound.left_out)
         problem = rig_problem(left, right, ViewPairs(kept, (), ()))
     fit, warnings = _adjusted(problem, (left, right), sound.rig, refine_cameras)
-    least = _covariance(fit, sound.luck and not sound.left_out)
+    least = _covariance(fit, sound.by_chance and not sound.left_out)
     if left.target is not None and left.target is right.target:
         uncertain = with_target_uncertainty(left.target, fit)
         least = uncertain if least is None or uncertain is None else not_smaller(least, uncertain)
@@ -100,7 +100,7 @@ def fit_rig(
 def _adjusted(
     problem: RigProblem, calibrations: tuple[Calibration, Calibration], start: Pose, refine_cameras: bool
 ) -> tuple[RigFit, list[str]]:
-    """The common bundle adjustment, and what to warn of."""
+    """The common bundle adjustment, and its warnings."""
     moving = [refine_cameras, refine_cameras]
     warnings = []
     while True:
@@ -123,12 +123,12 @@ def _adjusted(
             warnings.append(_kept_warning(("left", "right")[side]))
 
 
-def _covariance(fit: RigFit, luck: bool) -> Array | None:
-    """Covariance of the shared parameters where that of independent points is too small."""
+def _covariance(fit: RigFit, by_chance: bool) -> Array | None:
+    """Covariance of the shared parameters if that of independent points is too small; else None."""
     sides = estimated_parameters(fit.calibrations[0]), estimated_parameters(fit.calibrations[1])
     estimated = np.concatenate([*sides, np.ones(6, dtype=bool)])
     held = bool((fit.free != estimated).any())
-    if luck and not held:
+    if by_chance and not held:
         return None
     state = fit.adjusted.state
     poses = relative_poses(fit.problem, sides, Pose(state.R, state.t * fit.problem.frames.unit))

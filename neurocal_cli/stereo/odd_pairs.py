@@ -20,7 +20,7 @@ _SUSPECT = 60.0
 # with the rig as without it.
 _OWN_SHARE = 3.0
 _MOST_STARTS = 40
-_STEPS = 10  # of concentration; they end sooner
+_STEPS = 10  # most concentration steps; fewer suffice
 
 
 def odd_pairs(poses: RelativePoses, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -72,8 +72,8 @@ def _concentrated(
 def _predicted(poses: RelativePoses, core: NDArray[np.bool_]) -> Array:
     """(P,) squared distances from the rig of some pairs; of the others, with the uncertainty of that rig.
 
-    Few pairs determine the rig poorly, as it follows the errors of both cameras. What they predict of others
-    may be far off for no other reason.
+    Few pairs determine the rig poorly, because errors of both cameras bias it. Without this uncertainty,
+    sound pairs might seem far off.
     """
     S, g = poses.normal(core)
     solved = solve_scaled(S, np.column_stack([np.eye(len(S)), g]))

@@ -1,8 +1,8 @@
 """Covariance of a rig whose pairs of views contradict each other by more than noise.
 
-The normal matrix takes all points for independent. Where the relative pose differs from pair to pair, pairs
-are the independent unit. The delete-one jackknife over the views then gives the covariance, which needs no
-model of what differs (Efron and Stein 1981). A known change adds the square of the error that it leaves.
+The normal matrix treats all points as independent. If the relative pose differs from pair to pair, only the
+pairs are independent. The delete-one jackknife over the views then gives the covariance, without a model of
+the differences (Efron and Stein 1981). A known change adds the square of the error that it causes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled, unit_diago
 from neurocal_cli.stereo.contradiction import Contradiction, is_significant
 from neurocal_cli.stereo.relative_poses import RelativePoses
 
-_LEAST_PAIRS = 3  # that a jackknife needs; with two, all is widened by the scatter
+_LEAST_PAIRS = 3  # fewest pairs for a jackknife; with two, the covariance is multiplied by the scatter
 
 
 def rig_covariance(poses: RelativePoses, used: NDArray[np.bool_], found: Contradiction) -> Array:
@@ -35,7 +35,7 @@ def rig_covariance(poses: RelativePoses, used: NDArray[np.bool_], found: Contrad
 
 
 def _moves(poses: RelativePoses, used: NDArray[np.bool_]) -> Array:
-    """How far the unknowns move without each frame."""
+    """Moves of the unknowns when each frame is left out."""
     frame = poses.frame[used]
     S, g, cost = poses.cameras.S.copy(), poses.cameras.g.copy(), poses.cameras.cost.copy()
     S[frame] += poses.pairs.S[used]

@@ -1,4 +1,4 @@
-"""What the two rectified cameras of a rig see: the cameras, points moved to them, and how well rows agree."""
+"""The two rectified cameras of a rig, points converted to them, and the error of corresponding rows."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class RectifiedPair:
 
 @frozen_dataclass
 class RowError:
-    """By how much corresponding points miss each other's row, or column [px]."""
+    """Distance between the rows (or columns) of corresponding points [px]."""
 
     rms_px: float
     max_px: float
@@ -82,9 +82,9 @@ def rectified_pair(rig: Rig, alpha: float | None = None) -> RectifiedPair:
 
 
 def rectify_points(pair: RectifiedPair, side: int, points: Correspondences) -> Correspondences:
-    """Points of one camera, 0 left or 1 right, where its rectified camera sees them.
+    """Convert points of one camera, 0 left or 1 right, to its rectified camera.
 
-    Those of a wide lens that are behind the rectified image plane are left out.
+    Points of a wide lens behind the rectified image plane are left out.
 
     Raises
     ------
@@ -109,8 +109,7 @@ def row_error(pair: RectifiedPair, left: Correspondences, right: Correspondences
     ----------
     pair : RectifiedPair
     left, right : Correspondences
-        As `rectify_points` returns them. Mid-points that were measured in one direction only are left out
-        where that is along the row.
+        As `rectify_points` returns them. Mid-points that were measured only along the row are left out.
 
     Raises
     ------
@@ -131,10 +130,7 @@ def row_error(pair: RectifiedPair, left: Correspondences, right: Correspondences
 
 
 def row_error_of_rig(rig: Rig, pair: RectifiedPair) -> RowError | None:
-    """Distance of the rows of the points from which the rig was found; None where it has none.
-
-    Of the pairs of views that determine the rig.
-    """
+    """Row error of the rig's own points in the pairs that determine it; None if it has no points."""
     if not rig.pairs or not len(rig.left.points) or not len(rig.right.points):
         return None
     moved = []

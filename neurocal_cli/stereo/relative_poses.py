@@ -1,16 +1,17 @@
-"""The relative pose of the two cameras as each pair of views measures it by itself.
+"""The relative pose of the two cameras, estimated from each pair of views separately.
 
-Each camera alone gives the poses of its views. So every pair of views gives a relative pose of its own, with
-a covariance. All of them are one if the cameras are fixed to each other and each pair shows one moment.
+Each camera alone gives the poses of its views. So every pair of views gives its own relative pose, with a
+covariance. All are equal up to noise if the cameras are fixed to each other and the images of each pair were
+taken at the same moment.
 
-The model is linear around each camera's own result. With d the errors of both cameras' parameters, x the step
-of the rig from a reference, and z_i the step of the relative pose of pair i from the same reference:
+The model is linear around each camera's own result. Let d be the errors of both cameras' parameters, x the
+step of the rig from a reference, and z_i the step of the relative pose of pair i from the same reference:
 
     z_i = x - D_i d + e_i,   cov(e_i) = C_i,
 
-where D_i says how the poses of the views follow the cameras' parameters and C_i is the covariance of the
-relative pose for given cameras. What the views of each camera say of d itself is a second sum of squares.
-The sum of squares of both is the cost of the common bundle adjustment over that of both cameras alone.
+where D_i is the response of the views' poses to the cameras' parameters, and C_i the covariance of the
+relative pose for given cameras. The information of each camera's views about d is a second sum of squares.
+Together they are the cost of the common bundle adjustment beyond that of both cameras alone.
 """
 
 from __future__ import annotations
@@ -31,14 +32,13 @@ from neurocal_cli.least_squares.schur_complement import eliminate
 from neurocal_cli.stereo.problem import RigProblem
 
 _POSE = np.arange(POSE.start, POSE.stop)
-# Smaller noise, in normalised pixels, is rounding; a pixel has about 0.004 of them.
-_MUCH_LARGER = 2.0  # times the variance of all views; of 50 equations of noise, one in 10 million has it
-_LEAST_NOISE = 1e-6
+_MUCH_LARGER = 2.0  # ratio of a view's variance to that of all; 50 equations reach it once in 10 million
+_LEAST_NOISE = 1e-6  # normalised pixels; smaller noise is rounding, and a pixel is about 0.004
 
 
 @frozen_dataclass(eq=False)
 class RelativePoses:
-    """Relative poses of P pairs of views, in order of their names, and what they depend on.
+    """Relative poses of P pairs of views, in order of their names, as linear functions of the unknowns.
 
     The F unknowns are the free parameters of the left camera, those of the right one, and the step of the
     rig: rotation [rad] and translation [`unit`].
@@ -47,17 +47,17 @@ class RelativePoses:
     ----------
     names : tuple of (left name, right name)
     cameras : Quadratics
-        What each frame's views say of the cameras alone, V groups.
+        Information of each frame's views about the cameras alone, V groups.
     pairs : Quadratics
-        What each pair adds, the cost of the common fit over that of the cameras alone, P groups.
+        Term that each pair adds: the cost of the common fit beyond that of the cameras alone, P groups.
     frame : (P,) int array
         Frame of each pair.
     left, right, rig : (f,) int arrays
         Columns of the unknowns.
     estimated : two of (f,) int arrays
-        Places of the left and the right unknowns among A's entries and the distortion coefficients.
+        Indices of the left and the right unknowns among A's entries and the distortion coefficients.
     focal : two of (0, 1 or 2) int arrays
-        Columns of alpha_u and alpha_v of each camera, where they are free.
+        Columns of alpha_u and alpha_v of each camera, if they are free.
     entries : two of (5,) arrays
         Entries of A of each camera, normalised.
     offset : (P, 6) array
@@ -132,7 +132,7 @@ def relative_poses(
     Returns
     -------
     RelativePoses or None
-        None where a view does not determine its pose.
+        None if a view does not determine its pose.
     """
     sides = [_Alone(problem, side, free[side]) for side in (0, 1)]
     if not all(side.determined for side in sides):
@@ -187,7 +187,7 @@ def relative_poses(
 
 
 class _Alone:
-    """One camera alone: the poses of its views at its minimum, and how they follow its parameters."""
+    """One camera alone: the poses of its views at its minimum, and their response to its parameters."""
 
     def __init__(self, problem: RigProblem, side: int, free: NDArray[np.bool_]) -> None:
         observed, normal = problem.observations[side], problem.own_normal[side]
@@ -201,7 +201,7 @@ class _Alone:
         self.follow, self.step = solved[..., :-1], solved[..., -1]
         own = np.linalg.pinv(normal[:, _POSE[:, None], _POSE], hermitian=True)
         larger = cost / (variance * np.maximum(_equations(problem, side) - len(_POSE), 1.0))
-        # A view that errs much more than the others, as where the board is bent anew, is as uncertain.
+        # A view with a much larger error, for example of a board that bends, is more uncertain accordingly.
         times = np.where(larger > _MUCH_LARGER, larger, 1.0)[:, None, None]
         self.covariance = np.asarray(times * variance * own, dtype=float)
         self.quadratics = Quadratics(S / variance, g / variance, cost / variance)
@@ -212,7 +212,7 @@ class _Alone:
 def _both(
     problem: RigProblem, sides: Sequence[_Alone], places: Sequence[NDArray[np.intp]], width: int
 ) -> Quadratics:
-    """What the views of both cameras say of the cameras, by frames."""
+    """Information of the views of both cameras about the cameras, by frame."""
     n = len(problem.frames.scale)
     S, g, cost = np.zeros((n, width, width)), np.zeros((n, width)), np.zeros(n)
     for side, place in enumerate(places):

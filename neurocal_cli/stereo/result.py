@@ -50,9 +50,9 @@ def assemble_rig(
     fit : RigFit
     left_out : dict of str by (left name, right name)
     least : (f, f) array, optional
-        Covariance of the free shared parameters, normalised, below which the result's must not be.
+        Lower bound of the covariance of the free shared parameters, normalised.
     stretched : (f, f) array, optional
-        What is added to it because the print may be stretched.
+        Covariance to add because the print may be stretched.
 
     Raises
     ------
@@ -253,7 +253,7 @@ class _RigAssembly:
 
 
 def _widened(covariance: SchurCovariance, shared: Array) -> SchurCovariance:
-    """The same with another covariance of the shared unknowns; the own ones follow them as before."""
+    """Replace the covariance of the shared unknowns, and propagate the change to the own ones."""
     follow = solve_scaled(
         np.broadcast_to(covariance.shared, (len(covariance.cross), *shared.shape)), covariance.cross
     )

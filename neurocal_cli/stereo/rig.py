@@ -42,7 +42,7 @@ class Rig:
         Iterations of the common bundle adjustment.
     warnings : tuple of str
     judgement : Verdict or callable, optional
-        The verdict as a file has it, or what reaches it from this rig; see `verdict`.
+        The verdict read from a file, or the function that computes it from this rig; see `verdict`.
     """
 
     left: Calibration
@@ -62,10 +62,7 @@ class Rig:
 
     @cached_property
     def verdict(self) -> Verdict | None:
-        """What the data say of this rig beyond its error, reached when it is first read.
-
-        None where it has no points of its own to be judged by.
-        """
+        """Verdict on this rig, computed when it is first read; None without points of its own."""
         return self.judgement(self) if callable(self.judgement) else self.judgement
 
     @property

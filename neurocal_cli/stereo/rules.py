@@ -1,4 +1,4 @@
-"""One word on a rig, good, usable or poor, with the reasons and what to do next."""
+"""The rules of the verdict on a rig: good, usable or poor, with reasons and advice."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from neurocal_cli.calibration import Verdict
 from neurocal_cli.stereo.contradiction import Contradiction
 from neurocal_cli.stereo.evidence import RigEvidence
 from neurocal_cli.stereo.rig import Rig
-from neurocal_cli.stereo.sound_pairs import MOVED, pair_name, told_of_faults, told_of_move
+from neurocal_cli.stereo.sound_pairs import MOVED, describe_faults, describe_move, pair_name
 from neurocal_cli.verdict.findings import WORDS, Finding, Limit, verdict_of
 
-# Repeated by tests/test_wrong_rigs.py, in which no wrong rig may be good, and tests/test_rig_verdict.py, in
-# which real and simulated good ones are. Real boards make the relative poses scatter 2 to 3 times as much as
-# noise does.
+# Repeated by tests/test_wrong_rigs.py, in which no wrong rig may be good, and by tests/test_rig_verdict.py,
+# in which real and simulated good rigs are good. With real boards the relative poses scatter 2 to 3 times as
+# much as noise explains.
 _SCATTER = Limit(3.5, 10.0)
 _GROWTH = Limit(1.6, 2.3)
 _CHANGE = Limit(0.0, 10.0)  # standard deviations for each unknown of the explanation
@@ -30,7 +30,7 @@ _MOMENT = (
 
 
 def reach_rig_verdict(rig: Rig, evidence: RigEvidence) -> Verdict:
-    """Weigh the evidence.
+    """Apply the rules to the measures of a rig.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def _findings(rig: Rig, e: RigEvidence) -> Iterator[Finding]:
 
 
 def _pairs(rig: Rig, e: RigEvidence) -> Iterator[Finding]:
-    """Whether the pairs agree on one rig."""
+    """Findings about pairs that do not agree on one rig."""
     if len(rig.pairs) == 1:
         yield 1, "the rig rests on one pair of views, and nothing checks it", "add pairs of views"
     if e.moved is not None:
@@ -75,7 +75,7 @@ def _pairs(rig: Rig, e: RigEvidence) -> Iterator[Finding]:
     if odd:
         yield (
             _LEFT_OUT.grade(len(odd) / len(e.names)),
-            f"{told_of_faults(odd, len(e.names))} and were left out",
+            f"{describe_faults(odd, len(e.names))} and were left out",
             "look at the views of these pairs, and take them again",
         )
     found = e.contradiction
@@ -100,12 +100,12 @@ def _pairs(rig: Rig, e: RigEvidence) -> Iterator[Finding]:
 def _rig_moved(rig: Rig, e: RigEvidence, found: Contradiction) -> Finding:
     used = set(rig.pairs)
     kept = [part for part in (e.names[: found.at], e.names[found.at :]) if used & set(part)]
-    text, advice = told_of_move(e.names, e.size, found.at, kept[0] if len(kept) == 1 else ())
+    text, advice = describe_move(e.names, e.size, found.at, kept[0] if len(kept) == 1 else ())
     return _CHANGE.grade(found.gain), text, advice
 
 
 def _changed(e: RigEvidence, found: Contradiction) -> Finding:
-    """A focal length that changed, or images that were taken at different moments."""
+    """Finding about a focal length that changed, or images taken at different moments."""
     grade = _CHANGE.grade(found.gain)
     if found.kind in ("late", "early"):
         sense, way = {"late": ("later", "to the next"), "early": ("earlier", "back to the previous")}[

@@ -1,4 +1,4 @@
-"""Which pairs of views determine the rig, and what is wrong with the others."""
+"""Select the pairs of views that determine the rig, and diagnose the others."""
 
 from __future__ import annotations
 
@@ -21,49 +21,49 @@ from neurocal_cli.stereo.problem import RigProblem, estimated_parameters, rig_pr
 from neurocal_cli.stereo.relative_poses import RelativePoses, in_order, relative_poses
 from neurocal_cli.verdict.findings import name_some
 
-MOVED = "taken"  # the reason of a pair that shows the rig before or after it moved begins so
-_OTHER_SIZE = 1.2  # times; targets of one series are alike, and units differ by far more
-_AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and pairs, that agree by more than chance once shifted
+MOVED = "taken"  # first word of the reason for pairs taken before or after the rig moved
+_OTHER_SIZE = 1.2  # least ratio of target sizes that differ; in one series they are equal
+_AGREED, _LEAST_AGREED = 0.8, 3  # share of the pairs, and fewest pairs, that must agree once shifted
 
 Pair = tuple[str, str]
 
 
 @frozen_dataclass(eq=False)
 class SoundPairs:
-    """What the relative poses of the pairs say.
+    """Pairs that determine the rig, and the faults of the others.
 
     Attributes
     ----------
     problem : RigProblem
         Of all pairs.
     rig : Pose
-        The rig of most pairs, where an adjustment starts.
+        The rig of most pairs, the start of an adjustment.
     left_out : dict of str by (left name, right name)
         Pairs that do not determine the rig, with the reason.
     moved : str
-        What to say of a rig that moved between two pairs; empty if it did not.
-    luck : bool
-        Whether the pairs differ by no more than luck.
+        Message about a rig that moved between two pairs; empty if it did not.
+    by_chance : bool
+        Whether the pairs differ by no more than chance.
     """
 
     problem: RigProblem
     rig: Pose
     left_out: Mapping[Pair, str] = field(default_factory=dict)
     moved: str = ""
-    luck: bool = False
+    by_chance: bool = False
 
     def contradiction(self, n_pairs: int, outliers: str = "reject") -> str:
         """Message with the pairs that are left out and their faults."""
         if self.moved:
             return self.moved
-        found = told_of_faults(self.left_out, n_pairs)
+        found = describe_faults(self.left_out, n_pairs)
         if outliers == "keep" and 2 * len(self.left_out) < n_pairs:
             return f"{found}; remove them, or use --outliers reject"
         return f"{found}; check that the views of a pair show one target at one moment, in the same order"
 
 
-def told_of_faults(left_out: Mapping[Pair, str], n_pairs: int) -> str:
-    """What to say of pairs that are left out: how many they are, and the faults with the pairs of each."""
+def describe_faults(left_out: Mapping[Pair, str], n_pairs: int) -> str:
+    """Describe pairs that are left out: their number, and the faults with the pairs of each."""
     by_reason: dict[str, list[str]] = {}
     for pair, reason in left_out.items():
         by_reason.setdefault(reason, []).append(pair_name(pair))
@@ -108,14 +108,14 @@ def sound_pairs(left: Calibration, right: Calibration, views: ViewPairs) -> Soun
 
 
 def _explained(poses: RelativePoses, used: NDArray[np.bool_], found: SoundPairs) -> SoundPairs:
-    """The pairs that contradict most others, or those of the smaller part where the rig moved."""
+    """Leave out the pairs that contradict most others, or the smaller part if the rig moved."""
     why = contradiction(poses, used)
     odd = {pair: UNSYNCHRONISED for pair, is_odd in zip(poses.names, why.odd, strict=True) if is_odd}
     if why.kind == "moved":
         found = replace(found, left_out={**found.left_out, **odd})
         return _larger_part(poses, used & ~why.odd, why.at, found)
-    luck = not is_significant(why.scatter**2 * why.degrees, why.degrees)
-    return replace(found, left_out={**odd, **found.left_out}, luck=luck)
+    by_chance = not is_significant(why.scatter**2 * why.degrees, why.degrees)
+    return replace(found, left_out={**odd, **found.left_out}, by_chance=by_chance)
 
 
 def _larger_part(poses: RelativePoses, used: NDArray[np.bool_], at: int, found: SoundPairs) -> SoundPairs:
@@ -131,12 +131,12 @@ def _larger_part(poses: RelativePoses, used: NDArray[np.bool_], at: int, found: 
     left_out |= dict.fromkeys(others, reason)
     start = poses.solution(sides[kept])[-6:]
     rig = Pose(rotation_step(start[:3]) @ found.rig.R, found.rig.t + start[3:] * poses.unit)
-    text, advice = told_of_move(poses.names, poses.size, at, poses.names[at:] if kept else poses.names[:at])
+    text, advice = describe_move(poses.names, poses.size, at, poses.names[at:] if kept else poses.names[:at])
     return SoundPairs(found.problem, rig, left_out, f"{text}; {advice}")
 
 
-def told_of_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pair] = ()) -> tuple[str, str]:
-    """What to say of a rig that has two geometries, and what to do.
+def describe_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pair] = ()) -> tuple[str, str]:
+    """Describe a rig that has two geometries, with advice.
 
     Parameters
     ----------
@@ -147,7 +147,7 @@ def told_of_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pai
     at : int
         First pair of the second geometry.
     kept : sequence of (left name, right name)
-        The part that determines the rig; none where both do.
+        The part that determines the rig; empty if both do.
     """
     this = f"; this is that of {span(kept)}" if kept else ""
     (large, larger), (small, smaller) = sorted(
@@ -168,7 +168,7 @@ def told_of_move(names: Sequence[Pair], size: Array, at: int, kept: Sequence[Pai
 
 
 def _shifted(left: Calibration, right: Calibration, views: ViewPairs) -> str:
-    """What to say where the pairs agree on a rig once the right views are moved up or down by one."""
+    """Message if the pairs agree on a rig once the right views are shifted by one; otherwise empty."""
     if len(views.both) < 2 * _LEAST_AGREED:
         return ""
     for word, by in (("next", 1), ("previous", -1)):

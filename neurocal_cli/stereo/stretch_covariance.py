@@ -1,6 +1,6 @@
-"""What a rig is uncertain by because its target was kept as given, though the print may be stretched.
+"""Uncertainty of a rig that comes from keeping the given target although its print may be stretched.
 
-As for a camera alone (`target_shape.open_stretch`): two stretches are open unknowns of the common bundle
+As for a single camera (`target_shape.open_stretch`), two stretches are open unknowns of the common bundle
 adjustment.
 """
 
@@ -20,7 +20,7 @@ from neurocal_cli.target_shape.open_stretch import spread_of_stretch, stretched_
 
 @frozen_dataclass(eq=False)
 class StretchedRig:
-    """What an open stretch adds to the covariance of a rig.
+    """Term that an open stretch adds to the covariance of a rig.
 
     Attributes
     ----------
@@ -35,9 +35,9 @@ class StretchedRig:
 
 
 def stretched_rig(fit: RigFit) -> StretchedRig | None:
-    """What the stretch of a target adds; None where that is negligible, or the target is not flat.
+    """The term that the stretch of a target adds; None if it is negligible or the target is not flat.
 
-    Cameras that were held follow the stretch as well: they were calibrated on the same target.
+    Cameras that were not refined respond to the stretch as well, because they were calibrated on this target.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
-"""Covariance of a rig whose target was found with the cameras: the target is uncertain, too.
+"""Covariance of a rig whose target was estimated with the cameras, and so is uncertain as well.
 
-The unknowns that all views share are both cameras' and the rig's; poses and points of the target are
-eliminated. The derivatives by the rig's unknowns follow from each camera's own by the chain rule.
+All views share the unknowns of both cameras and of the rig; poses and target points are eliminated. The
+derivatives by the rig's unknowns follow from those of each camera by the chain rule.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from neurocal_cli.target_shape.surveyed import noise_variance
 
 
 def with_target_uncertainty(target: Target, fit: RigFit) -> Array | None:
-    """(F, F) covariance of the free shared parameters of the rig; None where nothing determines them."""
+    """(F, F) covariance of the free shared parameters of the rig; None if they are not determined."""
     prior = prior_of_target(target)
     info = _information(target, fit.problem, fit.adjusted.state, fit.free).turned(prior.axes)
     spare = info.equations - len(info.camera) - 6 * len(info.pose)
@@ -79,7 +79,7 @@ def _information(
 
 
 def _labels(target: Target, problem: RigProblem, observed: Observations) -> NDArray[np.intp]:
-    """(T, n) the target's point in each place of the batches, -1 in places that only fill."""
+    """(T, n) index of the target point in each slot of the batches; -1 for padding."""
     batches, frames = observed.batches, problem.frames
     frame = observed.view[batches.view]
     world = batches.local * frames.scale[frame][:, None, None] + frames.centre[frame][:, :, None]

@@ -128,10 +128,10 @@ def triangulate(
 
 
 def _sees_sideways(camera: Camera, pixels: Array) -> bool:
-    """Whether any pixel's ray is so far from the axis that (x, y, 1) / w, which is quicker, is of no use."""
+    """Whether any ray is too far from the axis for the faster parametrisation (x, y, 1) / w."""
     if not camera.distortion.wide or not len(pixels):
         return False
-    # The farthest from the principal point tell, up to what tangential terms may change.
+    # Only pixels farthest from the principal point need a test; several, because of tangential terms.
     away = np.nan_to_num(np.hypot(*(pixels - camera.A[:2, 2]).T))
     farthest = np.argsort(-away, kind="stable")[:_FARTHEST]
     return not bool((camera.unproject(pixels[farthest])[:, 2] > _LEAST_DEPTH).all())

@@ -1,1 +1,1 @@
-"""The target as it is: offsets of its points from where its file has them, found with the camera."""
+"""Estimation of a target's shape with the cameras: offsets of its points from their given positions."""

@@ -1,7 +1,7 @@
-"""How much a board bends anew in each view, and how it is bent in each, where its common points are held.
+"""Size of the bends of single views by empirical Bayes, and the bend of each view, for given common points.
 
-The bends of a view are unknowns beside its pose (`information`), Gaussian a priori with one size for all
-views. The evidence of the pixels with cameras, poses and bends integrated out tells that size.
+The bends of a view are unknowns besides its pose (`information`), with a Gaussian prior of the same size in
+all views. The size maximises the evidence, with cameras, poses and bends integrated out.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.posterior import log_evidence
 
-_LEAST, _MOST = 1e-6, 1.0  # of the target's size, as if all errors were noise
-_GRID, _FINER = 12, (0.6, 0.3, 0.1)  # places, and the widths of the parabolas that follow; of logarithms
+_LEAST, _MOST = 1e-6, 1.0  # range of the search, over the target's size, if all errors were noise
+_GRID, _FINER = 12, (0.6, 0.3, 0.1)  # grid points, then half-widths of parabolic steps; in the logarithm
 
 
 def most_probable_precision(info: Information, size: float, roughly: bool = False) -> float:
-    """Precision of the bends, in units of the noise's, that makes the pixels most probable.
+    """Prior precision of the bends with the highest evidence, in units of the noise precision.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def most_probable_precision(info: Information, size: float, roughly: bool = Fals
     size : float
         Of the target [world unit].
     roughly : bool
-        Whether a factor of 3 either way is near enough.
+        Whether an accuracy of a factor of 3 suffices.
     """
     noise, of_precision = info.straight().cost / info.spare, evidence_by_precision(info)
 
@@ -49,9 +49,9 @@ def most_probable_precision(info: Information, size: float, roughly: bool = Fals
 
 
 def evidence_by_precision(info: Information) -> Callable[[float], float]:
-    """Logarithm of the evidence of the target as it is given, for bends that have a precision a priori.
+    """Log evidence of the given target as a function of the prior precision of the bends.
 
-    Each view's bends are three independent ones, once its pose is eliminated.
+    With the poses eliminated, the three bend coefficients of each view are diagonalised once.
     """
     Q, X, B = info.pose[:, :6, :6], info.pose[:, :6, 6:], info.pose[:, 6:, 6:]
     root = np.linalg.inv(np.linalg.cholesky(Q))
@@ -78,7 +78,7 @@ def evidence_by_precision(info: Information) -> Callable[[float], float]:
 
 
 def bends_of(info: Information, camera_step: Array, offsets: Array) -> Array:
-    """(P, 3) the most probable bends [world unit], for the cameras' steps (f,) and the offsets (n, 3).
+    """(P, 3) most probable bends [world unit], given the step of the cameras (f,) and the offsets (n, 3).
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""Covariance of a calibrated camera and its poses: one place for all that reports or uses one.
+"""Covariance of a calibrated camera and its poses, for all code that reports or uses it.
 
-From the normal matrices, with the target's uncertainty where it was found (`uncertainty`), as far as views
-are independent (`view_covariance`), and with what the choices of the distortion model and of the target leave
-open (`open_coefficients`, `open_stretch`).
+It combines the normal matrices with the uncertainty of an estimated target (`uncertainty`), the jackknife
+over views (`view_covariance`), and the model uncertainty of the selected distortion model and target
+(`open_coefficients`, `open_stretch`).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 @frozen_dataclass(eq=False)
 class CameraSeen:
-    """A camera at its minimum with the points that it saw.
+    """A camera at its minimum, with its observations.
 
     Attributes
     ----------
@@ -47,17 +47,17 @@ class CameraSeen:
     free_poses : bool
     repeated : RepeatedPoses
     points : Correspondences
-        Where the target has them.
+        With the world coordinates of the estimated target, if any.
     target : Target, optional
-        Where it was found.
+        The estimated target.
     choice : collection of str
-        Models that the distortion was chosen from; empty where it was named.
+        Candidate models of the distortion selection; empty if the user named the model.
     shared : (f, f) array, optional
-        Covariance of what is free, where it comes from elsewhere.
+        Covariance of the free parameters, if it comes from elsewhere.
     by_prior : float
-        How many of the coefficients a prior determines, not the points.
+        Effective number of coefficients that a prior determines instead of the points.
     target_kept : bool
-        Whether the target was chosen as given, where it could have been found.
+        Whether the given target was kept although it could have been estimated.
     """
 
     views: Views
@@ -76,18 +76,18 @@ class CameraSeen:
 
 @frozen_dataclass(eq=False)
 class WideCovariance:
-    """Of a camera with the coefficients that its distortion model was chosen without.
+    """Covariance of a camera extended by the coefficients that its selected distortion model leaves out.
 
-    What is projected moves less than the covariance of the estimated ones alone has it: open coefficients and
-    the parameters that follow them make up for each other.
+    The projection is less uncertain than the covariance of the estimated parameters alone suggests, because
+    the open coefficients and the parameters correlated with them compensate.
 
     Attributes
     ----------
     open : OpenCoefficients
     normal : (V, 12 + K, 12 + K) array
-        Of the camera with them.
+        Normal matrices of the extended camera.
     entries : (f, f) array
-        Of all that is free, open ones included.
+        Covariance of all free parameters, including the open ones.
     """
 
     open: OpenCoefficients
@@ -103,13 +103,13 @@ class CameraCovariance:
     ----------
     basis : CovarianceBasis
     plain : Covariance
-        Of the normal matrices.
+        From the normal matrices alone.
     found : Covariance
-        As far as views are independent, and with what the choices of model and target leave open.
+        With the jackknife over views and the model uncertainty.
     wide : WideCovariance or None
-        Where the choice of the model leaves anything open.
+        None if the model selection leaves no coefficient open.
     stretched : float
-        Probability that the print is stretched, where the target was kept as given; 0 where it is negligible.
+        Probability that the print is stretched, if the given target was kept; 0 if it is negligible.
     """
 
     basis: CovarianceBasis
@@ -125,7 +125,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
     Raises
     ------
     numpy.linalg.LinAlgError
-        Points that do not determine a camera whose target was found.
+        The points do not determine a camera whose target was estimated.
     """
     asked = seen.free, seen.free_poses
     basis = _basis(seen, seen.state, seen.free, seen.normal, seen.shared)
@@ -150,7 +150,7 @@ def camera_covariance(seen: CameraSeen) -> CameraCovariance:
 
 
 def _chosen(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
-    """With what the choice of the model leaves open."""
+    """Add the uncertainty from the selection of the distortion model."""
     from neurocal_cli.bundle_adjustment.open_coefficients import corner_radius, open_coefficients, radius
 
     views, state = seen.views, seen.state
@@ -185,7 +185,7 @@ def _opened(
 
 
 def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> CameraCovariance:
-    """With what the choice of the target leaves open."""
+    """Add the uncertainty from keeping the given target."""
     from neurocal_cli.target_shape.open_stretch import open_stretch
 
     added = open_stretch(seen.views, seen.state, seen.free, seen.points.world, variance)
@@ -202,7 +202,7 @@ def _stretched(seen: CameraSeen, known: CameraCovariance, variance: float) -> Ca
 
 
 def _variance(seen: CameraSeen, basis: CovarianceBasis) -> float:
-    """Of the residuals, as if those were independent that are alike in neighbours or repeated poses."""
+    """Residual variance, enlarged for residuals correlated between neighbours or repeated poses."""
     views = seen.views
     unknowns = int(seen.free.sum()) + (6 * views.n_views if seen.free_poses else 0)
     alike = correlation(views, point_residuals(views, seen.state))

@@ -1,7 +1,7 @@
-"""The target found together with the cameras: linearise, solve for the offsets, move, until nothing moves.
+"""Estimate the target together with the cameras: linearise, solve for the offsets, move, repeat.
 
-Each step solves for cameras, poses and offsets at once (`posterior`); then the cameras and poses go to
-their minimum for the target as it is then believed to be.
+Each step solves for cameras, poses and offsets together (`posterior`). Then bundle adjustment brings cameras
+and poses to their minimum for the updated target.
 """
 
 from __future__ import annotations
@@ -22,40 +22,41 @@ from neurocal_cli.geometry import Array, nearest_similarity
 from neurocal_cli.median import median
 from neurocal_cli.target import Target, distinct_points, planes_of, scale_of_points
 from neurocal_cli.target_shape.bend_size import bends_of, most_probable_precision
-from neurocal_cli.target_shape.bends_left_out import bends_hold
+from neurocal_cli.target_shape.bend_validation import bends_are_valid
 from neurocal_cli.target_shape.information import Information, Sight, information_of
-from neurocal_cli.target_shape.left_out import holds_for_views_left_out
 from neurocal_cli.target_shape.posterior import Posterior, evidence_of_given, given_posterior, posterior
 from neurocal_cli.target_shape.prior import prior_of
+from neurocal_cli.target_shape.target_validation import passes_cross_validation
 
 _STEPS = 10
-# Unknowns of the dense system. From more on some views are taken; of far more no target is looked for.
+# Unknowns of the dense system: with more than the first, only some views are used; with more than the second,
+# no target is estimated.
 _DENSE, _MOST_DENSE = 600, 3000
-_FEWEST_SPARE = 10  # equations beyond the cameras' and the poses' unknowns
-_EXACT = 1e-6  # px: rounding, which tells nothing of a target
-_EARLY = 0.5  # of the gain, that the first step must promise
+_FEWEST_SPARE = 10  # fewest degrees of freedom besides cameras and poses
+_EXACT = 1e-6  # px: smaller residuals are rounding
+_EARLY = 0.5  # share of the required gain that the first step must predict
 _SETTLED = 0.02  # of the cameras' standard deviations
-_LARGEST = 0.02  # of the target's size: more is no target that happens to be bent
-# Prints are stretched by a few thousandths; more is a square of another size along one side. A target that
-# was found below the limit may settle a little beyond it, where the lens is chosen for it.
+_LARGEST = 0.02  # largest offset over the target's size; more is another target
+# Prints are stretched by a few thousandths; more means that the squares have another size along one side. An
+# estimated target below the first limit may move slightly beyond it when the lens is selected again.
 _STRETCHED, _STRETCHED_AGAIN = 0.02, 0.025
-_FEWEST, _FEWEST_OF_FOLDED = 3, 2  # different views of most points
+_FEWEST, _FEWEST_OF_FOLDED = 3, 2  # fewest different views of most points
 LEAST_GAIN = 6.0
-"""Of the logarithm of the evidence, for a target to be found unasked. Of 400 clean sets two gain more, 7.0 at
-most; tests/test_simulated_targets.py (slow) holds that clean sets keep the given target."""
+"""Least gain in log evidence with which "auto" estimates a target. Of 400 clean sets two gain more, 7.0 at
+most; tests/test_simulated_targets.py (slow) checks that clean sets keep the given target."""
 
 
 @frozen_dataclass(eq=False)
 class Found:
-    """A target, and the problems with their minima for it.
+    """An estimated target, with the problems and their minima for it.
 
     Attributes
     ----------
     target : Target
     fits : tuple of (Problem, Adjusted)
-        Each problem's points are where the target has them.
+        The points of each problem have the target's coordinates.
     evidence : float
-        Its logarithm, for cameras of any lens.
+        Log evidence, comparable between lens models.
     """
 
     target: Target
@@ -64,9 +65,9 @@ class Found:
 
 
 def enough_views(label: NDArray[np.intp], n_different: int, n_planes: int = 1) -> bool:
-    """Whether the points are seen often enough, from different sides, for a target to be found.
+    """Whether enough different views show most points to estimate the target.
 
-    Two views tell how the planes of a folded target stand; the bend of one plane takes three.
+    Two views determine the angles between the planes of a folded target; the bend of one plane needs three.
     """
     least = _FEWEST if n_planes == 1 else _FEWEST_OF_FOLDED
     return n_different >= least and bool(median(np.bincount(label).astype(float)) >= least)
@@ -78,23 +79,23 @@ def find_target(
     known: Target | None = None,
     least_gain: float = -np.inf,
 ) -> Found | None:
-    """Find where the points of a target really are.
+    """Estimate the true positions of a target's points.
 
     Parameters
     ----------
     fits : sequence of (Problem, Adjusted)
-        Cameras that saw the target, each at its minimum. Points with the same coordinates are the same.
+        Cameras that observed the target, each at its minimum. Points with equal coordinates are the same.
     flat : bool
         Whether the points stay in their planes.
     known : Target, optional
-        Where the points of the fits are already, and where to begin.
+        Estimated target whose coordinates the points of the fits have already; the starting point.
     least_gain : float
-        Of the logarithm of the evidence: a target that raises it by less is not looked for to the end.
+        The search ends early if the gain in log evidence will be smaller.
 
     Returns
     -------
     Found or None
-        None where the points do not determine a target, or ask for one that is no print of the given one.
+        None if the points do not determine a target, or if the result is too different from the given one.
     """
     points = [problem.points if known is None else known.straightened(problem.points) for problem, _ in fits]
     n_points = len(distinct_points(points)[0])
@@ -108,12 +109,12 @@ def find_target(
 
 
 def evidence_as_given(fits: Sequence[tuple[Problem, Adjusted]]) -> float:
-    """Logarithm of the evidence of the target as it is given, comparable with that of one that was found."""
+    """Logarithm of the evidence of the given target, comparable with that of a found one."""
     return evidence_of_given(Search(fits, flat=False, known=None).information())
 
 
 def searched(search: Search, least_gain: float) -> Found | None:
-    """What a search ends with; None also where the points do not determine it."""
+    """Result of a search; None also if the points do not determine the target."""
     try:
         with np.errstate(all="ignore"):
             return search.run(least_gain)
@@ -122,7 +123,7 @@ def searched(search: Search, least_gain: float) -> Found | None:
 
 
 def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Problem, Adjusted]:
-    """A part of the views, evenly among all: what so many views do not tell of a target is small."""
+    """At most `most` views, evenly spaced among all: so many determine the target well enough."""
     points = problem.points.of_few_views(most)
     if points is problem.points:
         return problem, adjusted
@@ -133,7 +134,7 @@ def _some_views(problem: Problem, adjusted: Adjusted, most: int) -> tuple[Proble
 
 
 def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known: Target | None) -> Found:
-    """All views on a target that some of them told."""
+    """Apply a target estimated from some views to all views."""
     moved = []
     for problem, adjusted in fits:
         points = problem.points if known is None else known.as_given(problem.points)
@@ -143,16 +144,16 @@ def _of_all_views(found: Found, fits: Sequence[tuple[Problem, Adjusted]], known:
 
 
 class Search:
-    """The fits as they move.
+    """State of the search: target and fits.
 
     Parameters
     ----------
     fits, flat, known
         As for `find_target`.
     bending : bool
-        Whether the target bends anew in each view; always where a known one does. Of one camera.
+        Whether each view has a bend of its own (one camera only); always if the known target has bends.
     still : bool
-        Whether its points are where they are given, but for that.
+        Whether the common points stay as given, so that only the bends are estimated.
     """
 
     def __init__(
@@ -187,7 +188,7 @@ class Search:
         self.precision = 1.0
 
     def run(self, least_gain: float) -> Found | None:
-        """Linearise, solve and move; None where the target gains too little, or is no print of the given."""
+        """Linearise, solve and move; None if the gain is too small or the offsets are too large."""
         noise: float | None = None
         for step in range(_STEPS):
             here = self.information()
@@ -203,14 +204,14 @@ class Search:
                 return None
             noise = found.variance
             std = np.sqrt(noise * np.diagonal(found.camera))
-            # Without sizes to begin with, the first ones are rough.
+            # Without initial sizes, those of the first step are rough.
             known = self.still or self.sizes is not None
             settled = known and bool((np.abs(found.camera_step) < _SETTLED * std).all())
             if not self._move(found, info):
                 return None
             if settled:
                 break
-        if found.evidence - self._without(info) < least_gain or not self._holds(found):
+        if found.evidence - self._without(info) < least_gain or not self._passes_cross_validation(found):
             return None
         self._align()
         target = self._target(found, found.evidence - evidence_of_given(info.straight()))
@@ -219,26 +220,26 @@ class Search:
         return Found(target, tuple(self.fits), found.evidence)
 
     def _without(self, info: Information) -> float:
-        """Evidence without what is looked for: the offsets, or bends alone."""
+        """Log evidence of the null model: without offsets or, if only bends are estimated, without bends."""
         return evidence_of_given(info.straight() if self.still else info)
 
-    def _holds(self, found: Posterior) -> bool:
+    def _passes_cross_validation(self, found: Posterior) -> bool:
         sights = self.sights()
-        if self.surface is not None and not bends_hold(sights[0], self.bends, self.precision):
+        if self.surface is not None and not bends_are_valid(sights[0], self.bends, self.precision):
             return False
-        return self.still or holds_for_views_left_out(
+        return self.still or passes_cross_validation(
             sights, self.prior, self.offsets, found.sizes, found.variance, self.precision
         )
 
     def _around_given(self, info: Information) -> Information:
-        """Around the given points; where they bend, with the bends' most probable size."""
+        """The quadratic in the whole offsets; with bends, also with their prior of the most probable size."""
         if self.surface is None:
             return info.around_given(self.offsets)
         self.precision = most_probable_precision(info, self.prior.size)
         return info.around_given(self.offsets).held(self.precision)
 
     def sights(self) -> list[Sight]:
-        """What each camera sees of the target as it is by now."""
+        """Observations of each camera for the current target."""
         sights = [sight_of(p, a, label) for (p, a), label in zip(self.fits, self.label, strict=True)]
         if self.surface is None:
             return sights
@@ -246,15 +247,15 @@ class Search:
         return [replace(sight, shapes=shapes, bends=self.bends) for sight in sights]
 
     def information(self) -> Information:
-        """Around the target as it is by now."""
+        """The quadratic around the current target."""
         return information_of(self.sights(), len(self.given)).turned(self.prior.axes)
 
     def _common(self) -> Array:
-        """(n, 3) the points that all views share."""
+        """(n, 3) current common points of all views."""
         return self.given + self.prior.in_world(self.offsets)
 
     def _world(self, k: int) -> Array:
-        """(N, 3) the points of one of the fits, in each of its views."""
+        """(N, 3) current world coordinates of the points of one fit, with the bend of their view."""
         common, points = self._common(), self.fits[k][0].points
         if self.surface is None:
             return common[self.label[k]]
@@ -276,9 +277,9 @@ class Search:
         return all(np.isfinite(adjusted.cost).all() for _, adjusted in self.fits)
 
     def _align(self) -> None:
-        """Turn, shift and scale the target to be nearest to the given one; no pixel sees that.
+        """Rotate, shift and scale the target to be nearest to the given one, which changes no pixel.
 
-        Where distances were measured, they hold the scale.
+        Measured distances determine the scale, if there are any.
         """
         if self.still or not all(problem.free_poses for problem, _ in self.fits):
             return
@@ -315,7 +316,7 @@ class Search:
 
 
 def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> Sight:
-    """What a fit's camera saw; label (N,) in the order of its points."""
+    """Observations of a fit's camera; label (N,) in the order of its points."""
     views = problem.views
     ordered = label if views.order is None else label[views.order]
     return Sight(views, adjusted.state, problem.free_camera, problem.free_poses, ordered)
@@ -324,6 +325,6 @@ def sight_of(problem: Problem, adjusted: Adjusted, label: NDArray[np.intp]) -> S
 def at_world(
     problem: Problem, adjusted: Adjusted, state: CameraState, world: Array
 ) -> tuple[Problem, Adjusted]:
-    """A camera with its views for other places of the points: the minimum near a state in pixels."""
+    """Adjust a camera to other world coordinates of its points, starting from a state in pixels."""
     new = replace(problem.with_points(replace(problem.points, world=world)), restraint=problem.restraint)
     return new, new.adjust(replace(adjusted, state=normalised(state, new.views)))

@@ -1,8 +1,8 @@
-"""What the pixels tell of cameras, poses and the points of the target, all at once.
+"""Normal equations of cameras, poses and target points together.
 
-Every point of the target may be off its given place by d, the same in all views. Around a state, the
-squared error is a quadratic in the cameras' free parameters c, the poses q and the offsets d. Poses meet
-each other only in c and d, and points meet each other only in c and q: both kinds are blocks.
+Each target point has an offset d from its given position, the same in all views. Around a state, the squared
+error is a quadratic in the cameras' free parameters c, the poses q and the offsets d. Different poses are
+coupled only through c and d, and different points only through c and q, so both parts are block diagonal.
 """
 
 from __future__ import annotations
@@ -24,22 +24,22 @@ from neurocal_cli.geometry import Array
 
 @frozen_dataclass(eq=False)
 class Sight:
-    """What one camera saw of the target.
+    """Observations of the target by one camera.
 
     Attributes
     ----------
     views : Views
-        With the target as it is believed to be.
+        With the current world coordinates of the target.
     state : CameraState
-        At the minimum for that.
+        At the minimum for these.
     free : (5 + K,) bool array
     free_poses : bool
     label : (N,) int array
-        The target's point in each row, in the order of `views`.
+        Index of the target point of each row, in the order of `views`.
     shapes : (n, 3, 3) array, optional
-        Of a target that bends anew in each view: each point's offsets for a coefficient of 1.
+        With a bend in each view: offsets of each point for unit coefficients.
     bends : (V, 3) array, optional [world unit]
-        Coefficients that the views are believed to have.
+        Current coefficients of the bend of each view.
     """
 
     views: Views
@@ -51,11 +51,11 @@ class Sight:
     bends: Array | None = None
 
     def of_views(self, which: NDArray[np.intp]) -> Sight:
-        """Of some views."""
+        """The observations of some views."""
         return self._of(which, self.views.subset(which), np.isin(self.views.index, which))
 
     def of_points(self, kept: NDArray[np.bool_]) -> Sight:
-        """Of some points (N,), in the order of `views`."""
+        """The observations of some points (N,), in the order of `views`."""
         return self._of(np.unique(self.views.index[kept]), self.views.of_points(kept), kept)
 
     def _of(self, which: NDArray[np.intp], views: Views, kept: NDArray[np.bool_]) -> Sight:
@@ -66,15 +66,15 @@ class Sight:
 
 @frozen_dataclass(eq=False)
 class Information:
-    """Sums of products of derivatives and residuals [px], by blocks.
+    """Blocks of the normal matrix and the right side: sums of products of derivatives and residuals [px].
 
-    Where the target bends anew in each view, a pose has p = 9 unknowns: its six and the coefficients of the
-    view's bend, counted from 0. Else p = 6.
+    With a bend in each view, a pose has p = 9 unknowns: its six, and the three coefficients of the view's
+    whole bend. Otherwise p = 6.
 
     Attributes
     ----------
     camera, camera_right : (f, f), (f,) array
-        Of the free parameters of all cameras, one after the other, in each one's normalised units.
+        Free parameters of all cameras in sequence, each in its normalised units.
     pose, pose_camera, pose_right : (P, p, p), (P, p, f), (P, p) array
     point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
         Offsets in the world's axes and unit.
@@ -83,7 +83,7 @@ class Information:
         Sum of squares.
     equations : float
     log_precision : float
-        Sum of the logarithms of the precisions that the bends have a priori; see `held`.
+        Sum of the logarithms of the prior precisions of the bends; see `held`.
     """
 
     camera: Array
@@ -101,17 +101,17 @@ class Information:
 
     @property
     def spare(self) -> float:
-        """Equations beyond the unknowns of the cameras and the poses."""
+        """Degrees of freedom: equations minus the unknowns of cameras and poses."""
         return self.equations - len(self.camera) - 6 * len(self.pose)
 
     def held(self, precision: float) -> Information:
-        """With a priori Gaussian bends of this precision, in units of the noise's."""
+        """Add a Gaussian prior of this precision, in units of the noise precision, on the bends."""
         pose, bends = self.pose.copy(), np.arange(6, self.pose.shape[1])
         pose[:, bends, bends] += precision
         return replace(self, pose=pose, log_precision=len(pose) * len(bends) * np.log(precision))
 
     def around_straight(self, bends: Array) -> Information:
-        """The same quadratic in the whole bends (P, 3), not in what they change by."""
+        """The same quadratic in the whole bends (P, 3) instead of their changes."""
         by_pose = (self.pose[:, :, 6:] @ bends[..., None])[..., 0]
         cost = 2 * self.pose_right[:, 6:] + by_pose[:, 6:]
         return replace(
@@ -123,12 +123,12 @@ class Information:
         )
 
     def pose_by(self, offsets: Array) -> Array:
-        """(P, p) what offsets (n, 3) add to the poses' right side."""
+        """(P, p) contribution of offsets (n, 3) to the right side of the poses."""
         P, p = self.pose.shape[:2]
         return (self.pose_point.reshape(P * p, offsets.size) @ offsets.ravel()).reshape(P, p)
 
     def straight(self) -> Information:
-        """Without bends."""
+        """The quadratic without bends."""
         return replace(
             self,
             pose=self.pose[:, :6, :6],
@@ -139,9 +139,9 @@ class Information:
         )
 
     def turned(self, axes: Array) -> Information:
-        """With each point's offset along its own axes, the columns of (n, 3, 3)."""
+        """Express each point's offset in its own axes, the columns of (n, 3, 3)."""
         transposed = np.swapaxes(axes, 1, 2)
-        alike = bool((axes == axes[:1]).all())  # one plane: a single product
+        alike = bool((axes == axes[:1]).all())  # with a single plane one product suffices
         return replace(
             self,
             point=transposed @ self.point @ axes,
@@ -155,7 +155,7 @@ class Information:
         )
 
     def around_given(self, offsets: Array) -> Information:
-        """The same quadratic in the whole offsets (n, 3), not in what they change by."""
+        """The same quadratic in the whole offsets (n, 3) instead of their changes."""
         by_point = (self.point @ offsets[..., None])[..., 0]
         return replace(
             self,
@@ -167,7 +167,7 @@ class Information:
 
 
 def information_of(sights: Sequence[Sight], n_points: int) -> Information:
-    """Sum over all that was seen of one target; each camera has its own free parameters and poses."""
+    """Sum over the observations of all cameras; each camera has its own free parameters and poses."""
     widths = [int(sight.free.sum()) for sight in sights]
     poses = [sight.views.n_views if sight.free_poses else 0 for sight in sights]
     f, P = sum(widths), sum(poses)
@@ -187,7 +187,7 @@ def information_of(sights: Sequence[Sight], n_points: int) -> Information:
 
 
 def joined(parts: Sequence[Information]) -> Information:
-    """Sum over parts of the views, which were seen by the same cameras."""
+    """Sum over parts of the views of the same cameras."""
 
     def summed(name: str) -> Any:
         return sum(getattr(part, name) for part in parts)
@@ -203,7 +203,7 @@ def joined(parts: Sequence[Information]) -> Information:
 
 
 def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
-    """Add what one camera saw; its cost."""
+    """Add the observations of one camera; return its cost."""
     views = sight.views
     columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
     label = labelled(views, sight.label)
@@ -228,12 +228,12 @@ def _add(found: Information, sight: Sight, own: slice, poses: slice) -> float:
 
 @frozen_dataclass(eq=False)
 class PointTerms:
-    """Sums of products with the derivatives by the points of the target, of one camera, normalised.
+    """Sums of products with the derivatives by the target points, for one camera, normalised.
 
     Attributes
     ----------
     normal : (V, 12 + K, 12 + K) array
-        As from `normal_blocks`; with columns of three bends before the residual, where the target has some.
+        As from `normal_blocks`; with bends, three columns for them before the residual.
     point, point_camera, point_right : (n, 3, 3), (n, 3, f), (n, 3) array
         Points in the world's axes and unit.
     pose_point : (V, p, n, 3) array
@@ -255,7 +255,7 @@ def point_terms(
     n_points: int,
     shapes: Array | None = None,
 ) -> PointTerms:
-    """Sum up what one camera saw of the points.
+    """Sums of one camera over its observations of the target points.
 
     Parameters
     ----------
@@ -264,13 +264,13 @@ def point_terms(
     scale : (V,) array
         S2 of each view [world unit].
     label : (T, n) int array
-        The target's point in each place of the batches, -1: none.
+        Index of the target point in each slot of the batches; -1: none.
     columns : (f,) int array
-        Of the camera's parameters that count.
+        Columns of the camera's free parameters.
     n_points : int
-        Points of the target.
+        Number of target points.
     shapes : (n, 3, 3) array, optional
-        Offsets of these for a coefficient of 1 of each view's bend.
+        Offsets of the points for unit coefficients of a view's bend.
     """
     width, f, V = 12 + len(state.k), len(columns), batches.n_views
     whole = width if shapes is None else width + N_SHAPES
@@ -312,7 +312,7 @@ def point_terms(
 
 
 def _is_once(label: NDArray[np.intp]) -> bool:
-    """Whether no batch has a point twice."""
+    """Whether no batch contains a point twice."""
     ordered = np.sort(label, axis=1)
     return not ((ordered[:, 1:] == ordered[:, :-1]) & (ordered[:, 1:] >= 0)).any()
 
@@ -325,7 +325,7 @@ def _of_each(a: Array, b: Array) -> Array:
 
 
 def without_points(sight: Sight) -> Array:
-    """(V, w, w) products of what one camera saw, by views [px]; columns as of `PointTerms.normal`."""
+    """(V, w, w) normal matrices of one camera's views [px], with the columns of `PointTerms.normal`."""
     views, state, batches = sight.views, sight.state, sight.views.batches
     width = 12 + len(state.k)
     whole = width if sight.shapes is None else width + N_SHAPES
@@ -343,7 +343,7 @@ def without_points(sight: Sight) -> Array:
 
 
 def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Information:
-    """Of some views (V,) of one camera, from `without_points`; no point of the target is off."""
+    """Information of some views (V,) of one camera, from `without_points`, with fixed target points."""
     N = normal[which]
     columns = camera_columns(len(sight.state.k))[np.flatnonzero(sight.free)]
     of_pose, P = pose_columns(N.shape[1], sight.shapes is not None), len(N)
@@ -359,7 +359,7 @@ def of_views(sight: Sight, normal: Array, which: NDArray[np.bool_]) -> Informati
 
 
 def pose_columns(width: int, bends: bool) -> NDArray[np.intp]:
-    """Of a pose's own unknowns in normal matrices of so many columns: omega, tau, and bends if any."""
+    """Columns of a view's own unknowns in normal matrices of this width: omega, tau, and bends if any."""
     last = np.arange(width - 1 - N_SHAPES, width - 1) if bends else np.arange(0)
     return np.concatenate([np.arange(POSE.start, POSE.stop), last])
 
@@ -374,7 +374,7 @@ def with_bends(part: Array, by_point: Array, shapes: Array) -> Array:
     by_point : (T, 3, 2, n) array
         From `by_world`.
     shapes : (T, n, 3, 3) or (1, n, 3, 3) array
-        Offsets of the points for a coefficient of 1.
+        Offsets of the points for unit coefficients.
     """
     along = np.ascontiguousarray(np.moveaxis(shapes, 1, 3))  # (T, 3, 3, n)
     by_bend = sum(by_point[:, None, i] * along[:, i, :, None] for i in range(3))
@@ -392,7 +392,7 @@ def by_world(part: Array, state: CameraState, scale: Array, view: NDArray[np.int
 
 
 def labelled(views: Views, label: NDArray[np.intp]) -> NDArray[np.intp]:
-    """(T, n) the target's point in each place of the batches, -1 in places that only fill."""
+    """(T, n) index of the target point in each slot of the batches; -1 for padding."""
     numbers = np.column_stack([label, label]).astype(float)
     laid = batches_of(views.local, numbers, None, views.index, views.n_views)
     found = np.rint(laid.pixels[:, 0]).astype(np.intp)

@@ -1,7 +1,7 @@
-"""Lens and target found together, because a bent board looks like a lens and a lens like a bent board.
+"""Select lens model and target together, because lens distortion and a bent board leave similar residuals.
 
-Beginning with the lens that fits the given target, the next richer one is tried as long as it raises the
-evidence, then the next simpler one as long as it costs next to nothing.
+Starting from the lens selected for the given target, the next richer model is tried as long as it raises the
+evidence enough. If none does, the next simpler one is tried as long as it hardly lowers it.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from neurocal_cli.bundle_adjustment.problem import Problem
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.find import Found, evidence_as_given, find_target
 
-# Each has the coefficients of the one before and more.
+# Nested models: each has the coefficients of the previous one and more.
 _CHAIN = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")
-_RICHER = 4.0  # of the logarithm of the evidence: one in fifty
-_SIMPLER = -1.0
+_RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
+_SIMPLER = -1.0  # and for a simpler one
 
 
 def find_lens_and_target(
@@ -27,7 +27,7 @@ def find_lens_and_target(
     known: Target | None = None,
     least_gain: float = -np.inf,
 ) -> Found | None:
-    """Find where the points of a target really are, and which lens sees them there; see `find_target`."""
+    """Estimate the positions of the target's points and select the lens model; see `find_target`."""
     best = find_target(fits, flat, known, least_gain)
     if best is None:
         return None
@@ -43,7 +43,7 @@ def find_lens_and_target(
 
 
 def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
-    """With the next lens of the chain for every camera; None where a camera has none."""
+    """Estimate the target with the next lens model of the chain for every camera; None at the chain's end."""
     fits = []
     for problem, adjusted in found.fits:
         place = _CHAIN.index(adjusted.state.model) + step if adjusted.state.model in _CHAIN else -1
@@ -54,7 +54,7 @@ def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
 
 
 def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Found) -> bool:
-    """Whether richer lenses explain the points as given better than the target with the named ones.
+    """Whether more distortion coefficients and the given target fit better than the found target.
 
     Parameters
     ----------

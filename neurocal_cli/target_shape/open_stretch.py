@@ -1,10 +1,10 @@
-"""What a camera is uncertain by because its target was kept as given, though the print may be stretched.
+"""Uncertainty of the camera that comes from keeping the given target although its print may be stretched.
 
-Noise can hide that a print is stretched, and a stretched print moves the focal length. So where the choice
-kept the target, two stretches are open unknowns o: one side longer than stated, and sides that are not at
-right angles. Each is absent, or Gaussian with the size that prints have. The covariance is that of averaging
-over all four models, around the parameters for the given target, because those are reported; see
-`bundle_adjustment.open_coefficients`, which does the same for the lens.
+Noise can hide the stretch of a print, and a stretched print biases the focal length. So if the given target
+was kept, two stretches are open unknowns o: one side longer than stated, and sides that are not
+perpendicular. Each is either absent or has a Gaussian prior with the size typical of prints. The covariance
+is that of model averaging over all four models, around the reported parameters for the given target.
+`bundle_adjustment.open_coefficients` does the same for the lens.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ from neurocal_cli.least_squares.normal_equations import solve_scaled
 from neurocal_cli.target import is_flat
 from neurocal_cli.target_shape.prior import STRETCH
 
-# That there is one, each. Larger odds make clean data less certain; with these, the std of few views grow by
-# less than 1 % in the median. Repeated by tests/test_open_stretch.py and tests/test_campaign.py (slow).
+# Prior odds of each stretch. Larger odds make clean data less certain; with these, the std of few views grows
+# by less than 1 % in the median. Repeated by tests/test_open_stretch.py and tests/test_campaign.py (slow).
 _ODDS = 0.2
-_NEGLIGIBLE = 1e-3  # a probability that leaves standard deviations as they are, to the last bit
-_NO_PRINT = 5.0  # standard deviations of prints and pixels together: the points ask for something else
+_NEGLIGIBLE = 1e-3  # probability up to which the standard deviations stay unchanged to the last bit
+_NO_PRINT = 5.0  # standard deviations of prints and pixels together, beyond which it is no stretch of a print
 
 
 @frozen_dataclass(eq=False)
 class StretchedCovariance:
-    """What an open stretch adds to the covariance of a camera.
+    """Term that an open stretch adds to the covariance of a camera.
 
     Attributes
     ----------
     probability : float
+        That the print is stretched.
     entries : (f, f) array
-        For what is free of A's entries and the distortion coefficients.
+        For A's free entries and the free distortion coefficients.
     poses : (V, 6, 6) array
     """
 
@@ -51,16 +52,16 @@ class StretchedCovariance:
 def open_stretch(
     views: Views, state: CameraState, free: NDArray[np.bool_], world: Array, variance: float
 ) -> StretchedCovariance | None:
-    """What the stretch of a target adds; None where that is negligible, or the target is not flat.
+    """The term that the stretch of a target adds; None if it is negligible or the target is not flat.
 
     Parameters
     ----------
     views, state, free
-        Of a camera at its minimum with free poses, for the target as given.
+        Of a camera at its minimum with free poses, for the given target.
     world : (N, 3) array
         Points of the target.
     variance : float
-        Of the residuals, larger where they are correlated.
+        Of the residuals, enlarged if they are correlated.
     """
     if not is_flat(world):
         return None
@@ -77,10 +78,11 @@ def open_stretch(
 
 
 def stretches(world: Array) -> Array:
-    """(2, 3, 3) stretches of a plane along its sides: one longer, the other shorter; and both leaning.
+    """(2, 3, 3) unit deformations of a plane: one side longer and the other shorter; and shear of the sides.
 
-    With z = x + i y around the centre, 5 mean(z^2)^2 - mean(z^4) is positive for rectangles whose sides are
-    along x and y, and turns by four times the angle of the sides.
+    The sides' direction follows from the points: with z = x + i y around the centre, 5 mean(z^2)^2 -
+    mean(z^4) is positive for rectangles with sides along x and y, and rotates by four times the angle of the
+    sides.
     """
     centred = world - world.mean(axis=0)
     axes = np.linalg.svd(centred, full_matrices=False)[2]
@@ -92,12 +94,12 @@ def stretches(world: Array) -> Array:
 
 
 def spread_of_stretch(S: Array, g: Array, variance: float) -> SpreadOfOpen | None:
-    """What points tell of two stretches; None where that is negligible, or more than prints are stretched.
+    """Posterior of the two stretches; None if they are negligible, or larger than those of prints.
 
     Parameters
     ----------
     S : (f + 2, f + 2) array
-        Normal matrix of all that is free and the stretches, poses eliminated.
+        Normal matrix of the free parameters and the stretches, with the poses eliminated.
     g : (f + 2,) array
         Right side, J^T r.
     variance : float

@@ -1,18 +1,18 @@
-"""Offsets of the target's points from the pixels and the prior, and the prior's sizes from the evidence.
+"""Posterior of the offsets of the target's points, with the sizes of the prior estimated by empirical Bayes.
 
-With the noise's variance as the unit, the squared error and the prior make one quadratic
+In units of the noise variance, the squared error and the prior form one quadratic
 
     E = |r|^2 + sum_g lambda_g |w_g|^2,    lambda_g = sigma^2 / size_g^2,
 
-over the cameras, the poses and the parts w of the offsets (`system`). MacKay's (1992) steps find the sizes:
-of the n_g coefficients of a part, the data determine
+in the cameras, the poses and the parts w of the offsets (`system`). MacKay's (1992) updates find the sizes.
+Of the n_g coefficients of a part, the data determine
 
     gamma_g = n_g - lambda_g tr (H^-1)_gg,    lambda_g <- gamma_g sigma^2 / |w_g|^2.
 
-The two coefficients of a stretch hardly tell its size. It is at least that of prints, or nothing, whichever
-has more evidence.
+A stretch has only two coefficients, which hardly determine its size. So its size is either at least that of
+prints or zero, whichever has more evidence.
 
-The evidence, with the noise's variance marginalised too, tells whether there are offsets at all.
+The evidence, with the noise variance marginalised as well, decides whether there are offsets at all.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from neurocal_cli.target_shape.system import Solved, System
 
 @frozen_dataclass(eq=False)
 class Posterior:
-    """The most probable offsets, and what is known of the rest.
+    """The most probable offsets with their std, and the covariance of the cameras.
 
     Attributes
     ----------
@@ -44,18 +44,18 @@ class Posterior:
     camera_step : (f,) array
         Of the cameras' free parameters.
     camera : (f, f) array
-        Their covariance in units of the noise's variance; that the offsets are uncertain is in it.
+        Covariance of these in units of the noise variance, with the offsets marginalised.
     followed : (f, n, 3) array
-        S_cd S_dd^-1: how the cameras' scores follow those of the offsets.
+        S_cd S_dd^-1: regression of the cameras' scores on those of the offsets.
     std : (n, 3) array [world unit]
         Of the offsets, along each point's axes.
     sizes : dict of float by name [world unit]
     determined : float
-        How many of the offsets' unknowns the data determine.
+        Effective number of the offsets' unknowns that the data determine.
     evidence : float
-        Its logarithm; a priori every value of a camera's normalised parameters is as likely as any.
+        Log evidence, with a flat prior on the cameras' normalised parameters.
     poses : (P, 6, 6) array, optional
-        Covariance of each pose in units of the noise's variance, where the points are surveyed.
+        Covariance of each pose in units of the noise variance, if the points are surveyed.
     """
 
     offsets: Array
@@ -70,8 +70,8 @@ class Posterior:
     poses: Array | None = None
 
 
-_SINGLE = {"place": [0, 1], "height": [2]}  # axes of a point by itself
-_STATED = "stated"  # all of them, where a survey states their standard deviations: the factor of these
+_SINGLE = {"place": [0, 1], "height": [2]}  # axes of the parts of single points
+_STATED = "stated"  # the only part of surveyed points: the factor of their stated standard deviations
 _OUT_OF_PLANE = ("bend", "height")
 _START = {
     "fold": 3e-3,
@@ -81,21 +81,21 @@ _START = {
     "place": 3e-4,
     "height": 3e-4,
 }  # of the target's size
-_MOST = 2e-3  # of its size, of a stretch: a skew of the image axes looks like one
-_NOTHING = 1e-7  # of its size
+_MOST = 2e-3  # largest size of a stretch over the target's size: a skew of the image axes looks like one
+_NOTHING = 1e-7  # size of an absent part over the target's size
 _SETTLED = 0.03  # relative change of the sizes
-# Of the logarithm of the evidence, that a step must promise. With these, cameras are 0.017 standard
-# deviations rms from where 1e-5 leads; 24 draws of each kind by tests/support/simulated_targets.py.
+# Least predicted gain in log evidence of a step. With these, cameras differ by 0.017 standard deviations rms
+# from those with 1e-5; 24 draws of each kind by tests/support/simulated_targets.py.
 _NO_GAIN = 0.001
-_NO_GAIN_YET = 0.1  # from sizes that no data told, around a target that is about to move
-_FARTHEST = 8.0  # times MacKay's step
+_NO_GAIN_YET = 0.1  # the same from arbitrary initial sizes, around a target that will still move
+_FARTHEST = 8.0  # largest multiple of MacKay's step
 _HALVINGS = 6
 _PASSES = 40
-_NO_COST = 1e-300  # what rounding leaves may be negative
+_NO_COST = 1e-300  # lower bound of a cost, which rounding may make negative
 
 
 def evidence_of_given(info: Information) -> float:
-    """Logarithm of the evidence of the target as it is given."""
+    """Log evidence of the given target."""
     S, g, cost, logdet = _poses_eliminated(info)
     cost -= float(g @ np.linalg.solve(S, g)) if len(g) else 0.0
     logdet += float(np.linalg.slogdet(S)[1]) if len(g) else 0.0
@@ -103,20 +103,20 @@ def evidence_of_given(info: Information) -> float:
 
 
 def camera_step_of(info: Information) -> Array:
-    """(f,) steps of the cameras, the points being where they are given."""
+    """(f,) step of the cameras, with the points as given."""
     S, g, *_ = _poses_eliminated(info)
     return camera_step(S, g)
 
 
 def camera_step(S: Array, g: Array) -> Array:
-    """Steps of the cameras for their matrix (f, f) and right sides (f,) or (f, k)."""
+    """Steps of the cameras, given their matrix (f, f) and right sides (f,) or (f, k)."""
     scaled, scale = unit_diagonal(S)
     inverse = np.linalg.pinv(scaled, hermitian=True) * scale[:, None] * scale
     return np.asarray(inverse @ g)
 
 
 def _poses_eliminated(info: Information) -> tuple[Array, Array, float, float]:
-    """The cameras' matrix, right side and cost; the logarithm of the determinant of the poses' part."""
+    """Eliminate the poses: the cameras' matrix, right side and cost, and the log determinant of the poses."""
     if not len(info.pose):
         return info.camera, info.camera_right, info.cost, 0.0
     root = np.linalg.inv(np.linalg.cholesky(info.pose))
@@ -129,7 +129,7 @@ def _poses_eliminated(info: Information) -> tuple[Array, Array, float, float]:
 
 
 def log_evidence(spare: float, cost: float, logdet: float) -> float:
-    """Of a quadratic with this minimum and determinant; a priori the noise has a variance as 1 / sigma^2."""
+    """Log evidence of a quadratic with this minimum and log determinant; variance prior 1 / sigma^2."""
     least = max(cost, _NO_COST)
     return math.lgamma(0.5 * spare) - 0.5 * spare * math.log(math.pi * least) - 0.5 * logdet
 
@@ -141,24 +141,25 @@ def posterior(
     flat: bool = False,
     variance: float | None = None,
 ) -> Posterior:
-    """Find the sizes of the parts, and the offsets.
+    """Estimate the sizes of the parts, and the offsets.
 
     Parameters
     ----------
     info : Information
-        Around the given target, offsets along each point's axes.
+        In the whole offsets from the given target, along each point's axes.
     prior : Prior
     sizes : dict of float by name [world unit], optional
-        To begin with.
+        Initial sizes.
     flat : bool
-        Whether nothing leaves the plane.
+        Whether the points stay in their plane.
     variance : float, optional [px^2]
-        Of the noise, to begin with: beside sizes, errors for the given target are no noise.
+        Initial noise variance. It is needed with initial sizes, because then the errors on the given target
+        are no noise.
 
     Raises
     ------
     numpy.linalg.LinAlgError
-        Points that do not determine the cameras.
+        The points do not determine the cameras.
     """
     parts = _Parts(info, prior, flat, _NO_GAIN_YET if sizes is None else _NO_GAIN)
     noise = np.sqrt(info.cost / parts.spare if variance is None else variance)
@@ -171,7 +172,7 @@ def posterior(
 
 
 def given_posterior(info: Information, prior: Prior) -> Posterior:
-    """The same where the points stay as they are given."""
+    """The posterior with zero offsets: the points stay as given."""
     n, f = len(info.point), len(info.camera)
     S, g, cost, logdet = _poses_eliminated(info)
     inverse = np.linalg.inv(S)
@@ -191,9 +192,10 @@ def given_posterior(info: Information, prior: Prior) -> Posterior:
 
 
 def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Posterior:
-    """The same with sizes and a variance of the noise that are known.
+    """The posterior for known sizes and a known noise variance.
 
-    The variance stays that of the noise where sizes are stated: they do not follow the residuals.
+    For surveyed points the std keeps the given variance, because their stated sizes do not follow the
+    residuals.
 
     Raises
     ------
@@ -209,7 +211,7 @@ def known_sizes(info: Information, prior: Prior, sizes: Mapping[str, float], var
 
 
 def offsets_of(info: Information, prior: Prior, sizes: Mapping[str, float], variance: float) -> Array:
-    """(n, 3) the offsets alone, as of `known_sizes`.
+    """(n, 3) offsets of `known_sizes`, without the covariances.
 
     Raises
     ------
@@ -222,9 +224,9 @@ def offsets_of(info: Information, prior: Prior, sizes: Mapping[str, float], vari
 
 
 def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[float, float]]:
-    """Minimum and determinant for surveyed points by the ratio of their factor to the noise's std.
+    """Minimum and log determinant for surveyed points, as a function of factor over noise std.
 
-    The logarithm of the determinant is that of H less that of the precisions.
+    The log determinant is that of H minus that of the precisions.
     """
     parts = _Parts(info, prior, flat=False)
 
@@ -237,7 +239,7 @@ def quadratic_at(info: Information, prior: Prior) -> Callable[[float], tuple[flo
 
 
 def prior_covariance(prior: Prior, sizes: Mapping[str, float]) -> Array:
-    """(3 n, 3 n) of the offsets along each point's axes, for sizes of the parts [world unit]."""
+    """(3 n, 3 n) prior covariance of the offsets along each point's axes, for given sizes [world unit]."""
     n, m = len(prior.axes), prior.basis.shape[2]
     if prior.stated is not None:
         return np.diag((sizes[_STATED] * prior.stated.ravel()) ** 2)
@@ -251,7 +253,7 @@ def prior_covariance(prior: Prior, sizes: Mapping[str, float]) -> Array:
 
 @frozen_dataclass(eq=False)
 class _Solution:
-    """The quadratic solved for one set of sizes, in units of the noise's standard deviation."""
+    """The quadratic solved for one set of sizes, which are in units of the noise's standard deviation."""
 
     ratios: dict[str, float]
     solved: Solved
@@ -273,7 +275,7 @@ class _Parts:
         return self.allowed({name: _START[name] * self.prior.size for name in names})
 
     def allowed(self, sizes: Mapping[str, float]) -> dict[str, float]:
-        """Without those that leave the plane, where nothing may."""
+        """The sizes, without out-of-plane parts if the target must stay flat."""
         return dict(sizes) | {name: self.least for name in _OUT_OF_PLANE if self.flat and name in sizes}
 
     def at(self, ratios: dict[str, float]) -> _Solution:
@@ -284,26 +286,26 @@ class _Parts:
         return _Solution(ratios, solved, solved.cost / self.spare, evidence)
 
     def offsets(self, ratios: dict[str, float]) -> Array:
-        """(n, 3) for these sizes."""
+        """(n, 3) offsets for these sizes."""
         smooth, single = self.system.offsets(self.of_smooth(ratios), self.of_points(ratios))
         return np.asarray(self.prior.basis @ smooth + single)
 
     def of_smooth(self, ratios: Mapping[str, float]) -> Array:
-        """(m,) precisions of the coefficients, in units of the noise's."""
+        """(m,) precisions of the smooth coefficients, in units of the noise precision."""
         smooth = np.empty(self.system.m)
         for name, places in self.prior.groups.items():
             smooth[places] = (self.prior.size / ratios[name]) ** 2
         return smooth
 
     def of_points(self, ratios: Mapping[str, float]) -> Array:
-        """(n, 3) precisions of the points by themselves, in units of the noise's."""
+        """(n, 3) precisions of the single points' parts, in units of the noise precision."""
         if self.prior.stated is not None:
             return np.asarray((ratios[_STATED] * self.prior.stated) ** -2)
         place, height = (ratios[name] ** -2 for name in _SINGLE)
         return np.tile([place, place, height], (self.system.n, 1))
 
     def _coefficients(self, now: _Solution, name: str) -> tuple[Array, Array, float]:
-        """A part's coefficients, their variances, and the offset for a coefficient of 1."""
+        """A part's coefficients, their variances, and the offset for a unit coefficient."""
         if name in self.prior.groups:
             places = self.prior.groups[name]
             return now.solved.smooth[places], now.solved.smooth_variance[places], self.prior.size
@@ -314,9 +316,9 @@ class _Parts:
         return now.solved.single[:, columns], now.solved.single_variance[:, columns], 1.0
 
     def renewed(self, now: _Solution) -> tuple[dict[str, float], dict[str, float]]:
-        """MacKay's step, longer for parts of which the data determine little, where it would be too short.
+        """MacKay's update of the sizes, and the slopes of the log evidence by the logarithms of the sizes.
 
-        And the slopes of the evidence by the logarithms of the sizes.
+        The step is lengthened for parts that the data hardly determine, where MacKay's step is too short.
         """
         new, slope, noise = {}, {}, np.sqrt(now.variance)
         for name, ratio in now.ratios.items():
@@ -336,12 +338,12 @@ class _Parts:
         return now.ratios["stretch"] * float(np.sqrt(now.variance)) > np.sqrt(self.stretch * self.least)
 
     def with_stretch_changed(self, now: _Solution) -> dict[str, float]:
-        """The sizes with a stretch instead of none, or none instead of one."""
+        """The sizes with the stretch switched on or off."""
         size = self.least if self.is_stretched(now) else self.stretch
         return now.ratios | {"stretch": size / float(np.sqrt(now.variance))}
 
     def climbed(self, now: _Solution) -> _Solution:
-        """Steps to the most probable sizes, ever longer ones for those that change as they did before."""
+        """Ascend to the most probable sizes; steps grow for sizes that keep changing in one direction."""
         before, reach = dict.fromkeys(now.ratios, 0.0), dict.fromkeys(now.ratios, 1.0)
         for _ in range(_PASSES):
             wanted, slope = self.renewed(now)
@@ -365,7 +367,7 @@ class _Parts:
         return now
 
     def beyond(self, now: _Solution, step: dict[str, float], reach: dict[str, float]) -> dict[str, float]:
-        """Sizes after so many times these steps of their logarithms; a stretch has limits of its own."""
+        """Sizes after the given multiples of steps in their logarithms; a stretch has its own limits."""
         noise, most = np.sqrt(now.variance), self.prior.size
         sizes = {
             name: ratio * noise * np.exp(step[name] * (1.0 if name == "stretch" else reach[name]))
@@ -377,7 +379,7 @@ class _Parts:
         }
 
     def better(self, now: _Solution, wanted: dict[str, float]) -> Iterator[_Solution]:
-        """Sizes on the way to the wanted ones, ever nearer, that raise the evidence."""
+        """Solutions with higher evidence on the way to the wanted sizes, by step halving."""
         for halvings in range(_HALVINGS):
             part = 0.5**halvings
             trial = {name: ratio * (wanted[name] / ratio) ** part for name, ratio in now.ratios.items()}
@@ -386,7 +388,7 @@ class _Parts:
                 yield found
 
     def change(self, old: Mapping[str, float], new: Mapping[str, float]) -> float:
-        """Largest relative one of the sizes."""
+        """Largest relative change of the sizes."""
         return float(max(abs(np.log(new[name] / old[name])) for name in old))
 
     def posterior(self, now: _Solution) -> Posterior:

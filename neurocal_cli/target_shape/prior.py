@@ -1,18 +1,18 @@
-"""How a target may differ from its file: planes that stand at other angles, bends, stretches, single points.
+"""Prior of the offsets of a target's points: angles between planes, bends, stretches, single points.
 
-A priori each part of the offsets is Gaussian with a size that the data tell (`posterior`):
+Each part of the offsets has a Gaussian prior, whose size is estimated from the data (`posterior`):
 
-- fold: a plane of a folded target as a whole, turned and shifted;
-- bend: out of the plane, smooth;
-- stretch: in the plane, linear: one side longer than stated, or sides that are not at right angles;
-- warp: in the plane, smooth;
-- place and height: of each point by itself, in the plane and out of it.
+- fold: rigid motion of a plane of a folded target;
+- bend: smooth, out of the plane;
+- stretch: linear in the plane: one side longer than stated, or sides that are not perpendicular;
+- warp: smooth, in the plane;
+- place and height: independent for each point, in the plane and out of it.
 
-Points that were surveyed have the standard deviations that the survey states, each by itself along the
-world's axes, and nothing else (`surveyed_prior`). They also say where the world's axes are, and its scale.
+Surveyed points have only the standard deviations that the survey states, independent along the world's axes
+(`surveyed_prior`). They also determine the world's axes and scale.
 
-Smooth means the covariance exp(-|x - y|^2 / (2 l^2)) between two points of a plane, a Gaussian process; its
-largest eigenfunctions stand for it. A target that is solid all through warps in all directions alike.
+The smooth parts are Gaussian processes with the covariance exp(-|x - y|^2 / (2 l^2)) between two points of a
+plane, represented by its largest eigenfunctions. A solid target warps in all directions alike.
 """
 
 from __future__ import annotations
@@ -24,33 +24,34 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.target import Target, is_flat
 
-_LENGTH = 0.35  # of a plane's size, as printed boards bend; tests/test_target_shape.py tries others
-_LEAST = 1e-4  # of the largest eigenvalue: smaller ones are nothing
-_HELD = 1e-7  # of the target's size: a surveyed point that is exactly where it is stated
+_LENGTH = 0.35  # correlation length l over a plane's size, for printed boards; see tests/test_target_shape.py
+_LEAST = 1e-4  # of the largest eigenvalue: smaller ones are left out
+_HELD = 1e-7  # std of a surveyed point that is stated as exact, over the target's size
 # Std of a stretch, half of the relative difference of two sides. Four boards in photographs are stretched by
-# 0.03, 0.29, 0.00 and 0.05 %, and lean by 0.04, 0.04, 0.14 and 0.09 % (tests/test_target.py, slow).
+# 0.03, 0.29, 0.00 and 0.05 %, and sheared by 0.04, 0.04, 0.14 and 0.09 % (tests/test_target.py, slow).
 STRETCH = 1.5e-3
-# What a print leans by, over what it is stretched by: between 1, as in these photographs, and 0, as in
-# simulated boards. With 1, errors from five views of stretched and of twisted boards are 7 % and 2 % larger,
-# from those of bent ones 1 % smaller (tests/test_simulated_targets.py, slow).
+# Shear of a print relative to its stretch: between 1, as in these photographs, and 0, as in simulated boards.
+# With 1, errors from five views of stretched and of twisted boards are 7 % and 2 % larger, and from those of
+# bent ones 1 % smaller (tests/test_simulated_targets.py, slow).
 _LEANING = 0.3
-_MOST = 150  # points that the eigenfunctions are found from
+_MOST = 150  # most points from which the eigenfunctions are computed
 
 
 @frozen_dataclass(eq=False)
 class Prior:
-    """The parts that offsets are made of.
+    """Gaussian prior of the offsets, as a sum of parts.
 
     Attributes
     ----------
     axes : (n, 3, 3) array
         Columns: each point's axes, two in its plane and the normal.
     basis : (n, 3, m) array
-        Offsets along these axes [world unit] for each coefficient of 1.
+        Offsets along these axes [world unit] for unit coefficients.
     groups : dict of int array by name
-        Coefficients of the same size.
+        Indices of the coefficients with the same prior size.
     gauge : (3 n, 7) array
-        Orthonormal directions that no photograph tells: shifts, turns and a scale of the whole target.
+        Orthonormal gauge directions, which images do not determine: shifts, rotations and scale of the
+        target.
     size : float
         Of the target [world unit].
     stated : (n, 3) array, optional [world unit]
@@ -65,22 +66,22 @@ class Prior:
     stated: Array | None = None
 
     def along_axes(self, world: Array) -> Array:
-        """Offsets (n, 3) in the world's axes, along each point's own."""
+        """Convert offsets (n, 3) from the world's axes to each point's own."""
         return np.asarray((world[:, None] @ self.axes)[:, 0])
 
     def in_world(self, along: Array) -> Array:
-        """The inverse."""
+        """Convert offsets (n, 3) from each point's own axes to the world's."""
         return np.asarray((self.axes @ along[..., None])[..., 0])
 
 
 def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:
-    """Parts for the points of a target.
+    """Prior for the points of a target.
 
     Parameters
     ----------
     given : (n, 3) array [world unit]
     plane : (n,) int array
-        Plane that each point belongs to, numbered from 0.
+        Index of each point's plane, from 0.
     """
     n, planes = len(given), int(plane.max()) + 1
     size = float(np.ptp(given - given.mean(axis=0), axis=0).max())
@@ -105,7 +106,7 @@ def prior_of(given: Array, plane: NDArray[np.intp]) -> Prior:
 
 
 def surveyed_prior(given: Array, stated: Array) -> Prior:
-    """Prior of points (n, 3) with standard deviations (n, 3) that a survey states [world unit]."""
+    """Prior for surveyed points (n, 3) with stated standard deviations (n, 3) [world unit]."""
     n = len(given)
     size = float(np.ptp(given - given.mean(axis=0), axis=0).max())
     axes = np.broadcast_to(np.eye(3), (n, 3, 3))
@@ -113,7 +114,7 @@ def surveyed_prior(given: Array, stated: Array) -> Prior:
 
 
 def prior_of_target(target: Target) -> Prior:
-    """Prior that a target was found with."""
+    """The prior with which a target was estimated."""
     if target.stated is not None:
         return surveyed_prior(target.given, target.stated)
     return prior_of(target.given, target.plane)
@@ -134,7 +135,7 @@ def _axes(given: Array) -> tuple[Array, Array]:
 
 
 def _at(rows: NDArray[np.intp], part: Array, n: int) -> Array:
-    """Of all points (n, 3, m), from those of one plane."""
+    """Extend a part from the points of one plane to all points (n, 3, m)."""
     whole = np.zeros((n, *part.shape[1:]))
     whole[rows] = part
     return whole
@@ -157,7 +158,7 @@ def _of_plane(local: Array, flat: bool) -> list[tuple[str, Array]]:
 
 
 def _as_a_whole(centred: Array, axes: Array) -> Array:
-    """Shifts and turns of a plane (n, 3, 6), along its axes."""
+    """Shifts and rotations of a plane (n, 3, 6), along its axes."""
     shifts = np.broadcast_to(axes.T, (len(centred), 3, 3))
     turns = np.stack([np.cross(unit, centred) @ axes for unit in np.eye(3)], axis=2)
     return np.concatenate([shifts, turns], axis=2)

@@ -1,14 +1,13 @@
-"""Points in space whose standard deviations a survey states: where they are, found with the cameras.
+"""Adjust surveyed points, whose standard deviations are stated, together with the cameras.
 
-Each point is a priori Gaussian around its stated place, in the world's axes. Beside the points' places the
-noise of the pixels is unknown, and so is whether the survey's standard deviations hold: its variance sigma^2
-and a factor f on them all are told by the likelihood of the residuals with everything else marginalised
-(restricted maximum likelihood, Patterson and Thompson 1971),
+The prior of each point is Gaussian around its surveyed position, in the world's axes. Two more parameters are
+unknown: the variance sigma^2 of the pixels and a factor f on all stated standard deviations s. They are
+estimated by restricted maximum likelihood (Patterson and Thompson 1971), with everything else marginalised:
 
     -2 log L = m log sigma^2 + log det H - log det Lambda + E / sigma^2,    Lambda = sigma^2 / (f s)^2,
 
-with m residuals to spare, and H, Lambda and E as in `posterior`. As long as the residuals do not contradict
-the survey, f is 1.
+with m degrees of freedom, and H, Lambda and E as in `posterior`. Unless the residuals contradict the survey,
+f is 1.
 """
 
 from __future__ import annotations
@@ -32,32 +31,32 @@ from neurocal_cli.target_shape.prior import Prior, surveyed_prior
 
 _STEPS = 10
 _SETTLED = 0.02  # of the standard deviations of cameras and points
-_MOST_DENSE = 3000  # unknowns
+_MOST_DENSE = 3000  # most unknowns
 _GRID = 13
-_NEAR = 1e-3  # of a logarithm
-_LEAST_NOISE, _LARGEST_NOISE = 1e-3, 2.0  # of the residuals' level with the points as given
-_LEAST_RATIO = 1e-3  # of the noise, by points that are no worse than the pixels
-_CONTRADICTED = 5.0  # of the logarithm of the likelihood: one survey of 600 that is right
-_OFF = 1.4  # a factor that matters
+_NEAR = 1e-3  # accuracy of a logarithm
+_LEAST_NOISE, _LARGEST_NOISE = 1e-3, 2.0  # range of the noise over the residuals' level with the given points
+_LEAST_RATIO = 1e-3  # least ratio of survey error to pixel noise, and the reverse
+_CONTRADICTED = 5.0  # gain in log likelihood that contradicts the survey: one correct survey of 600
+_OFF = 1.4  # least factor that matters
 
 
 def find_surveyed(fits: Sequence[tuple[Problem, Adjusted]]) -> Found | None:
-    """Find where surveyed points are.
+    """Adjust surveyed points and cameras together.
 
     Parameters
     ----------
     fits : sequence of (Problem, Adjusted)
-        Cameras that saw the points where the survey has them, each at its minimum.
+        Cameras with the points at their surveyed coordinates, each at its minimum.
 
     Returns
     -------
     Found or None
-        None where there are too many points and views at once, or they determine nothing.
+        None if there are too many points and views, or if they do not determine the unknowns.
 
     Raises
     ------
     InputError
-        A point with two standard deviations.
+        A point has two different standard deviations.
     """
     all_points = [problem.points for problem, _ in fits]
     given, label, ids = distinct_points(all_points)
@@ -98,12 +97,12 @@ def find_surveyed(fits: Sequence[tuple[Problem, Adjusted]]) -> Found | None:
 
 
 def noise_variance(info: Information, prior: Prior, factor: float) -> float:
-    """Variance of the pixels [px^2] beside surveyed points.
+    """Most likely variance of the pixels [px^2], with surveyed points.
 
     Parameters
     ----------
     info : Information
-        Around the given points.
+        In the whole offsets from the surveyed points.
     prior : Prior
         Of surveyed points.
     factor : float
@@ -113,7 +112,7 @@ def noise_variance(info: Information, prior: Prior, factor: float) -> float:
 
 
 def _noise(info: Information, prior: Prior, factor: float) -> tuple[float, float]:
-    """The most likely variance of the pixels, and -2 log L."""
+    """Most likely variance of the pixels, and -2 log L."""
     at, spare = quadratic_at(info, prior), _spare(info)
 
     def likelihood(log_variance: float) -> float:
@@ -128,7 +127,7 @@ def _noise(info: Information, prior: Prior, factor: float) -> tuple[float, float
 
 
 def _factor(info: Information, prior: Prior) -> float:
-    """Factor on the stated standard deviations: 1 where the residuals do not contradict them."""
+    """Factor on the stated standard deviations: 1 unless the residuals contradict them."""
     at, spare = quadratic_at(info, prior), _spare(info)
     assert prior.stated is not None
 
@@ -136,7 +135,7 @@ def _factor(info: Information, prior: Prior) -> float:
         cost, logdet = at(np.exp(log_ratio))
         return spare * (np.log(cost / spare) + 1.0) + logdet
 
-    # How much the points' standard deviations add to the pixels', for a ratio of 1.
+    # Survey error in the image, in units of the pixel noise, for a ratio of 1.
     blur = np.sqrt(np.maximum(np.einsum("nii,ni->n", info.point, prior.stated**2).mean(), 1e-300))
     log_ratio, least = _lowest(likelihood, np.log(_LEAST_RATIO / blur), -np.log(_LEAST_RATIO * blur))
     cost, _ = at(np.exp(log_ratio))
@@ -150,7 +149,7 @@ def _spare(info: Information) -> float:
 
 
 def _lowest(function: Callable[[float], float], low: float, high: float) -> tuple[float, float]:
-    """Where a function of one variable is lowest, and its value: near the lowest of a grid."""
+    """Minimum of a function of one variable, refined from the lowest point of a grid; place and value."""
     from scipy.optimize import minimize_scalar
 
     grid = np.linspace(low, high, _GRID)
@@ -161,7 +160,7 @@ def _lowest(function: Callable[[float], float], low: float, high: float) -> tupl
 
 
 def _stated(all_points: Sequence[Correspondences], n: int, label: NDArray[np.intp]) -> Array:
-    """(n, 3) standard deviations of the different points."""
+    """(n, 3) stated standard deviations of the distinct points."""
     blocks = [
         np.zeros_like(points.world) if points.world_std is None else points.world_std for points in all_points
     ]

@@ -1,7 +1,7 @@
-"""The normal equations of cameras, poses and offsets, solved at given precisions of the offsets' parts.
+"""Solve the normal equations of cameras, poses and offsets for given prior precisions of the offsets' parts.
 
-Whichever of poses and points has more unknowns is eliminated first, block by block. What is left is dense, so
-the cost grows linearly with the views, or with the points.
+The Schur complement eliminates the poses or the points, whichever have more unknowns, block by block. The
+remaining system is dense. So the work grows linearly with the number of views or of points.
 """
 
 from __future__ import annotations
@@ -18,17 +18,17 @@ from neurocal_cli.target_shape.information import Information
 from neurocal_cli.target_shape.prior import Prior
 from neurocal_cli.target_shape.without_poses import WithoutPoses
 
-_SMALL = 48  # rows of a triangular matrix from which on its halves are inverted by themselves
-_RIDGE = 1e-10  # added to a unit diagonal where rounding has made a matrix indefinite
+_SMALL = 48  # largest triangular matrix that is inverted directly; others are split in halves
+_RIDGE = 1e-10  # added to a unit diagonal if rounding has made a matrix indefinite
 
 
 class System:
-    """The quadratic with its parts: what does not depend on the precisions is computed once.
+    """The quadratic with its parts; everything independent of the precisions is computed once.
 
     Parameters
     ----------
     info : Information
-        Around the given target, offsets along each point's axes.
+        In the whole offsets from the given target, along each point's axes.
     prior : Prior
     """
 
@@ -45,11 +45,11 @@ class System:
 
     @property
     def s(self) -> int:
-        """Number of the cameras' parameters and the smooth coefficients."""
+        """Number of camera parameters and smooth coefficients."""
         return self.f + self.m
 
     def _prepare(self) -> None:
-        """What points are eliminated from."""
+        """Compute the matrices from which the points will be eliminated."""
         info, basis = self.info, self.prior.basis
         by_basis = info.point @ basis  # (n, 3, m)
         across = np.einsum("nif,nim->fm", info.point_camera, basis)
@@ -60,7 +60,7 @@ class System:
         pose_basis = info.pose_point.reshape(self.P * self.p, 3 * self.n) @ flat
         pose_shared = np.concatenate([info.pose_camera, pose_basis.reshape(self.P, self.p, self.m)], axis=2)
         self.bordered = self._with_points(shared, right, pose_shared)
-        # (n, 3, s + P p + 1): what each point meets
+        # (n, 3, s + P p + 1): coupling of each point to all other unknowns and to the right side
         poses = np.moveaxis(info.pose_point, 2, 0).reshape(self.n, self.p * self.P, 3).swapaxes(1, 2)
         by_shared = [info.point_camera, by_basis]
         self.by_point = np.concatenate([*by_shared, poses, info.point_right[..., None]], axis=2)
@@ -82,7 +82,7 @@ class System:
         return M
 
     def _eliminate_poses(self) -> None:
-        """The bordered matrix of cameras, smooth parts and points, from that without the parts."""
+        """Eliminate the poses: the bordered matrix of cameras, smooth parts and points."""
         without = WithoutPoses(self.info)
         M, f, s, m = without.matrix(), self.f, self.s, self.m
         basis = self.prior.basis.reshape(3 * self.n, m)
@@ -96,11 +96,11 @@ class System:
         self.dense, self.logdet_poses = dense, without.logdet
 
     def solve(self, smooth: Array, single: Array) -> Solved:
-        """At given precisions (m,) of the smooth parts and (n, 3) of each point by itself."""
+        """Solve for given precisions (m,) of the smooth parts and (n, 3) of the single points."""
         return self._points_first(smooth, single) if self.points_first else self._poses_first(smooth, single)
 
     def least(self, smooth: Array, single: Array) -> tuple[float, float]:
-        """Cost at the minimum and the logarithm of the determinant, without the rest of `Solved`."""
+        """Cost at the minimum and log determinant, without the rest of `Solved`."""
         if self.points_first:
             M, root, _ = self._without_points(smooth, single)
             logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
@@ -118,7 +118,7 @@ class System:
         )
 
     def offsets(self, smooth: Array, single: Array) -> tuple[Array, Array]:
-        """Coefficients (m,) of the smooth parts and (n, 3) of each point by itself."""
+        """Coefficients (m,) of the smooth parts and offsets (n, 3) of the single points."""
         if not self.points_first:
             M = self._without_poses(smooth, single)
             x = np.asarray(np.linalg.solve(M[:-1, :-1], M[:-1, -1]))
@@ -129,7 +129,7 @@ class System:
         return x[self.f : self.s], (np.swapaxes(root, 1, 2) @ own[..., None])[..., 0]
 
     def _without_poses(self, smooth: Array, single: Array) -> Array:
-        """The bordered matrix of cameras, smooth parts and points."""
+        """The bordered matrix of cameras, smooth parts and points, with the precisions."""
         s, f = self.s, self.f
         M = self.dense.copy()
         at = np.arange(len(M) - 1)
@@ -163,9 +163,9 @@ class System:
         )  # fmt: skip
 
     def _poses(self, inverse: Array) -> Array | None:
-        """(P, 6, 6) covariance of the poses, from that of all the others; only where points are surveyed.
+        """(P, 6, 6) covariance of the poses from that of all other unknowns; only for surveyed points.
 
-        Elsewhere what no photograph tells of the target would be in it.
+        Without a survey it would include the gauge freedom of the target.
         """
         if self.prior.stated is None:
             return None
@@ -193,7 +193,7 @@ class System:
         half = root @ M[:dim, -1]
         x, variance = half @ root, np.einsum("ij,ij->j", root, root)
         cost = float(M[-1, -1] - half @ half)
-        # The points' own: how they follow all the others.
+        # Back-substitution of the points: their response to all other unknowns.
         back = np.swapaxes(own_root, 1, 2)
         e = (back @ (rows[:, :, -1] - rows[:, :, :-1] @ x)[..., None])[..., 0]
         follow = (back @ rows[:, :, :-1]).reshape(3 * n, dim)
@@ -223,9 +223,9 @@ class System:
         return np.asarray(np.einsum("fm,nim->fni", smooth, self.prior.basis) + single)
 
     def _variance(self, smooth: Array, cross: Array, single: Array, single_gauge: Array) -> Array:
-        """(n, 3) variance of the whole offsets, without turns, shifts and a scale of all points together.
+        """(n, 3) variance of the whole offsets, without the gauge: rotations, shifts and scale of all points.
 
-        With G the orthonormal directions of these, it is the diagonal of (I - G G^T) C (I - G G^T).
+        With G the orthonormal gauge directions, it is the diagonal of (I - G G^T) C (I - G G^T).
         """
         basis, G = self.prior.basis, self.gauge.reshape(self.n, 3, -1)
         diagonal = (
@@ -239,14 +239,14 @@ class System:
 
 
 class Rest(NamedTuple):
-    """What is asked only of the sizes that are best.
+    """Blocks of the covariance that are needed only for the final sizes.
 
     Attributes
     ----------
     camera_offsets : (f, n, 3) array
-        Covariance of the cameras and the whole offsets.
+        Covariance between the cameras and the whole offsets.
     offset_variance : (n, 3) array
-        Of the whole offsets, without what no photograph tells.
+        Variance of the whole offsets, without the gauge.
     poses : (P, 6, 6) array, optional
         Covariance of each pose.
     """
@@ -267,14 +267,14 @@ class Solved:
     smooth : (m,) array
         Coefficients of the smooth parts.
     single : (n, 3) array
-        What each point is off by itself.
+        Offsets of the single points' parts.
     cost : float
     logdet : float
-        Logarithm of the determinant of the whole matrix.
+        Log determinant of the whole matrix.
     smooth_variance, single_variance : (m,), (n, 3) array
     camera_covariance : (f, f) array
     rest : callable
-        Works out more blocks.
+        Computes further blocks.
     """
 
     camera: Array
@@ -289,13 +289,13 @@ class Solved:
 
 
 def _root_of_inverse(M: Array) -> tuple[Array, float]:
-    """A factor whose product R^T R is the inverse, and the logarithm of the determinant."""
+    """A factor R of the inverse R^T R, and the log determinant of the matrix."""
     scale = 1.0 / np.sqrt(np.diagonal(M))
     scaled = M * scale[:, None]
     scaled *= scale
     try:
         root = _inverse_of_triangular(np.linalg.cholesky(scaled))
-    except np.linalg.LinAlgError:  # coefficients that only tell together, as xi and alpha do
+    except np.linalg.LinAlgError:  # nearly degenerate coefficients, such as xi and alpha
         root = _inverse_of_triangular(np.linalg.cholesky(scaled + _RIDGE * np.eye(len(M))))
     logdet = -2 * float(np.log(np.diagonal(root)).sum() + np.log(scale).sum())
     root *= scale
@@ -303,7 +303,7 @@ def _root_of_inverse(M: Array) -> tuple[Array, float]:
 
 
 def _inverse_of_triangular(L: NDArray[np.floating]) -> Array:
-    """Of a lower triangular matrix, by halves: in a third of NumPy's time, which has no use for zeros."""
+    """Inverse of a lower triangular matrix, by halves: in a third of the time of NumPy's general inverse."""
     n, h = len(L), len(L) // 2
     if n <= _SMALL:
         return np.asarray(np.linalg.inv(L))

@@ -1,10 +1,10 @@
-"""What a camera's uncertainty is where its target was found with it.
+"""Uncertainty of a camera whose target was estimated with it.
 
-The target's points are uncertain themselves, so that the camera is known less well than from a target that
-is given. Its covariance comes from the whole system, with the offsets marginalised. For everything that
-looks at one view at a time, the derivatives by the camera are taken along the way that the offsets follow
-it: J_c - J_d T^T with T = S_cd S_dd^-1. These are the efficient scores of the camera (Bickel et al. 1993),
-of which sums over views have the information that is left.
+The target's points are uncertain as well, so the camera is less certain than with a given target. Its
+covariance comes from the whole system, with the offsets marginalised. Methods that work view by view use the
+efficient scores of the camera (Bickel et al. 1993) instead of its derivatives: J_c - J_d T^T with
+T = S_cd S_dd^-1, so that the offsets respond to the camera. Their sums over views contain the remaining
+information.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ _MOST_POSES = (
 
 @frozen_dataclass(eq=False)
 class CovarianceBasis:
-    """What the covariance of a camera is computed from (`covariance`, `counting_views`).
+    """Input of a camera's covariance (`covariance`, `counting_views`).
 
     Attributes
     ----------
     normal : (V, 12 + K, 12 + K) array
-        As from `reprojection.normal_blocks`; where a target was found, with the efficient scores of what is
-        free of the camera.
+        As from `reprojection.normal_blocks`; if the target was estimated, with the efficient scores of the
+        free camera parameters.
     shared : (f, f) array or None
-        Covariance of A's free entries and the free distortion coefficients, normalised, where it does not
-        follow from the normal matrices.
+        Covariance of A's free entries and the free distortion coefficients, normalised, if it does not follow
+        from the normal matrices.
     n_equations : float
-        Equations, less the unknowns of the target that they determine.
+        Number of equations minus the effective number of estimated unknowns of the target.
     moves_without : callable or None
-        How far the free parameters move without the views of each pose.
+        Moves of the free parameters when the views of each pose are left out.
     poses : (V, 6, 6) array or None
-        Covariance of the poses, where it does not follow from the normal matrices.
+        Covariance of the poses, if it does not follow from the normal matrices.
     """
 
     normal: Array
@@ -73,16 +73,16 @@ def covariance_basis(
     normal: Array,
     shared: Array | None = None,
 ) -> CovarianceBasis:
-    """What the covariance of a camera at its minimum rests on, for a target that is given or was found.
+    """Input of the covariance of a camera at its minimum, for a given or estimated target.
 
     Parameters
     ----------
     target : Target or None
-        The one that was found, if so.
+        The estimated target; None if it is given.
     views, state, free, free_poses
         As for `adjust`, at the minimum.
     points : Correspondences
-        Where the target has them.
+        With the coordinates of the target.
     normal : (V, 12 + K, 12 + K) array
         From `reprojection.normal_blocks`.
     shared : (f, f) array, optional
@@ -91,7 +91,7 @@ def covariance_basis(
     Raises
     ------
     numpy.linalg.LinAlgError
-        Points that do not determine the camera.
+        The points do not determine the camera.
     """
     if target is None:
         return CovarianceBasis(normal, shared, views.n_equations)
@@ -104,18 +104,18 @@ def covariance_basis(
 
 @frozen_dataclass(eq=False)
 class _TargetUncertainty:
-    """What a camera is known to be when its target is not quite known.
+    """Uncertainty of a camera with an uncertain target.
 
     Attributes
     ----------
     entries : (f, f) array
         Covariance of A's free entries and the free distortion coefficients, normalised.
     normal : (V, 12 + K, 12 + K) array
-        As from `reprojection.normal_blocks`, with the efficient scores of what is free of the camera.
+        As from `reprojection.normal_blocks`, with the efficient scores of the free camera parameters.
     determined : float
-        Unknowns of the target that the data determine.
+        Effective number of unknowns of the target that the data determine.
     poses : (V, 6, 6) array or None
-        Covariance of the poses, where the points are surveyed.
+        Covariance of the poses, if the points are surveyed.
     """
 
     entries: Array
@@ -129,10 +129,10 @@ class _TargetUncertainty:
     _variance: float
 
     def moves_without(self, group: NDArray[np.intp]) -> Array | None:
-        """(P, f) how far the camera's parameters move where the views of one pose are left out.
+        """(P, f) moves of the camera's parameters when the views of one pose are left out.
 
-        The target is found anew without them, in one step. None where the poses are many, and the efficient
-        scores tell the same.
+        One step also re-estimates the target without them. None if there are many poses: then the efficient
+        scores give the same.
 
         Parameters
         ----------
@@ -158,7 +158,7 @@ class _TargetUncertainty:
 
 
 def _solved(info: Information, prior: Prior, target: Target, variance: float) -> Posterior:
-    """Cameras and target, for a target whose parts have known sizes."""
+    """Posterior of cameras and target, with the known sizes of the target's parts."""
     from neurocal_cli.target_shape.posterior import given_posterior, known_sizes
 
     if target.bends is not None:
@@ -177,7 +177,7 @@ def _target_uncertainty(
     points: Correspondences,
     cost: float,
 ) -> _TargetUncertainty:
-    """Of one camera with this squared error [px^2]."""
+    """Uncertainty of one camera with this squared error [px^2]."""
     from neurocal_cli.target_shape.information import Sight, information_of, labelled
     from neurocal_cli.target_shape.prior import prior_of_target
     from neurocal_cli.target_shape.surveyed import noise_variance
@@ -186,7 +186,7 @@ def _target_uncertainty(
     label = label if views.order is None else label[views.order]
     prior = prior_of_target(target)
     sight = Sight(views, state, free, free_poses, label)
-    bent, bends = 0.0, np.zeros((views.n_views, N_SHAPES))  # unknowns that the data determine
+    bent, bends = 0.0, np.zeros((views.n_views, N_SHAPES))  # effective number that the data determine
     if target.bends is not None:
         bends = target.bends.of_views(views.names)
         sight = replace(sight, shapes=surface_of(target.given).offsets(target.found), bends=bends)
@@ -199,7 +199,7 @@ def _target_uncertainty(
         variance = noise_variance(info, prior, target.sizes["stated"])
     found = _solved(info, prior, target, variance)
     followed = np.einsum("fni,nji->fnj", found.followed, prior.axes)
-    followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # points of no target: -1
+    followed = np.concatenate([followed, np.zeros((len(followed), 1, 3))], axis=1)  # for label -1
     normal = _efficient(sight, labelled(views, label), followed)
     if target.bends is not None:
         normal = _without_bends(normal, bends, variance / (target.bends.size * views.pixel_scale) ** 2)
@@ -211,7 +211,7 @@ def _target_uncertainty(
 
 
 def _efficient(sight: Sight, label: NDArray[np.intp], followed: Array) -> Array:
-    """(V, 12 + K, 12 + K), or with three columns of bends before the residual."""
+    """(V, 12 + K, 12 + K) normal matrices of the efficient scores; with bends, three more columns."""
     from neurocal_cli.target_shape.information import by_world, with_bends
 
     views, state, shapes = sight.views, sight.state, sight.shapes
@@ -232,7 +232,7 @@ def _efficient(sight: Sight, label: NDArray[np.intp], followed: Array) -> Array:
 
 
 def _without_bends(normal: Array, bends: Array, precision: float) -> Array:
-    """With the bends (V, 3) integrated out; the squared error stays what it is with them."""
+    """Integrate out the bends (V, 3); the squared error stays that with them."""
     width = normal.shape[1]
     own = np.arange(width - 1 - N_SHAPES, width - 1)
     normal = normal.copy()

@@ -1,4 +1,4 @@
-"""The quadratic of cameras and offsets that is left when every pose is where it is best for them."""
+"""The quadratic in cameras and offsets with the poses eliminated (Schur complement)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from neurocal_cli.target_shape.information import Information
 
 
 class WithoutPoses:
-    """Information without its poses; those of other views add to it.
+    """Information with the poses eliminated; results for different views can be added.
 
     Parameters
     ----------
@@ -18,9 +18,9 @@ class WithoutPoses:
     Attributes
     ----------
     rows : (P p, f + 3 n + 1) array
-        What the poses take away is the product of these, for cameras, offsets and the right side.
+        Factor of the Schur complement's correction, for cameras, offsets and the right side.
     logdet : float
-        Logarithm of the determinant of the poses' part.
+        Log determinant of the poses' part.
     """
 
     def __init__(self, info: Information) -> None:
@@ -31,7 +31,7 @@ class WithoutPoses:
         self.logdet = -2 * float(np.log(np.diagonal(root, axis1=1, axis2=2)).sum())
 
     def matrix(self) -> Array:
-        """(f + 3 n + 1, f + 3 n + 1), with the right side and the cost as its border."""
+        """(f + 3 n + 1, f + 3 n + 1) reduced matrix, bordered by the right side and the cost."""
         info, f, n = self.info, len(self.info.camera), len(self.info.point)
         M = self.rows.T @ -self.rows
         M[:f, :f] += info.camera
@@ -48,7 +48,7 @@ class WithoutPoses:
         return np.asarray(M)
 
     def at(self, offsets: Array) -> tuple[Array, Array, Array]:
-        """The cameras' matrix (f, f), right sides (f, k) and costs (k,) beside certain offsets (k, n, 3)."""
+        """The cameras' matrix (f, f), right sides (f, k) and costs (k,) for given offsets (k, n, 3)."""
         info, f, k = self.info, len(self.info.camera), len(offsets)
         flat = offsets.reshape(k, -1).T
         by_camera, left = self.rows[:, :f], self.rows[:, -1:] - self.rows[:, f:-1] @ flat

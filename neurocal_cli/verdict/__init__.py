@@ -1,1 +1,1 @@
-"""A verdict on a calibration: the evidence, the word, the reasons and the advice."""
+"""The verdict on a calibration: measures, rules, reasons and advice."""

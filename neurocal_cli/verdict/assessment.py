@@ -1,17 +1,17 @@
-"""A verdict on a calibration: what the data says of it beyond the error it was trained on.
+"""Measure the quality of a calibration beyond its reprojection error, and reach a verdict.
 
-Everything follows from the calibration and its points, so a file can be judged as well as a result:
+Everything is computed from the calibration and its points, so a file can be judged like a fresh result:
 
-* the error on data left out (`cross_validation`);
-* the precision of the points themselves: what every view leaves when it has a camera of its own, a
-  free network (`outlier_views.free_networks`); a common camera that leaves more contradicts the data;
-* how far two halves of the data disagree, in units of their reported uncertainty;
-* whether residuals of neighbours are correlated (`residual_correlation`);
-* whether the views are of two cameras, or of a focal length that changes (`view_groups`);
-* whether the distortion model that was named lacks coefficients (`missing_coefficients`);
-* whether the points ask for other values of parameters that were given (`given_parameters`);
-* how much of the image and how many directions the points cover (`coverage`);
-* how far projected pixels would move with other noise (`projection_uncertainty`).
+* the cross-validation error (`cross_validation`);
+* the noise floor: the error if each view has its own camera, a free network (`outlier_views.free_networks`);
+  a common camera with a much larger error contradicts the data;
+* the difference between two halves of the data, in units of its reported uncertainty;
+* the correlation of neighbouring residuals (`residual_correlation`);
+* two cameras among the views, or a changing focal length (`view_groups`);
+* coefficients that the chosen distortion model lacks (`missing_coefficients`);
+* given parameters that the points contradict (`given_parameters`);
+* the coverage of the image and of directions by the points (`coverage`);
+* the uncertainty of projected pixels (`projection_uncertainty`).
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from neurocal_cli.verdict.board_shape import BoardShape, board_shape
 from neurocal_cli.verdict.coverage import cover
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import pixel_spread
-from neurocal_cli.verdict.given_parameters import asked_for
+from neurocal_cli.verdict.given_parameters import reestimate_given
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients, missing_coefficients
 from neurocal_cli.verdict.noise_shape import noise_shape
 from neurocal_cli.verdict.projection_uncertainty import (
@@ -69,19 +69,19 @@ from neurocal_cli.verdict.stated_noise import stated_noise, stated_survey
 from neurocal_cli.verdict.view_change import ViewChange, view_change
 from neurocal_cli.verdict.view_groups import ViewGroups, view_groups
 
-_STEPS = 5  # poses that were given, and a file that was edited, may be off the minimum
-_IN_PLANE = 1e-9  # depth over the largest one that rounding leaves of 0
-_BY_FLEXING = 0.01  # relative
-_EXACT = 1e-4  # of the spread of the pixels: errors that cost nothing
-_ALIKE = 0.1  # correlation of neighbours' residuals: noise leaves 0.04 of 600 points
+_STEPS = 5  # steps to the minimum, which given poses and an edited file may miss
+_IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
+_BY_FLEXING = 0.01  # relative change of the focal length that bends of single views can mimic
+_EXACT = 1e-4  # of the spread of the pixels: negligible errors
+_CORRELATED = 0.1  # correlation of neighbouring residuals; noise of 600 points gives 0.04
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
 
-# A file that was edited may have points in the camera's plane: what is measured of it says so.
+# In an edited file, points may lie in the camera's plane; the measures are then inf or nan.
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def gather_evidence(calibration: Calibration) -> Evidence:
-    """Measure how good a calibration is.
+    """Compute all measures of a calibration's quality.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def gather_evidence(calibration: Calibration) -> Evidence:
 
 
 def assess(calibration: Calibration) -> Verdict | None:
-    """Good, usable or poor, with the reasons; None for a calibration that holds no points of its own."""
+    """Good, usable or poor, with reasons and advice; None for a calibration without points of its own."""
     if not _has_points(calibration):
         return None
     behind = _views_behind(calibration)
@@ -108,7 +108,7 @@ def assess(calibration: Calibration) -> Verdict | None:
 
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
 def uncertainty_over_image(calibration: Calibration) -> ProjectionUncertainty | None:
-    """How uncertain projected pixels are; None without points or the size of the images."""
+    """Uncertainty of projected pixels over the image; None without points or image size."""
     if not _has_points(calibration) or _views_behind(calibration):
         return None
     return _AtMinimum(calibration).projection()
@@ -119,9 +119,9 @@ def _has_points(calibration: Calibration) -> bool:
 
 
 def _views_behind(calibration: Calibration) -> int:
-    """How many views have points behind the camera, or in its plane, as their stored poses say.
+    """Number of views with points behind the camera or in its plane, according to their stored poses.
 
-    Of a wide lens: points that it does not show.
+    For a wide lens: with points outside the domain of its model.
     """
     points = calibration.points
     poses = [calibration.views[name].pose for name in points.view_names]
@@ -137,7 +137,7 @@ def _views_behind(calibration: Calibration) -> int:
 
 
 class _AtMinimum:
-    """A calibration taken back into normalised units, at its minimum."""
+    """A calibration in normalised units, adjusted to its minimum."""
 
     def __init__(self, calibration: Calibration) -> None:
         self.calibration, self.points = calibration, calibration.points
@@ -178,10 +178,10 @@ class _AtMinimum:
         return weighed(self.points, -self._residuals())
 
     def evidence(self) -> Evidence:
-        """Everything that the rules look at."""
+        """All measures that the rules use."""
         views = self.views
         precision, contradiction = self._precision()
-        # Where a target was found, what it does not explain differs from view to view: it bends anew.
+        # Residuals beyond an estimated target come from bends that differ from view to view.
         found = self.calibration.target is not None
         noise = self.cost / self.spare * (max(contradiction, 1.0) ** 2 if found else 1.0)
         alike, residuals = correlation(views, self.errors), self._residuals()
@@ -201,7 +201,7 @@ class _AtMinimum:
             change=self._change(noise),
             board=self._board(),
             mirrored=tuple(seen_from_behind(views, self.state)),
-            asked_for=asked_for(views, self.state, self.calibration.fixed, self.free_poses),
+            reestimated=reestimate_given(views, self.state, self.calibration.fixed, self.free_poses),
             noise=(
                 *stated,
                 *stated_survey(self.calibration.target),
@@ -237,10 +237,10 @@ class _AtMinimum:
         return self.calibration.rmse_px * float(np.sqrt(lost.sum() / max(self.cost, 1e-300)))
 
     def _held_out_with_prior(self) -> Array:
-        """Squared errors of views that are left out, a rich lens's displacement being found without them.
+        """Squared errors of held-out views, with a rich lens's displacement estimated without them.
 
-        With everything, points and prior are balanced; without a fold F of the views the minimum is at
-        -(H - S_F)^-1 g_F, where H^-1 is the covariance for noise of unit variance.
+        At the minimum the gradients of points and prior cancel. Without a fold F of the views the minimum is
+        at -(H - S_F)^-1 g_F, where H^-1 is the covariance for noise of unit variance.
         """
         free, shared = _stored(self.calibration, self.views.pixel_scale)
         q, fold = reduced(self.normal, free, self.free_poses), self.repeated.folds(FOLDS)
@@ -268,7 +268,7 @@ class _AtMinimum:
         change = view_change(
             self.views, self.state, self.free, scores, self.repeated.group, variance, self.spare
         )
-        # A board that bends anew in each view makes two small groups of almost any views.
+        # A board that bends differently in each view mimics two slightly different groups of views.
         flexes = self.calibration.target is not None and change is not None and change.pattern == "groups"
         return None if flexes and change is not None and abs(change.amount) < _BY_FLEXING else change
 
@@ -281,7 +281,7 @@ class _AtMinimum:
 
     def _missing(self, alike: float) -> MissingCoefficients | None:
         chosen = self.calibration.lens_choice or self.calibration.straight_lines is not None
-        if chosen or alike < _ALIKE or not self.free[0]:
+        if chosen or alike < _CORRELATED or not self.free[0]:
             return None
         std = float(np.sqrt(self.covariance[0, 0]))
         return missing_coefficients(self.views, self.state, self.normal, self.free, self.free_poses, std)
@@ -296,13 +296,13 @@ class _AtMinimum:
         return chi * self.spare / max(self.cost, 1e-300) / len(difference)
 
     def projection(self) -> ProjectionUncertainty | None:
-        """How uncertain projected pixels are all over the image, if its size is known."""
+        """Uncertainty of projected pixels over the image; None if its size is unknown."""
         if self.points.image_size is None:
             return None
         view = self.points.view_index
         depth = (self.given.R[view, 2] * self.points.world).sum(axis=1) + self.given.t[view, 2]
         angle = None
-        if self.camera.distortion.wide:  # depths behind 90 degrees are none
+        if self.camera.distortion.wide:  # beyond 90 degrees there is no depth, so use distances
             angle = farthest_angle(self.views, self.state)
             depth = np.linalg.norm(
                 (self.given.R[view] @ self.points.world[..., None])[..., 0] + self.given.t[view], axis=1
@@ -328,9 +328,9 @@ class _AtMinimum:
 
 
 def _free(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) which of A's entries and of the distortion coefficients the points alone determined.
+    """(5 + K,) which of A's entries and the distortion coefficients were determined by the points alone.
 
-    A rich lens is judged with its displacement as it is.
+    The displacement of a rich lens counts as fixed.
     """
     fixed = {*calibration.fixed, *NODES}
     coefficients = coefficient_names(calibration.distortion_model)
@@ -342,7 +342,7 @@ def _free(calibration: Calibration) -> NDArray[np.bool_]:
 
 
 def _stored(calibration: Calibration, pixel_scale: float) -> tuple[NDArray[np.bool_], Array]:
-    """What was estimated, and the covariance that the calibration holds, with its prior, normalised."""
+    """Which parameters were estimated, and the stored covariance (including a prior), normalised."""
     names = (*INTRINSIC_NAMES, *coefficient_names(calibration.distortion_model))
     place = [names.index(name) for name in calibration.covariance_names]
     to_entries = np.eye(len(names))

@@ -1,11 +1,11 @@
-"""Whether the residuals repeat on the board: the signature of a flat target that is not as its points say.
+"""Test whether a flat board is bent or stretched: its residuals then repeat on the board in all views.
 
-A board that leaves its plane by d(x, y) moves each point's pixel by d times the derivative along the board's
-normal, in every view alike. Let d be a polynomial of the second and third degree. Its seven coefficients are
-unknowns of one more Gauss-Newton step, from the minimum and together with the camera and all poses. What they
-gain tells whether the board is bent, and the step of the camera how wrong it is for that. A print that is
-stretched along one of its sides, or whose sides are not at right angles, is told in the same way by two
-coefficients of displacements in the plane.
+If the board leaves its plane by d(x, y), the pixel of each point moves by d times its derivative along the
+board's normal. Let d be a polynomial of second and third degree. Its seven coefficients are added as unknowns
+to one Gauss-Newton step from the minimum, together with the camera and all poses. The gain of the step tells
+whether the board is bent, and the step of the camera how much that has biased it. A print that is stretched
+along one side, or whose sides are not perpendicular, is tested in the same way with two coefficients of
+in-plane displacements.
 """
 
 from __future__ import annotations
@@ -28,37 +28,37 @@ from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 from neurocal_cli.least_squares.schur_complement import eliminate
 
-# Of x and y: what bends a board smoothly. Lower ones are its plane.
+# Powers of x and y of a smooth bend; lower ones describe the plane.
 _POWERS = ((2, 0), (1, 1), (0, 2), (3, 0), (2, 1), (1, 2), (0, 3))
 _BENT = np.arange(len(_POWERS))
 _STRETCHED = len(_POWERS) + np.arange(2)  # displacements along x by x and by y
 _CHANCE = 4.75  # sigmas: one clean set in a million
-_FLAT = 0.02  # of its size: more is no board that happens to be bent
-_FEWEST = 3  # views
-_ENOUGH = 60  # views: more do not tell it better than it need be told
+_FLAT = 0.02  # largest thickness over size of a board that counts as flat
+_FEWEST = 3  # fewest views
+_ENOUGH = 60  # most views used; more are not needed for the test
 _RIDGE = 1e-13  # as in cross-validation
 _ACROSS = 11  # points of a grid on the board
 
 
 @frozen_dataclass
 class BoardShape:
-    """How a target that is said to be flat seems to be bent, or stretched.
+    """Estimated bend or stretch of a target that is given as flat.
 
     Attributes
     ----------
     bend : float
-        Between its highest and its lowest point, over its mean plane [world unit]; 0 where it is stretched.
+        Height between its highest and lowest point over the mean plane [world unit]; 0 if it is stretched.
     stretch, shear : float
-        By which share it is longer along its longer side than stated, against the shorter side; angle [rad]
-        by which its sides are off a right one. 0 where it is bent.
+        Relative stretch of the longer side against the shorter one; deviation of the angle between the sides
+        from a right angle [rad]. 0 if the board is bent.
     side : str
-        Axis of the world that is nearest to its longer side.
+        World axis nearest to the longer side.
     focal_length : float
-        By which share the focal length would change if the board were taken as it seems to be.
+        Relative change of the focal length if this shape were used.
     sigmas : float
-        That in standard deviations.
+        The same in standard deviations.
     explained : float
-        Share of the squared error that it explains.
+        Share of the squared error that the shape explains.
     """
 
     bend: float
@@ -79,22 +79,22 @@ def board_shape(
     times: float,
     std: float,
 ) -> BoardShape | None:
-    """See whether the board is bent or stretched; None where it is not, or where that cannot be told.
+    """Test whether the board is bent or stretched; None if it is not, or if the test is impossible.
 
     Parameters
     ----------
     views : Views
     state : CameraState
-        Normalised, at the minimum; poses were estimated.
+        Normalised, at the minimum, with estimated poses.
     free : (5 + K,) bool array
     variance : float
         Of the residuals, normalised.
     spare : float
         Equations beyond the unknowns.
     times : float
-        How many times the variance of sums over views is that of independent views (`repeated_poses`).
+        Variance of sums over views relative to that of independent views (`repeated_poses`).
     std : float
-        Of A11, normalised.
+        Standard deviation of A11, normalised.
     """
     if views.n_views < _FEWEST or not free[0] or not views.nearly_flat.all():
         return None
@@ -135,7 +135,7 @@ def board_shape(
 
 
 def _step(H: Array, g: Array, f: int, group: NDArray[np.intp]) -> tuple[Array, float]:
-    """Gauss-Newton step of f shared parameters and a group of the shape's, and what the group gains."""
+    """Gauss-Newton step of f shared parameters and a group of shape coefficients, and the group's gain."""
     some = np.concatenate([np.arange(f), f + group])
     inverse = inverse_or_nan(H[np.ix_(some, some)])
     step = inverse @ g[some]
@@ -146,7 +146,7 @@ def _step(H: Array, g: Array, f: int, group: NDArray[np.intp]) -> tuple[Array, f
 
 
 def _least(n: int) -> float:
-    """Chi-squared of n coefficients from which on they are no chance."""
+    """Critical chi-squared of n coefficients."""
     return n * float(exceeded_by_chance(n, _CHANCE))
 
 
@@ -172,13 +172,13 @@ class _Frame:
 
     @classmethod
     def of(cls, views: Views) -> _Frame | None:
-        """Axes of the points of all views, None where they lie in no plane."""
+        """Axes of the points of all views; None if they do not lie in a common plane."""
         world = views.local * np.repeat(views.scale, views.counts)[:, None]
         world += np.repeat(views.centre, views.counts, axis=0)
         centre = world.mean(axis=0)
         axes = np.linalg.eigh((world - centre).T @ (world - centre))[1][:, ::-1]
         size = np.abs((world - centre) @ axes).max(axis=0)
-        # All views must show one plane.
+        # All views must show the same plane.
         return cls(centre, axes, size[0], size[1] / size[0]) if size[2] <= _FLAT * size[0] else None
 
     def bend(self, coefficients: Array) -> float:

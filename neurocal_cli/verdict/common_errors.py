@@ -1,4 +1,4 @@
-"""What views say together that none says alone: two cameras, one that changes, a board that is bent."""
+"""Findings about errors common to the views: two cameras, a camera that changes, a bent board."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from neurocal_cli.verdict.view_groups import ViewGroups
 # bent by 0.2 mm and more. A result is off by half of a change; careful calibrations state 0.05 %.
 _CHANGED, _MUCH_CHANGED = 0.001, 0.05  # of the focal length
 _APART = Limit(0.01, 0.05)  # of the focal length
-# Small differences of one parameter that explain what two cameras would are those of one camera.
-_LARGE = 0.03  # of the focal length: beyond what score tests know
-_NEARLY = 0.7
-_NEAR = 0.02  # of the focal length
-# Real boards of good calibrations are bent, too; they cost up to 0.4 % and 1.3 sigmas.
+# A small change of one parameter is preferred to two cameras if it explains nearly as much.
+_LARGE = 0.03  # of the focal length: largest difference for which the score tests are valid
+_NEARLY = 0.7  # share of the explained error that counts as nearly as much
+_NEAR = 0.02  # of the focal length: equal up to this
+# Real boards of good calibrations are bent as well; they bias the focal length by up to 0.4 % and 1.3 sigmas.
 _OFF, _MUCH_OFF = 0.005, 0.05  # of the focal length
 _SIGMAS = 2.0
-_TOO_SIMPLE = Limit(1.2, 4.0)  # times the rms error with all coefficients
-# Times the noise floor that may be left when a cause is taken away: what leaves more is not the cause, or not
-# the only one. Of the wrong inputs, true causes leave up to 1.04 and others 1.38 and more.
+_TOO_SIMPLE = Limit(1.2, 4.0)  # rms error over that with all coefficients
+# Largest error, in units of the noise floor, that may remain without a cause; otherwise it is not the cause
+# or not the only one. Among the wrong inputs, true causes leave up to 1.04, and others 1.38 or more.
 _LEFT = 1.25
 
 
@@ -36,7 +36,7 @@ Cause = TypeVar("Cause", BoardShape, ViewChange, ViewGroups)
 
 
 def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding]:
-    """Reasons against a camera that is not the same in all views, or a board that is not flat.
+    """Findings about a camera that is not the same in all views, or a board that is not flat.
 
     Parameters
     ----------
@@ -44,12 +44,12 @@ def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding
     unit : str
         Of the world.
     wide : bool
-        Whether the lens is a wide one, whose rays may not meet in one point.
+        Whether the lens is wide, and so may have no single centre of projection.
     """
     change, board, groups = _explanation(evidence), evidence.board, evidence.groups
     missing = evidence.missing
     if missing is not None and _explains(missing.explained, evidence):
-        # Distortion that is left in the residuals looks like a bent board, and like several cameras.
+        # Residual distortion looks like a bent board, and like several cameras.
         least = missing.explained
         board, change, groups = _above(least, board), _above(least, change), _above(least, groups)
         if board is None and change is None and groups is None:
@@ -61,7 +61,7 @@ def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding
         yield _bent(board, unit)
     if change is None and groups is not None:
         yield _of_several_cameras(groups)
-    # Views of a bent board differ, and not by chance; rows given twice know less than they seem to.
+    # A bent board makes views differ significantly as well; duplicated rows exaggerate the significance.
     if change is not None and not evidence.repeated and (board is None or change.explained > board.explained):
         yield _changed(change, wide)
 
@@ -77,12 +77,12 @@ def _too_simple(missing: MissingCoefficients) -> Finding:
 
 
 def _above(share: float, cause: Cause | None) -> Cause | None:
-    """A cause, unless it explains less than a share of the squared error."""
+    """The cause, if it explains at least this share of the squared error."""
     return None if cause is None or cause.explained < share else cause
 
 
 def _explanation(evidence: Evidence) -> ViewChange | None:
-    """The pattern of views that is the reason; None where there is none, or two cameras are."""
+    """The change between views that explains the error; None if there is none, or if two cameras do."""
     change, groups = evidence.change, evidence.groups
     if change is None or not _explains(change.explained, evidence):
         return None
@@ -93,7 +93,7 @@ def _explanation(evidence: Evidence) -> ViewChange | None:
 
 
 def _explains(share: float, evidence: Evidence) -> bool:
-    """Whether hardly more than noise is left of the error without a share of its square."""
+    """Whether hardly more than noise remains if a share of the squared error is explained."""
     return not evidence.contradiction * np.sqrt(max(1.0 - share, 0.0)) > _LEFT
 
 
@@ -110,13 +110,13 @@ def _of_several_cameras(groups: ViewGroups) -> Finding:
     return (
         _APART.grade(groups.apart),
         f"the images come from two cameras, or {_alternative(first, second)}: {name_some(groups.names[0])} "
-        f"ask for {asked[0]}, the others for {asked[1]}",
+        f"fit {asked[0]}, the others {asked[1]}",
         "calibrate these views and the others separately",
     )
 
 
 def _alternative(first: Array, second: Array) -> str:
-    """What else than two cameras these are, from alpha_u, alpha_v, u0 and v0."""
+    """The alternative to two cameras, from alpha_u, alpha_v, u0 and v0 of both."""
     ratio = first / second
     if np.abs(ratio - ratio[0]).max() < _NEAR and abs(ratio[0] - 1) > _NEAR:
         return "are of two sizes"

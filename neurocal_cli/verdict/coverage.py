@@ -1,4 +1,4 @@
-"""How much of the image and of the directions in space the points cover."""
+"""Coverage of the image and of directions in space by the points."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _THIRDS = (
 
 @frozen_dataclass
 class Coverage:
-    """What the points cover.
+    """Coverage by the points of a calibration.
 
     Attributes
     ----------
     image : float
-        Share of the image's cells, 6 x 6, that hold a point; nan where the image's size is unknown.
+        Share of the image's 6 x 6 cells that hold a point; nan if the image size is unknown.
     empty : str
-        The emptiest part of the image, as "upper left"; "" where none is.
+        The emptiest part of the image, such as "upper left"; "" if all parts are covered.
     tilt : float
-        Largest angle between two planes of targets [degrees]; 90 for targets that are not flat.
+        Largest angle between the planes of two views' targets [degrees]; 90 for targets that are not flat.
     relief : float
-        How deep the deepest target is, over its distance; nan where all are flat.
+        Depth of the deepest target over its distance; nan if all are flat.
     """
 
     image: float
@@ -41,7 +41,7 @@ class Coverage:
 
 
 def cover(points: Correspondences, views: Views, state: CameraState) -> Coverage:
-    """See what the points of a calibration cover."""
+    """Coverage by the points of a calibration."""
     tilt = 90.0
     if views.nearly_flat.all():
         normals = (state.R @ views.basis)[:, :, 2]

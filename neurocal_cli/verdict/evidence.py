@@ -1,4 +1,4 @@
-"""What is measured of a calibration before it is judged."""
+"""The measures of a calibration from which its verdict follows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.verdict.board_shape import BoardShape
 from neurocal_cli.verdict.coverage import Coverage
 from neurocal_cli.verdict.findings import Finding
-from neurocal_cli.verdict.given_parameters import AskedFor
+from neurocal_cli.verdict.given_parameters import Reestimated
 from neurocal_cli.verdict.missing_coefficients import MissingCoefficients
 from neurocal_cli.verdict.projection_uncertainty import ProjectionUncertainty
 from neurocal_cli.verdict.view_change import ViewChange
@@ -15,46 +15,46 @@ from neurocal_cli.verdict.view_groups import ViewGroups
 
 @frozen_dataclass(eq=False)
 class Evidence:
-    """What was measured.
+    """Measures of a calibration's quality.
 
     Attributes
     ----------
     rmse_px : float [px]
-        Of the calibration.
+        Rms reprojection error of the calibration.
     held_out_px : float [px]
-        Rms error on data left out in five folds; nan where nothing can be left out.
+        Five-fold cross-validation error; nan if no data can be left out.
     precision_px : float [px]
-        Rms error that free networks leave, one for each view, freedom accounted for; nan where they
-        are no freer than the camera.
+        Noise floor: rms error of a free network for each view, corrected for degrees of freedom; nan if the
+        networks are no freer than the camera.
     contradiction : float
-        The camera's rms error, freedom accounted for, over `precision_px`; 1 for noise alone.
+        The camera's rms error, corrected for degrees of freedom, over `precision_px`; 1 for noise alone.
     disagreement : float
-        Squared difference of two halves of the data over its covariance, for each parameter; 1 when
-        the reported standard deviations hold.
+        Chi-squared per parameter of the difference between two halves of the data; 1 if the reported
+        standard deviations hold.
     correlation : float
-        Of neighbours' residuals; 0 for noise.
+        Correlation of neighbouring residuals; 0 for noise.
     condition : float
-        Of the normal matrix scaled to a unit diagonal.
+        Condition of the normal matrix scaled to a unit diagonal.
     coverage : Coverage
     projection : ProjectionUncertainty or None
-        At the nearest, the middle and the farthest point's distance, and at ten times that; None
-        where the image's size is unknown.
+        At the distances of the nearest, median and farthest point, and at ten times the farthest; None if the
+        image size is unknown.
     repeated, mirrored : tuple of str
-        Views that are copies of others; that show the target from its other side.
-    asked_for : tuple of AskedFor
-        Given parameters as the points would have them.
+        Views that are copies of others; views that show the target mirrored.
+    reestimated : tuple of Reestimated
+        Given parameters, estimated from the points.
     noise : tuple of Finding
-        Residuals that are not those of measuring, or not as the points state.
+        Residuals that do not look like measurement noise, or contradict the stated noise.
     groups : ViewGroups or None
-        Two cameras among the views, or a focal length that changes; None where nothing says so.
+        Two cameras among the views, or a changing focal length; None if there is neither.
     poses : int
-        Different poses among the views (`repeated_poses`).
+        Number of different poses among the views (`repeated_poses`).
     change : ViewChange or None
-        How the camera differs between views; None where it does not.
+        Change of the camera between views; None if there is none.
     board : BoardShape or None
-        How a target that is said to be flat seems to be bent; None where it does not.
+        Bend or stretch of a target that is given as flat; None if there is none.
     missing : MissingCoefficients or None
-        What distortion coefficients explain that the named model lacks; None where it lacks none.
+        Effect of coefficients that the chosen distortion model lacks; None if it lacks none.
     """
 
     rmse_px: float
@@ -68,7 +68,7 @@ class Evidence:
     projection: ProjectionUncertainty | None
     repeated: tuple[str, ...]
     mirrored: tuple[str, ...]
-    asked_for: tuple[AskedFor, ...]
+    reestimated: tuple[Reestimated, ...]
     noise: tuple[Finding, ...]
     groups: ViewGroups | None
     poses: int

@@ -1,4 +1,4 @@
-"""What a verdict is made of: findings, each with a grade, a reason and an advice; limits give the grades."""
+"""The parts of a verdict: findings with a grade, a reason and advice, and the limits for the grades."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _SHOWN = 3
 
 @frozen_dataclass
 class Limit:
-    """From where on a quantity is no longer good, and from where on it is poor."""
+    """Limits above which a quantity is no longer good, and above which it is poor."""
 
     good: float
     poor: float
 
     def grade(self, value: float) -> int:
-        """0 good, 1 usable, 2 poor; what is unknown is good."""
+        """0 good, 1 usable, 2 poor; nan counts as good."""
         return int(value > self.good) + int(value > self.poor)
 
 
 def verdict_of(findings: Iterable[Finding], measures: Mapping[str, float]) -> Verdict:
-    """The word of the worst finding, with all reasons and advice, the worst first and each once."""
+    """Verdict with the word of the worst finding, and all reasons and advice, the worst first, each once."""
     found = sorted((f for f in findings if f[0] > 0), key=lambda f: -f[0])
     return Verdict(
         WORDS[found[0][0] if found else 0],
@@ -43,14 +43,14 @@ def verdict_of(findings: Iterable[Finding], measures: Mapping[str, float]) -> Ve
 
 
 def name_some(names: Iterable[object]) -> str:
-    """The first names, and how many there are more."""
+    """List the first names, and the number of further ones."""
     some = [str(name) for name in names]
     more = len(some) - _SHOWN
     return ", ".join(some[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 def image_diagonal(points: Correspondences) -> float:
-    """Diagonal of the image [px], or of what the points span of it."""
+    """Diagonal of the image [px]; of the pixels' bounding box if the image size is unknown."""
     return float(np.hypot(*(points.image_size or np.ptp(points.pixels, axis=0))))
 
 

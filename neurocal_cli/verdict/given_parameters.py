@@ -1,7 +1,7 @@
-"""Whether the points agree with intrinsic parameters that were given, not estimated.
+"""Test whether the points agree with intrinsic parameters that were given.
 
-Poses take a wrong focal length or centre upon themselves, so that the error hardly grows: a board that seems
-too large is moved away. What the points themselves ask for is found with these parameters free.
+The poses absorb a wrong focal length or centre, so the error hardly grows: a board that appears too large is
+moved away. Therefore the given parameters are estimated from the points and compared.
 """
 
 from __future__ import annotations
@@ -15,15 +15,15 @@ from neurocal_cli.bundle_adjustment.views import Views
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 
 _NAMES = ("alpha_u", "alpha_v", "u0", "v0")
-_PLACES = (0, 2, 3, 4)  # among A's entries
-_THETA = 1  # stays as it is given
+_PLACES = (0, 2, 3, 4)  # indices among A's entries
+_THETA = 1  # a given theta stays fixed
 _STEPS = 20
 _WELL_POSED = 1e-7  # smallest eigenvalue of a normal matrix of unit diagonal
 
 
 @frozen_dataclass
-class AskedFor:
-    """A given parameter as the points would have it.
+class Reestimated:
+    """A given parameter and its estimate from the points.
 
     Attributes
     ----------
@@ -37,10 +37,10 @@ class AskedFor:
     std: float
 
 
-def asked_for(
+def reestimate_given(
     views: Views, state: CameraState, given: frozenset[str], free_poses: bool
-) -> tuple[AskedFor, ...]:
-    """Find what the points ask for in place of the focal lengths and the centre that are given.
+) -> tuple[Reestimated, ...]:
+    """Estimate the given focal lengths and the given centre from the points.
 
     Parameters
     ----------
@@ -53,8 +53,8 @@ def asked_for(
 
     Returns
     -------
-    tuple of AskedFor
-        None where nothing is given, or where the points do not tell.
+    tuple of Reestimated
+        Empty if none is given, or if the points do not determine them.
     """
     if given.isdisjoint(_NAMES):
         return ()
@@ -69,7 +69,7 @@ def asked_for(
     px, centre = views.pixel_scale, np.array([0, 0, 0, *views.pixel_centre])
     before, after = px * state.entries[0] + centre, px * adjusted.state.entries[0] + centre
     return tuple(
-        AskedFor(name, float(before[k]), float(after[k]), float(px * std[k]))
+        Reestimated(name, float(before[k]), float(after[k]), float(px * std[k]))
         for name, k in zip(_NAMES, _PLACES, strict=True)
         if name in given and np.isfinite(std[k])
     )

@@ -1,4 +1,4 @@
-"""The verdict on a calibration where it meets points that it was not calibrated from."""
+"""The verdict on a calibration with new points, from which it was not calibrated."""
 
 from __future__ import annotations
 
@@ -12,24 +12,24 @@ from neurocal_cli.verdict.assessment import gather_evidence
 from neurocal_cli.verdict.findings import WORDS, Finding, Limit, image_diagonal, pixel_spread
 from neurocal_cli.verdict.rules import ERROR, given_parameters
 
-# Times the error of the calibration. Good cameras stay below on 200 sets of new views of their own:
+# Ratio to the error of the calibration. Good cameras stay below the first limit on 200 sets of new views:
 # tests/test_given_points.py.
 _LARGER = Limit(1.5, 4.0)
-_CHANCE = 3.0  # standard deviations of an rms error of so few points
-_ROUNDING = 1e-4  # of the pixels' spread: an error below is as good as none
+_CHANCE = 3.0  # standard deviations by which the rms error of few points may be larger
+_ROUNDING = 1e-4  # of the pixels' spread: smaller errors are negligible
 
 
 @frozen_dataclass
 class GivenPoints:
-    """The error of a calibration on points that were given.
+    """The error of a calibration on given points.
 
     Attributes
     ----------
     rmse_px : float [px]
-        nan where no point lies in front of the camera.
+        nan if no point lies in front of the camera.
     n_points, n_behind : int
     fit : Calibration or None
-        The views among them whose poses were fitted, with the camera given.
+        The views whose poses were fitted to these points, with the camera given.
     """
 
     rmse_px: float
@@ -39,7 +39,7 @@ class GivenPoints:
 
 
 def judged_by_points(verdict: Verdict, calibration: Calibration, given: GivenPoints) -> Verdict:
-    """Add to a verdict what the error on given points says.
+    """Add the findings about given points to a verdict.
 
     Parameters
     ----------
@@ -55,8 +55,8 @@ def judged_by_points(verdict: Verdict, calibration: Calibration, given: GivenPoi
     """
     findings = [_error(verdict, calibration, given)]
     if given.fit is not None:
-        asked_for = gather_evidence(given.fit).asked_for
-        findings += given_parameters(asked_for, calibration.intrinsics, calibration.std)
+        reestimated = gather_evidence(given.fit).reestimated
+        findings += given_parameters(reestimated, calibration.intrinsics, calibration.std)
     findings = sorted((f for f in findings if f[0] > 0), key=lambda f: -f[0])
     if not findings:
         return verdict
@@ -77,11 +77,11 @@ def _error(verdict: Verdict, calibration: Calibration, given: GivenPoints) -> Fi
             f"{given.n_behind} of the {given.n_points} given points lie behind the camera",
             "check the signs of X,Y,Z, and that the points are of these views",
         )
-    # With few points of its own a calibration errs less on them than on any others.
+    # With few points, the error of a calibration on its own points is too small, so use cross-validation.
     held_out = verdict.measures.get("held_out_px", np.nan)
     own = float(np.fmax(calibration.rmse_px, held_out))
     own = max(own, _ROUNDING * pixel_spread(calibration.points))
-    # Two coordinates a point: the relative standard deviation of an rms error is 1 / sqrt(2 n).
+    # The relative standard deviation of an rms error of n numbers is 1 / sqrt(2 n); a point has two.
     ratio = error / (own * (1 + _CHANCE / np.sqrt(4 * seen)))
     grade = max(_LARGER.grade(ratio), ERROR.grade(error / image_diagonal(calibration.points)))
     return (

@@ -1,7 +1,7 @@
-"""Whether the distortion model that was named is too simple: more coefficients explain what it leaves.
+"""Test whether the distortion model is too simple: whether more coefficients explain the residuals.
 
-A camera with OpenCV's five coefficients is adjusted to the same points, beginning with the one that was
-found. Where it leaves hardly more than noise, the missing coefficients are the cause of the error.
+The camera is adjusted again with OpenCV's five coefficients, from the estimated parameters. If it then leaves
+hardly more than noise, the missing coefficients are the cause of the error.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from neurocal_cli.camera.distortion import coefficient_names
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_RICHEST = "plumb_bob"  # the coefficients of the simpler models and more
+_RICHEST = "plumb_bob"  # has the coefficients of all simpler models
 _STEPS = 60
-_ENOUGH = 60  # views: more do not tell it better than it need be told
+_ENOUGH = 60  # views: more are not needed
 _DECISIVE = 10.0  # of the Bayesian information criterion, as among models by cross-validation: odds of 150
 
 
 @frozen_dataclass
 class MissingCoefficients:
-    """What coefficients change which the named distortion model lacks.
+    """Effect of the coefficients that a distortion model lacks.
 
     Attributes
     ----------
     explained : float
         Share of the squared error that they explain.
     focal_length : float
-        By which share of it the focal length is too long without them.
+        Relative change of the focal length without them.
     sigmas : float
-        That in standard deviations.
+        The same in standard deviations, without sign.
     """
 
     explained: float
@@ -51,7 +51,7 @@ class MissingCoefficients:
 def missing_coefficients(
     views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], free_poses: bool, std: float
 ) -> MissingCoefficients | None:
-    """See whether the distortion model lacks coefficients; None where it lacks none, or by chance.
+    """Test whether the distortion model lacks coefficients; None if it lacks none, or not significantly.
 
     Parameters
     ----------
@@ -59,12 +59,12 @@ def missing_coefficients(
     state : CameraState
         Normalised, at the minimum.
     normal : array
-        Normal matrices of the views there.
+        Normal matrices of the views at the state.
     free : (5 + K,) bool array
         Which of A's entries and of the distortion coefficients are estimated.
     free_poses : bool
     std : float
-        Of A11, normalised.
+        Standard deviation of A11, normalised.
     """
     if not set(coefficient_names(state.model)) < set(coefficient_names(_RICHEST)):
         return None

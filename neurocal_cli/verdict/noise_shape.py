@@ -1,4 +1,4 @@
-"""Whether the residuals are alike in both directions and in all views, as those of measuring are."""
+"""Test whether the residuals have the same size in u and v and in all views, as measurement noise has."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import Finding, name_some, pixel_spread
 
 # Real sets stay below 1.3 and 3: opencv_stereo, sony_chess, fisheye_stereo, Zhang's.
-_ONE_WAY = 2.5  # rms along u over that along v
-_VIEW = 4.0  # rms of a view over that of the lower quartile of views
-_SYSTEMATIC = 0.5  # correlation of neighbours, from where the target or the lens is at fault
-_FEWEST = 12  # points
+_ONE_WAY = 2.5  # rms along u over that along v, or the reverse
+_VIEW = 4.0  # rms of a view over the lower quartile of all views
+_SYSTEMATIC = 0.5  # correlation of neighbouring residuals above which the target or the lens is the cause
+_FEWEST = 12  # fewest points
 _ROUNDING = 1e-4  # of the pixels' spread
 
 
 def noise_shape(points: Correspondences, residuals: Array, correlation: float) -> Iterator[Finding]:
-    """Name a direction, and views, in which the residuals are far larger than otherwise.
+    """Findings about a direction, or views, with much larger residuals than the others.
 
     Parameters
     ----------
     points : Correspondences
     residuals : (N, 2) array [px]
     correlation : float
-        Of neighbours' residuals: what is correlated is no error of measuring.
+        Of neighbouring residuals; correlated ones are no measurement noise.
     """
     if points.covariance is not None or len(points) < _FEWEST or correlation > _SYSTEMATIC:
         return

@@ -1,4 +1,4 @@
-"""Pixel coordinates that no measurement gives: rounded, clipped, normalised, outside of their image."""
+"""Findings about implausible pixel coordinates: rounded, clipped, normalised, outside the image."""
 
 from __future__ import annotations
 
@@ -11,16 +11,17 @@ from neurocal_cli.geometry import Array, distinct_rows
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import Finding, name_some
 
-_FEWEST = 20  # points of which all are whole numbers: not by chance
-_ALIKE = 6  # points at the very same outermost coordinate, and this share of all
+_FEWEST = 20  # fewest points from which whole numbers are no chance
+# Clipped: at least this number of points, and this share, have exactly the same outermost coordinate.
+_ALIKE = 6
 _ALIKE_SHARE = 0.01
-_BESIDE = 1.0  # px outside of the image: the extent of a point's surroundings
-_SOME = 0.01  # share of the points that may lie outside, as a few wrong ones
-_NORMALISED = 2.0  # no image is that small
+_BESIDE = 1.0  # px by which a detected point may lie outside the image
+_SOME = 0.01  # share of points outside the image up to which they count as single outliers
+_NORMALISED = 2.0  # coordinates below this are normalised; no image is that small
 
 
 def odd_pixels(points: Correspondences) -> Iterator[Finding]:
-    """Name what is odd about the pixels as numbers."""
+    """Findings about the pixels as numbers."""
     first, _ = distinct_rows(np.column_stack([points.pixels, points.world]))  # copies count once
     pixels = points.pixels[first]
     if np.abs(pixels).max() < _NORMALISED:
@@ -44,7 +45,7 @@ def odd_pixels(points: Correspondences) -> Iterator[Finding]:
 
 
 def _step(pixels: Array) -> int:
-    """What all coordinates are multiples of; 0 where they are not whole numbers."""
+    """Greatest common divisor of all coordinates; 0 if they are not whole numbers."""
     if len(pixels) < _FEWEST or np.abs(pixels).max() > 1e9 or (pixels != np.round(pixels)).any():
         return 0
     return int(np.gcd.reduce(pixels.astype(np.int64), axis=None))
@@ -97,7 +98,7 @@ def _beyond(pixels: Array, size: Array) -> NDArray[np.bool_]:
 
 
 def points_given_twice(points: Correspondences) -> Iterator[Finding]:
-    """Name views that have pixels of several images, or several pixels of the same point."""
+    """Findings about views with the points of several images, or several pixels for the same point."""
     table = np.column_stack([points.view_index, points.world])
     first, label = distinct_rows(table)
     seen, _ = distinct_rows(np.column_stack([label, points.pixels]))

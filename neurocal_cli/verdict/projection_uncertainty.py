@@ -1,14 +1,14 @@
-"""How far the pixel of a point in space would move if the calibration were done again with other noise.
+"""Projection uncertainty: std of the pixel of a point in space due to noise in the calibration.
 
-A point is held in the frames of the target's views, as in mrcal: what the camera sees at a pixel and
-a depth is taken through every view's pose to the target and, with the perturbed poses, back; the mean
-of that is where the perturbed camera sees it. So a change of the camera that its poses follow costs
-nothing, as it costs nothing to who uses the camera.
+As in mrcal, a point is fixed to the targets of the calibration. The point at a pixel and a depth is
+transformed to the target by each view's pose, and back by the perturbed pose; the perturbed camera projects
+the mean of the results. So a change of the camera that a common change of its poses compensates counts as no
+uncertainty, just as it does not matter to a user.
 
-To first order the mean over views of the perturbed poses is a motion (omega, T) of the camera's frame,
-p -> p + omega x p + T, and all follows from the normal matrices: with the shared parameters' covariance
-S^-1 and each view's pose, given them, B^-1, the motion is G d + e with the means G of -M B^-1 C^T and
-cov(e) of M B^-1 M^T, M turning a view's pose steps into motions.
+To first order, the mean of the perturbed poses is a motion (omega, T) of the camera's frame,
+p -> p + omega x p + T, and everything follows from the normal matrices. Let S^-1 be the covariance of the
+shared parameters d, and B^-1 that of each view's pose given them. Then the motion is G d + e, where G is the
+mean of -M B^-1 C^T over the views and cov(e) that of M B^-1 M^T; M converts a view's pose step to a motion.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from neurocal_cli.geometry import Array, cross_matrix
 from neurocal_cli.least_squares.leave_out import inverse_or_nan
 
 _ACROSS = 21  # points across the image
-# A wide lens may show this times the angle of the farthest point, and this angle in any case [rad].
+# The image circle of a wide lens is assumed to reach this times the angle of the farthest point, and at least
+# this angle [rad].
 _BEYOND, _LEAST = 1.1, 1.2
 
 
@@ -35,11 +36,11 @@ class ProjectionUncertainty:
     Attributes
     ----------
     pixels : (G, 2) array [px]
-        Places in the image; those that the camera cannot see are nan below.
+        Positions in the image; `std` is nan outside the domain of the lens.
     depths : (D,) array
         Distances along the optical axis [world unit].
     std : (D, G) array [px]
-        Of the pixel's length of error, ``sqrt(var u + var v)``.
+        Standard deviation of both coordinates together, ``sqrt(var u + var v)``.
     """
 
     pixels: Array
@@ -48,13 +49,13 @@ class ProjectionUncertainty:
 
     @property
     def worst(self) -> float:
-        """Largest one at the points' middle distance [px]; nan where the camera sees nothing of the image."""
+        """Largest std at the median distance of the points [px]; nan if it is nan everywhere."""
         seen = self.std[1][np.isfinite(self.std[1])]
         return float(seen.max()) if seen.size else float("nan")
 
 
 def image_grid(size: tuple[int, int]) -> Array:
-    """Places all over an image, its corners among them; (G, 2)."""
+    """Regular grid of pixels over an image, including its corners; (G, 2)."""
     width, height = size
     down = max(2, round(_ACROSS * height / width))
     u, v = np.meshgrid(np.linspace(0, width - 1, _ACROSS), np.linspace(0, height - 1, down))
@@ -74,7 +75,7 @@ def projection_uncertainty(
     shared: Array,
     farthest: float | None = None,
 ) -> ProjectionUncertainty:
-    """Propagate the covariance of a calibration.
+    """Propagate the covariance of a calibration to projected pixels.
 
     Parameters
     ----------
@@ -113,7 +114,7 @@ def projection_uncertainty(
 def _motions(
     views: Views, state: CameraState, normal: Array, shared: NDArray[np.intp], free_poses: bool
 ) -> tuple[Array, Array]:
-    """Gain G (6, f), cov(e) (6, 6); world units, residuals of unit variance."""
+    """Gain G (6, f) and cov(e) (6, 6) of the motion, in world units, for residuals of unit variance."""
     if not free_poses:
         return np.zeros((6, len(shared))), np.zeros((6, 6))
     V = views.n_views
@@ -131,7 +132,7 @@ def _motions(
 def _derivatives(
     camera: Camera, pixels: Array, scale: float, farthest: float | None
 ) -> tuple[Array, Array, Array]:
-    """Of the pixels (G, 2) by the normalised camera (5 + K) and by points at depth 1; rays (G, 3)."""
+    """Derivatives of pixels (G, 2) by the normalised camera (5 + K) and by points at depth 1; rays (G, 3)."""
     rays = camera.seen_points(pixels)
     if farthest is not None:
         rays = np.where(rays[:, 2:] < np.cos(min(max(_BEYOND * farthest, _LEAST), np.pi)), np.nan, rays)

@@ -1,4 +1,4 @@
-"""Whose points were left out: whole views, single views, the same points of the target in all views."""
+"""Findings about outliers: whole views, many points of a view, the same target points in most views."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import Finding, Limit, name_some
 
 _SHARE = Limit(0.02, 0.2)  # of the points
-_OF_A_VIEW = 0.2  # share of its points; clean views lose none
-_FEWEST = 4  # points of a view, or views of a point
-_OF_A_POINT = 0.6  # share of the views that show it
+_OF_A_VIEW = 0.2  # share of a view's points from which on it is named; clean views lose none
+_FEWEST = 4  # fewest outliers of a view, or views of a point
+_OF_A_POINT = 0.6  # share of its views in which a target point must be an outlier to be named
 
 
 def with_rejected(calibration: Calibration) -> Correspondences:
-    """World points and pixels of all points that were given, by view."""
+    """All given points, outliers included: world points and pixels by view."""
     kept, lost = calibration.points, calibration.rejected.points
     if lost is None:
         return kept
@@ -31,7 +31,7 @@ def with_rejected(calibration: Calibration) -> Correspondences:
 
 
 def rejected_points(calibration: Calibration) -> Iterator[Finding]:
-    """Say how many points were left out, and what they have in common."""
+    """Finding about the number of outliers, and what they have in common."""
     rejected = calibration.rejected
     lost = rejected.points
     if lost is None:
@@ -59,7 +59,7 @@ def rejected_points(calibration: Calibration) -> Iterator[Finding]:
 
 
 def _of_views(calibration: Calibration, lost: Correspondences) -> dict[str, int]:
-    """Outliers of views that lost many of their points, but not all."""
+    """Number of outliers in views that lost many of their points, but not all."""
     kept = dict(
         zip(calibration.points.view_names, np.bincount(calibration.points.view_index).tolist(), strict=True)
     )

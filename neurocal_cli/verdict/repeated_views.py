@@ -1,4 +1,4 @@
-"""Views that are no news: copies of each other."""
+"""Views that are copies of other views."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _SAME = 1e-3  # px
 
 
 def repeated_views(points: Correspondences) -> tuple[str, ...]:
-    """Views with the very pixels of an earlier view, and views with rows given twice."""
+    """Names of views with the same pixels as an earlier view, and of views with duplicated rows."""
     table = np.round(np.column_stack([points.pixels / _SAME, points.world]), 6)
     order = np.lexsort((*table.T, points.view_index))
     table, view = table[order], points.view_index[order]

@@ -9,7 +9,7 @@ from neurocal_cli.calibration import Verdict
 
 
 def verdict_lines(verdict: Verdict) -> list[str]:
-    """The word, what it rests on, what speaks against it and what to do next."""
+    """Lines of the verdict: the word, the main measures, reasons and advice."""
     lines = [f"verdict: {verdict.word}"]
     if found := facts(verdict):
         lines.append(f"  {found}")
@@ -19,7 +19,7 @@ def verdict_lines(verdict: Verdict) -> list[str]:
 
 
 def verdict_json(verdict: Verdict) -> dict[str, Any]:
-    """Turn a verdict into values that JSON can hold; a number that does not exist is None."""
+    """Convert a verdict to JSON values; numbers that are not finite become None."""
     measures = {name: value if math.isfinite(value) else None for name, value in verdict.measures.items()}
     return {
         "word": verdict.word,
@@ -30,7 +30,7 @@ def verdict_json(verdict: Verdict) -> dict[str, Any]:
 
 
 def facts(verdict: Verdict) -> str:
-    """What a verdict rests on."""
+    """The main measures of a verdict in one line."""
     m = verdict.measures
     texts = (
         ("held_out_px", "cross-validation error {:.3g} px"),

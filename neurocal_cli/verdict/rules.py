@@ -1,4 +1,4 @@
-"""One word on a calibration, good, usable or poor, with the reasons and what to do next."""
+"""The rules of the verdict: good, usable or poor, with reasons and advice."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from neurocal_cli.camera.pinhole import Intrinsics
 from neurocal_cli.verdict.common_errors import common_errors
 from neurocal_cli.verdict.evidence import Evidence
 from neurocal_cli.verdict.findings import Finding, Limit, image_diagonal, name_some, pixel_spread, verdict_of
-from neurocal_cli.verdict.given_parameters import AskedFor
+from neurocal_cli.verdict.given_parameters import Reestimated
 from neurocal_cli.verdict.pixel_values import odd_pixels, points_given_twice
 from neurocal_cli.verdict.rejected_points import rejected_points, with_rejected
 from neurocal_cli.verdict.units_of_views import views_of_another_scale
 
-# Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and tests/test_verdict.py, in
-# which real and simulated good data are; the errors, angles and shares are what a user would call large.
+# Repeated by tests/test_wrong_inputs.py, in which no wrong input may be good, and by tests/test_verdict.py,
+# in which real and simulated good data are good. The limits are what a user would call large.
 ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal: 1 and 5 px of 640 x 480
 _CONTRADICTION = Limit(1.6, 2.3)
-# Rms of what is above the noise floor over the image's diagonal, 0.16 px of 640 x 480: what hands and easels
-# bend a board from view to view leaves. Where the target was found it is in the standard deviations.
+# Rms error above the noise floor over the image's diagonal (0.16 px of 640 x 480) that a board leaves if it
+# is held by hand or on an easel and bends from view to view. If the target was estimated, the standard
+# deviations include it.
 _FLEXING = 0.0002
 _HELD_OUT = Limit(1.3, 2.0)  # over the rms error
 _DISAGREEMENT = Limit(6.0, 40.0)
@@ -32,18 +33,18 @@ _FLAT = Limit(-20.0, -5.0)  # degrees of tilt, negative
 _ALPHA = Limit(0.01, 0.05)  # std over the value
 _CENTRE = Limit(0.01, 0.05)  # std over alpha
 _PROJECTION = Limit(0.004, 0.05)  # worst std in the image over its diagonal
-_GIVEN = Limit(0.01, 0.05)  # difference over alpha; 100 cameras given truly stay below 5 std
-_TOLD_APART = 5.0  # standard deviations
-_SHALLOW = 0.1  # depth over distance: the focal length of 200 points is known to about 1 %
-_FEW_POSES = 10  # where views repeat them
+_GIVEN = Limit(0.01, 0.05)  # difference over alpha
+_TOLD_APART = 5.0  # standard deviations; 100 cameras with correctly given parameters stay below
+_SHALLOW = 0.1  # depth over distance at which 200 points determine the focal length to about 1 %
+_FEW_POSES = 10  # fewer poses are reported if views repeat them
 _OBLONG, _SKEW, _OFF_CENTRE = 0.03, 0.01, 0.1  # alpha_u / alpha_v, rad, share of the image's size
-_STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, however uncertain it is
+_STRETCHED = 2.0  # alpha_u / alpha_v that no camera has, whatever its std
 _NO_SINGLE_CAMERA = ": no single camera fits, as with a target of another shape or a rolling shutter"
 _TOLD = 3.0  # standard deviations
 
 
 def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
-    """Weigh the evidence.
+    """Apply the rules to the measures of a calibration.
 
     Returns
     -------
@@ -66,17 +67,17 @@ def reach_verdict(calibration: Calibration, evidence: Evidence) -> Verdict:
 
 
 def _findings(calibration: Calibration, evidence: Evidence) -> Iterator[Finding]:
-    if _oblong(calibration):  # views of a target that is too long in one direction differ as well
+    if _oblong(calibration):  # a target stretched in one direction makes views differ as well
         evidence = replace(evidence, groups=None)
     if not calibration.converged:
         yield 2, f"training did not converge: {calibration.stop_reason}", "increase --starts"
     errors = [finding for finding in _errors(calibration, evidence) if finding[0] > 0]
-    # What the errors have in common is their cause, even where it costs the camera little.
+    # A common error explains the others, so it is reported first even if it hardly biases the camera.
     wide = calibration.camera.distortion.wide
     for grade, reason, advice in common_errors(evidence, calibration.unit, wide):
         yield max(grade, int(bool(errors))), reason, advice
     yield from errors
-    yield from given_parameters(evidence.asked_for, calibration.intrinsics, calibration.std)
+    yield from given_parameters(evidence.reestimated, calibration.intrinsics, calibration.std)
     yield from _data(calibration, evidence)
     yield from _coverage(calibration, evidence)
     yield from _parameters(calibration, evidence)
@@ -124,19 +125,19 @@ def _errors(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 
 def _above_floor(e: Evidence) -> float:
-    """Rms error that is not noise [px]."""
+    """Rms error above the noise floor [px]."""
     return float(np.sqrt(max(e.rmse_px**2 - e.precision_px**2, 0.0)))
 
 
 def given_parameters(
-    asked_for: tuple[AskedFor, ...], given: Intrinsics, std: Mapping[str, float]
+    reestimated: tuple[Reestimated, ...], given: Intrinsics, std: Mapping[str, float]
 ) -> Iterator[Finding]:
-    """Given parameters, of these standard deviations, that the points contradict."""
-    told = [a for a in asked_for if abs(a.found - a.given) > _TOLD_APART * np.hypot(a.std, std[a.name])]
+    """Finding about given parameters, with these standard deviations, that the points contradict."""
+    told = [a for a in reestimated if abs(a.found - a.given) > _TOLD_APART * np.hypot(a.std, std[a.name])]
     if not told:
         return
     off = max(abs(a.found - a.given) for a in told) / given.alpha_u
-    texts = [f"{a.name} = {a.given:.5g} is given, but the points ask for {a.found:.5g} px" for a in told]
+    texts = [f"{a.name} = {a.given:.5g} is given, but the points give {a.found:.5g} px" for a in told]
     yield (
         _GIVEN.grade(off),
         ", ".join(texts),
@@ -198,7 +199,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
         yield (
             1,
             f"the target is only {100 * e.coverage.relief:.2g} % as deep as it is far away: too shallow to "
-            "tell the focal length and the centre",
+            "determine the focal length and the centre",
             "use a deeper target, or several views of it from different angles",
         )
     if "u0" not in fixed:
@@ -231,7 +232,7 @@ def _parameters(calibration: Calibration, e: Evidence) -> Iterator[Finding]:
 
 
 def _oblong(calibration: Calibration) -> bool:
-    """Whether the pixels are not square: beyond doubt, or by far."""
+    """Whether the pixels are not square: significantly, or by far."""
     A, std = calibration.intrinsics, calibration.std
     ratio = A.alpha_u / A.alpha_v
     told = _TOLD * (std["alpha_u"] + std["alpha_v"]) / A.alpha_v

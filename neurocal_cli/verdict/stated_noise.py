@@ -1,4 +1,4 @@
-"""Whether the residuals bear out the standard deviations that pixels and points came with."""
+"""Test whether the residuals agree with the stated standard deviations of pixels and world points."""
 
 from __future__ import annotations
 
@@ -12,18 +12,19 @@ from neurocal_cli.points import Correspondences
 from neurocal_cli.target import Target
 from neurocal_cli.verdict.findings import Finding, name_some
 
-_SHARE = 0.5  # of the noise that is the same for all points, whatever they state
-_FACTOR = 2.0  # between views whose sigma is too small and others; a std of 12 points is known to a fifth
+_SHARE = 0.5  # common share of the noise from which on the stated sigmas are wrong
+# Factor between views whose sigma is too small and the others; 12 points determine a std to a fifth.
+_FACTOR = 2.0
 _FEWEST = 12
 
 
 def stated_noise(points: Correspondences, residuals: Array) -> Iterator[Finding]:
-    """Name views whose sigma is too small, and sigmas that say nothing of the errors.
+    """Findings about views whose sigma is too small, and about sigmas unrelated to the residuals.
 
     Parameters
     ----------
     points : Correspondences
-        Covariances that a detector measured are not judged: `reweighting` does.
+        Covariances measured by a detector are not judged here, because `reweighting` handles them.
     residuals : (N, 2) array [px]
     """
     covariance = points.covariance
@@ -44,11 +45,11 @@ def stated_noise(points: Correspondences, residuals: Array) -> Iterator[Finding]
         factor = float(np.median(level[small])) / float(np.median(level[~small]))
         yield 1, f"{name_some(names)}: the stated sigma is {factor:.2g} times too small", advice
     else:
-        yield 1, "the stated sigmas say nothing of the residuals", advice
+        yield 1, "the stated sigmas do not predict the residuals", advice
 
 
 def stated_survey(target: Target | None) -> Iterator[Finding]:
-    """Say whether surveyed points are as exact as stated."""
+    """Finding about surveyed points that are more or less exact than stated."""
     factor = 1.0 if target is None or target.stated is None else target.sizes["stated"]
     if factor == 1.0:
         return
@@ -56,6 +57,6 @@ def stated_survey(target: Target | None) -> Iterator[Finding]:
     yield (
         1,
         f"the standard deviations sX,sY,sZ of the points are {factor if small else 1 / factor:.2g} times too "
-        f"{'small' if small else 'large'}; they are taken as the residuals ask for",
+        f"{'small' if small else 'large'}; they are scaled to match the residuals",
         "state sX,sY,sZ as the survey has them, in the unit of the points",
     )

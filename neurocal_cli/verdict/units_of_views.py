@@ -1,6 +1,6 @@
-"""Views whose world coordinates are in another unit, or of another size of squares, than the others'.
+"""Findings about views whose world coordinates have another unit or size of squares than the others'.
 
-Each view's pose takes such a scale upon itself: the camera does not suffer, but the poses are wrong.
+The pose of each view absorbs such a scale: the camera stays right, but the poses are wrong.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from neurocal_cli.median import median
 from neurocal_cli.points import Correspondences
 from neurocal_cli.verdict.findings import Finding, name_some
 
-_SCALED = 1.1  # times the distance of neighbouring points; boards of one set are equal to rounding
-_SHARED = 0.5  # of a view's points, seen in other views too: the same target, only partly seen
-_MOST_POINTS = 400  # of a view that are looked at
-_ROUND = 0.01  # relative, to which a ratio is one of units
+_SCALED = 1.1  # ratio of the spacing of points; in boards of one set it is 1 up to rounding
+_SHARED = 0.5  # share of a view's points that other views show as well: the same target, only partly seen
+_MOST_POINTS = 400  # most points of a view that are used
+_ROUND = 0.01  # relative difference within which a ratio is one of two units
 _UNITS = {
     25.4: "inches and millimetres",
     10.0: "centimetres and millimetres",
@@ -31,7 +31,7 @@ _UNITS = {
 
 
 def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
-    """Name the views in which neighbouring points lie farther apart, or nearer, than in the most views."""
+    """Findings about views in which the points are spaced wider or closer than in most views."""
     if points.n_views < 2:
         return
     order = np.argsort(points.view_index, kind="stable")
@@ -57,7 +57,7 @@ def views_of_another_scale(points: Correspondences) -> Iterator[Finding]:
 
 
 def _steps(worlds: list[Array]) -> Array:
-    """(V,) median distance of a point's nearest neighbour; worked out once for the same points."""
+    """(V,) median distance of a point's nearest neighbour; computed once for equal points."""
     known: dict[bytes, float] = {}
     found = []
     for world in worlds:
@@ -72,13 +72,13 @@ def _steps(worlds: list[Array]) -> Array:
 
 
 def _most_common(step: Array) -> float:
-    """The step that most views have; of two that as many have, the first view's."""
+    """The spacing that most views have; of two equally common ones, the first view's."""
     near = np.abs(np.log(step[:, None] / step[None])) < np.log(_SCALED)
     return float(step[np.argmax(near.sum(axis=1))])
 
 
 def _seen_in_others(worlds: list[Array], off: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether the points of each view are those of views that are not off, to rounding."""
+    """(V,) whether most points of each suspect view are also points of the other views."""
     known = np.unique(
         np.concatenate([np.round(w, 6) for w, one in zip(worlds, off, strict=True) if not one]), axis=0
     )

@@ -1,15 +1,15 @@
-"""Whether the camera is the same in all views: score tests, which need no other calibration.
+"""Score tests for a camera that changes between views, which need no new calibration.
 
-Let one parameter of the camera, the logarithm of its focal length or of the image's size, differ by delta_v
-from view to view. With each view's S_v and g_v (`cross_validation.reduced`), and a the step of the shared
-parameters that delta = 1 makes, its score is s_v = a.g_v, and the covariance of the scores is
+Let one parameter of the camera, the logarithm of its focal length or of the image size, differ by delta_v in
+view v. With S_v and g_v of each view (`cross_validation.reduced`), and the step a of the shared parameters
+for delta = 1, the score of a view is s_v = a.g_v, and the covariance of the scores is
 
     M = diag(a.S_v a) - B S^-1 B^T,   B_v = S_v a,
 
-in units of the noise's variance. A pattern c of views, delta_v = b c_v, has b = c.s / c.M c, known to
-1 / sqrt(c.M c). The patterns are a line along the sequence of the views, over the inverse of their distance
-and over the tilt of the target, a step at each place of the sequence, every other view, and the two groups
-that differ most. Differences are small here: `view_groups` knows larger ones.
+in units of the noise variance. For a pattern c of views, delta_v = b c_v, the estimate is b = c.s / c.M c
+with the standard deviation 1 / sqrt(c.M c). The patterns are: linear in the sequence of the views, in their
+inverse distance and in the tilt of the target; a step at each place of the sequence; every other view; and
+the two groups that differ most. The tests hold for small differences; `view_groups` finds larger ones.
 """
 
 from __future__ import annotations
@@ -27,24 +27,25 @@ from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.chi_squared import exceeded_by_chance
 from neurocal_cli.least_squares.leave_out import Quadratics, inverse_or_nan
 
-# Repeated by tests/test_view_change.py: on clean scenes less than one in a hundred is told, and on real
-# boards, whose views differ by more than noise, none is.
-_LINE = 3.5  # sigmas: one in 2000 for each
-_BY_POSE = 4.0  # sigmas: poses differ in six ways, and what a lens leaves differs with them
-_MOST_BY_POSE = 0.1  # of the focal length: no focus changes it by more
-_NEARER = 0.1  # of the farthest distance: less tells nothing of the focus
-_TURNED = 0.2  # rad
-_STEP = 4.5  # sigmas, of the largest of all steps
-_SCATTER = 1.645  # sigmas: the other views differ by more than noise in one case of 20
-_FEWEST = 5  # views
-# The largest chi-squared of two groups among V normal values, and its share of theirs, is exceeded in one
-# case of 1000 by 2/pi V + 6.5 + 2.75 sqrt(V), and by 2/pi + 1.06 / sqrt(V): 40,000 draws at V = 4 to 1000.
+# Repeated by tests/test_view_change.py: on clean scenes there is less than one false alarm in a hundred, and
+# on real boards, whose views differ by more than noise, none.
+_LINE = 3.5  # sigmas: one false alarm in 2000 for each test
+_BY_POSE = 4.0  # sigmas: poses differ in six ways, and lens errors are correlated with them
+_MOST_BY_POSE = 0.1  # of the focal length: refocusing changes it by no more
+_NEARER = 0.1  # least relative range of distances for a test of the focus
+_TURNED = 0.2  # rad; least range of tilts
+_STEP = 4.5  # sigmas of the largest of all steps
+_SCATTER = 1.645  # sigmas: one false alarm in 20 for scatter of the other views
+_FEWEST = 5  # fewest poses
+# Critical values (1 in 1000) for the best split of V normal values into two groups: its chi-squared exceeds
+# 2/pi V + 6.5 + 2.75 sqrt(V), and its share of the total 2/pi + 1.06 / sqrt(V). From 40,000 draws at V = 4 to
+# 1000.
 _MEAN, _TWO, _TWO_ROOT, _SHARE = 2.0 / np.pi, 6.5, 2.75, 1.06
 
 
 @frozen_dataclass
 class ViewChange:
-    """How the camera differs between views.
+    """A change of the camera between views.
 
     Attributes
     ----------
@@ -53,15 +54,15 @@ class ViewChange:
     pattern : str
         "line", "distance", "tilt along u", "tilt along v", "step" or "groups".
     amount : float
-        From the first view to the last, from the farthest to the nearest, from the one turned to the left or
-        upwards to the one turned to the right or downwards, or of the second group against the first, as a
-        share of it.
+        Relative change: from the first view to the last, from the farthest to the nearest, from the view
+        turned most to the left (or upwards) to that turned most to the right (or downwards), or of the second
+        group against the first.
     sigmas : float
-        In its standard deviations.
+        The same in standard deviations.
     explained : float
         Share of the squared error that it explains.
     views : tuple of str
-        The second group; for a line of any kind all views, in their sequence.
+        The second group; for the linear patterns all views, in their sequence.
     """
 
     what: str
@@ -73,7 +74,7 @@ class ViewChange:
 
 
 def in_sequence(names: tuple[str, ...]) -> list[int]:
-    """Places of names in their natural order, in which img2 is before img10."""
+    """Indices that sort names in natural order, in which img2 comes before img10."""
 
     def key(place: int) -> list[tuple[bool, int, str]]:
         parts = re.findall(r"\d+|\D+", names[place])
@@ -91,7 +92,7 @@ def view_change(
     variance: float,
     spare: float,
 ) -> ViewChange | None:
-    """Find how the camera differs between views: the most significant way, or None.
+    """Find the most significant change of the camera between views; None if there is none.
 
     Parameters
     ----------
@@ -127,7 +128,7 @@ def view_change(
 
 
 def _of_poses(views: Views, state: CameraState) -> Iterator[tuple[str, Array]]:
-    """What the poses differ by, (V,) each, where they do."""
+    """Properties of the poses, (V,) each, that vary enough for a test."""
     distance = np.linalg.norm(state.t, axis=1) * views.scale
     if np.ptp(distance) > _NEARER * distance.max():
         yield "distance", 1.0 / distance
@@ -141,7 +142,7 @@ def _of_poses(views: Views, state: CameraState) -> Iterator[tuple[str, Array]]:
 
 
 def _directions(views: Views, state: CameraState, free: NDArray[np.bool_]) -> Iterator[tuple[str, Array]]:
-    """Steps of A's entries and the coefficients, by what changes."""
+    """Steps of A's entries and the coefficients for a unit change, by the name of what changes."""
     focal, size = np.zeros((2, len(free)))
     focal[:3] = size[:3] = state.entries[0, :3]
     size[3:5] = state.entries[0, 3:5] + views.pixel_centre / views.pixel_scale
@@ -173,12 +174,12 @@ class _ScoreTest:
 
     @classmethod
     def of(cls, scores: Quadratics, step: Array, variance: float) -> _ScoreTest:
-        """Scores of the parameter that moves the free ones by a step (f,)."""
+        """Scores of the parameter whose unit change moves the free parameters by a step (f,)."""
         B = scores.S @ step
         return cls(scores.g @ step, B @ step, B, inverse_or_nan(scores.S.sum(axis=0)), variance)
 
     def cumulative(self, order: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Amounts and sigmas of the patterns that are 0 for the first k views of an order and 1 after."""
+        """Amounts and sigmas of all step patterns: 0 for the first k views of an order, 1 for the rest."""
         num = -np.cumsum(self.s[order])[:-1]  # the scores add up to 0
         B = np.cumsum(self.B[order], axis=0)[:-1]
         return self._tested(num, np.cumsum(self.information[order])[:-1], B)
@@ -198,7 +199,7 @@ class _ScoreTest:
         return np.where(usable, amount, 0.0), np.where(usable, sigmas, 0.0)
 
     def scatter(self) -> tuple[float, float]:
-        """Chi-squared of all views' differences, and its degrees of freedom."""
+        """Chi-squared of the differences between all views, and its degrees of freedom."""
         with np.errstate(divide="ignore", invalid="ignore"):
             chi = self.s**2 / self.information / self.variance
             shared = ((self.B @ self.S_inverse) * self.B).sum(axis=1) / self.information
@@ -209,7 +210,7 @@ class _ScoreTest:
 def _patterns(
     test: _ScoreTest, lines: dict[str, Array]
 ) -> Iterator[tuple[str, NDArray[np.bool_], float, float]]:
-    """Patterns that chance does not make: what, its second group, its amount and sigmas."""
+    """Significant patterns: name, second group, amount and sigmas."""
     place = lines["line"]
     P = len(place)
     order = np.argsort(place, kind="stable")
@@ -217,7 +218,7 @@ def _patterns(
     chi, freedom = test.scatter()
 
     def beyond_scatter(sigmas: float) -> float:
-        # Views that differ anyhow, as those of real boards do, make patterns by chance.
+        # If all views scatter by more than noise, as on real boards, patterns arise by chance.
         rest = (chi - sigmas**2) / max(freedom - 1, 1.0)
         usual = float(exceeded_by_chance(max(freedom - 1, 1.0), _SCATTER))
         return sigmas / float(np.sqrt(max(rest / usual, 1.0)))
@@ -251,5 +252,5 @@ def _patterns(
     if two > by_chance and two > (_MEAN + _SHARE / np.sqrt(freedom)) * max(chi, two):
         larger = ~everywhere
         larger[order[k + 1 :]] = True
-        # As many sigmas as a pattern known beforehand would have with what is beyond chance.
+        # Sigmas of an equally significant pattern that was fixed beforehand.
         yield "groups", larger, float(amounts[k]), float(np.sqrt(two - by_chance + _LINE**2))

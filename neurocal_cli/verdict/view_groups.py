@@ -1,9 +1,9 @@
-"""Whether the views are of two cameras, or of one whose focal length changes from view to view.
+"""Test whether the views come from two cameras, or from one whose focal length changes from view to view.
 
-A common camera puts conditions on the network of each view, two on a flat target's and five on a solid one's.
-What they cost in squared error, over the noise's variance and the number of conditions, is 1 for noise alone.
-Where they cost far more, the views are dealt to two cameras, each to the one that explains it better, and
-both are adjusted, as k-means does it with points. If two cameras leave hardly more than noise, there are two.
+A common camera imposes conditions on the network of each view: two for a flat target, five for a solid one.
+Their cost in squared error per condition, in units of the noise variance, is 1 for noise alone. If it is much
+larger, the views are clustered as in k-means: each view is assigned to the better of two cameras, and both
+cameras are adjusted to their views. If hardly more than noise remains, there are two cameras.
 """
 
 from __future__ import annotations
@@ -20,32 +20,32 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.least_squares.leave_out import Quadratics
 
-# By condition, in variances of the noise. Of 200 clean sets of 5 to 40 views none costs more than the first:
-# tests/test_view_groups.py repeats it.
+# Cost per condition in units of the noise variance: least cost of a contradiction, and largest cost that may
+# remain. Of 200 clean sets of 5 to 40 views none exceeds the first: tests/test_view_groups.py repeats it.
 _CONTRADICTS = 5.0
 _NOISE = 4.0
-_FEWEST = 2  # views of a group
-_SPARE = 4  # more conditions than what explains them has parameters
-_DIFFERENT = 0.01  # of the focal length
+_FEWEST = 2  # fewest views of a group
+_SPARE = 4  # least excess of conditions over the parameters that explain them
+_DIFFERENT = 0.01  # least difference, over the focal length
 _STARTS = 20
 _ROUNDS = 20
-OWN_STEPS = 40  # of a camera for each view
+OWN_STEPS = 40  # steps of a separate camera for each view
 _STEPS = 30
-_ADJUSTED = 4  # rounds with cameras that are adjusted, not only followed along the quadratic
+_ADJUSTED = 4  # clustering rounds with adjusted cameras, after those with the quadratic model
 
 
 @frozen_dataclass(eq=False)
 class ViewGroups:
-    """What the views ask for.
+    """Two cameras among the views, or a focal length for each view.
 
     Attributes
     ----------
     names : two tuples of str
-        The views of each camera, the smaller group first; empty where only the focal length changes.
+        The views of each camera, the smaller group first; empty if only the focal length changes.
     cameras : (2, 5) array [px]
-        alpha_u, theta's entry, alpha_v, u0 and v0 of both; nan where only the focal length changes.
+        A11, A12, A22, A13 and A23 of both; nan if only the focal length changes.
     scale : (V,) array
-        Focal length of each view over the common one; empty where there are two cameras.
+        Focal length of each view over the common one; empty if there are two cameras.
     explained : float
         Share of the squared error that this explains.
     """
@@ -57,7 +57,7 @@ class ViewGroups:
 
     @property
     def apart(self) -> float:
-        """Difference of the cameras, or of the focal lengths, over the focal length."""
+        """Largest difference of the cameras or of the focal lengths, over the focal length."""
         if self.scale.size:
             return float(np.ptp(self.scale))
         first, second = self.cameras[:, [0, 2, 3, 4]]
@@ -67,7 +67,7 @@ class ViewGroups:
 def view_groups(
     views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], networks: Array | None = None
 ) -> ViewGroups | None:
-    """Find two cameras among the views, or a focal length that changes; None where neither explains more.
+    """Find two cameras among the views, or a changing focal length; None if neither explains the error.
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def view_groups(
     normal : (V, 12 + K, 12 + K) array
     free : (5 + K,) bool array
     networks : (V,) array, optional
-        From `free_networks`, where that is known.
+        Result of `free_networks`, if known.
     """
     conditions = conditions_on_views(views, state)
     n_free = int(free[:5].sum())
@@ -153,7 +153,7 @@ def _two_cameras(
 
 
 def _dealt(quadratics: Quadratics) -> NDArray[np.bool_] | None:
-    """The best division into two that random ones lead to."""
+    """The best clustering into two groups from several random starts, with the quadratic model."""
     rng = np.random.default_rng(0)
     V = len(quadratics.cost)
     best, division = np.inf, None
@@ -181,26 +181,26 @@ def _adjusted(
 
 
 def _cost_of_each(views: Views, state: CameraState, camera: CameraState) -> Array:
-    """(V,) squared error of each view through a camera, with the pose that suits it best."""
+    """(V,) squared error of each view with a given camera and its best pose."""
     start = CameraState(camera.entries, state.R, state.t, camera.model, camera.k)
     return adjust(views.batches, start, np.zeros(5 + camera.k.shape[-1], dtype=bool), True, _STEPS).cost
 
 
 def _direction(state: CameraState, free: NDArray[np.bool_]) -> Array:
-    """Of a change of the focal length, among the free parameters."""
+    """Step of the free parameters for a relative change of the focal length."""
     scaled = np.zeros(len(free))
     scaled[:3] = state.entries[0][:3]
     return np.asarray(scaled[free])
 
 
 def _scales(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> Array:
-    """(V,) focal length of each view over the common one, by one step."""
+    """(V,) focal length of each view over the common one, by one Gauss-Newton step."""
     d = _direction(state, free)
     return np.asarray(1 + (q.g @ d) / np.einsum("i,vij,j->v", d, q.S, d))
 
 
 def _gain_of_scales(q: Quadratics, state: CameraState, free: NDArray[np.bool_]) -> float:
-    """Squared error that a focal length of each view's own would spare, the rest common to all."""
+    """Drop in squared error with a focal length for each view and all other parameters in common."""
     d = _direction(state, free)
     Sd, gd = q.S @ d, q.g @ d
     weight = 1 / np.maximum(Sd @ d, 1e-300)

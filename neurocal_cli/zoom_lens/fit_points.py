@@ -116,9 +116,9 @@ def fit_lens(
 
 
 def _with_target(fitted: ZoomLens, start: CalibratedSettings, found: Target) -> ZoomLens:
-    """The lens with its target, and what the target's uncertainty makes of its own."""
+    """Add the target to the lens, with the effect of its uncertainty."""
     coupling = None
-    with suppress(np.linalg.LinAlgError):  # a pose that nothing determines
+    with suppress(np.linalg.LinAlgError):  # an undetermined pose
         coupling = target_coupling(start.data, start.tables, found, start.variance)
     return replace(fitted, target=found, target_coupling=coupling)
 

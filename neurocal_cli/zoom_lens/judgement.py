@@ -1,7 +1,7 @@
-"""One word on a zoom lens, good, usable or poor, with the reasons and what to do next.
+"""The verdict on a zoom lens: good, usable or poor, with reasons and advice.
 
-It rests on what the lens itself holds: the settings that were left out, the error of the networks and of the
-settings predicted from all others, both over the noise floor, and the standard deviation of the focal length
+It uses only the lens itself: the rejected settings, the errors of the networks and of leave-one-out
+cross-validation over the settings (both over the noise floor), and the standard deviation of the focal length
 at the settings and between them. The noise floor is the error of a separate camera at each setting.
 """
 
@@ -20,7 +20,7 @@ from neurocal_cli.zoom_lens.zoom_lens import ZoomLens
 # Repeated by test_the_verdict_on_a_lens. The networks of smooth lenses stay within 1.04 of the noise floor
 # even between settings (slow tests in tests/test_zoom_lens.py).
 _CONTRADICTION = Limit(1.3, 2.3)  # rms error over the noise floor
-_BETWEEN = Limit(1.5, 4.0)  # rms error of settings left out over the noise floor
+_BETWEEN = Limit(1.5, 4.0)  # cross-validation error over the settings, over the noise floor
 _ONE = Limit(2.5, 10.0)  # rms error of the worst setting over the median
 _REJECTED = Limit(0.0, 0.2)  # share of the settings
 _ALPHA = Limit(0.01, 0.05)  # std over the value, of the worst setting
@@ -28,7 +28,7 @@ _ERROR = Limit(0.00125, 0.006)  # rms error over the image's diagonal, as of one
 
 
 def judge_lens(lens: ZoomLens, elsewhere_px: float = float("nan")) -> Verdict | None:
-    """Weigh what a lens holds; None for a lens of known cameras, which has no points.
+    """Judge a lens; None for a lens of known cameras, which has no points.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def _between(lens: ZoomLens) -> Array:
     apart = np.abs(scaled[:, None] - scaled)
     middles = [np.zeros((0, len(lens.controls)))]
     for k in range(len(lens.controls)):
-        # The nearest with another value of this control, others alike if there is one.
+        # The nearest setting with another value of this control, preferably with the same other value.
         distance = np.where(apart[..., k] > 0, 2 * apart.sum(axis=2) - apart[..., k], np.inf)
         nearest = distance.argmin(axis=1)
         known = np.isfinite(distance.min(axis=1))
@@ -67,7 +67,7 @@ def _between(lens: ZoomLens) -> Array:
 
 
 def _elsewhere(lens: ZoomLens, px: float) -> Finding:
-    """What the error at other points says, such as at settings between."""
+    """Finding about the error at other points, such as at settings in between."""
     floor = lens.noise_floor_px
     return (
         _BETWEEN.grade(px / max(floor, 1e-9)),

@@ -45,7 +45,7 @@ def contradiction(lens: ZoomLens, setting: Array, tables: Tables, s: int) -> str
     """
     try:
         prediction = lens.predict(setting[None])
-    except InputError:  # no camera there: another setting spoils what is left
+    except InputError:  # no valid camera there, because another setting is wrong
         return None
     L = len(lens.names)
     H = tables.normal.H[s, :L, :L]

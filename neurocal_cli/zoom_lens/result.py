@@ -82,7 +82,7 @@ def assemble(start: CalibratedSettings, joints: list[Joint], options: FitOptions
 
 
 def _refuse_contradiction(lens: ZoomLens, each: Array) -> None:
-    """Networks (M, S, L) that give no camera at a setting which they learnt: this is no lens."""
+    """Refuse networks with outputs (M, S, L) that are no valid camera at one of their own settings."""
     valid = (np.isfinite(each).all(axis=2) & (each[:, :, :2] > 0).all(axis=2)).all(axis=0)
     if valid.all():
         return

@@ -17,7 +17,7 @@ from neurocal_cli.pipeline.common_target import common_target
 from neurocal_cli.target import Target
 from neurocal_cli.zoom_lens.settings import LensPoints
 
-_SETTINGS = 12  # more tell little more of a target, and each has unknowns of its own
+_SETTINGS = 12  # most settings used; each adds unknowns, and more hardly improve the target
 _FEWEST = 2
 
 
@@ -29,7 +29,7 @@ def lens_target(
     seed: int,
     progress: Callable[[str, float], None],
 ) -> Target | None:
-    """Find the target; None where it stays as given.
+    """Estimate the target; None if it stays as given.
 
     Parameters
     ----------
@@ -57,5 +57,5 @@ def lens_target(
 
 
 def on_target(lens: LensPoints, target: Target | None) -> LensPoints:
-    """Points where the target has them."""
+    """Points with the coordinates of the target."""
     return lens if target is None else replace(lens, points=target.applied(lens.points))

@@ -1,12 +1,12 @@
-"""What the uncertainty of a target that was found does to the lens that was fitted to it.
+"""Uncertainty of a zoom lens that comes from the uncertainty of an estimated target.
 
-The offsets d of the target's points are common to all settings. With B_s = J_c^T J_d of a setting's local
-and shared parameters, poses eliminated, the weights w of the networks have the covariance
+The offsets d of the target's points are common to all settings. With B_s = J_c^T J_d of a setting's local and
+shared parameters (poses eliminated), the weights w of the networks have the covariance
 
     N^-1 + N^-1 K S^-1 K^T N^-1,    K = sum_s J_s^T B_s / sigma^2,    S = E^-1 - K^T N^-1 K,
 
-where N is their information with the target as found, and E the covariance of the offsets for a lens that is
-known: of the pixels and of the prior that the target was found with.
+where N is their information for a fixed target, and E the covariance of the offsets for a known lens, from
+the pixels and the prior of the target.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from neurocal_cli.target_shape.posterior import prior_covariance
 from neurocal_cli.target_shape.prior import prior_of_target
 from neurocal_cli.zoom_lens.setting_normals import PixelData, Tables
 
-_MOST = 60  # directions of the offsets that are kept
-_NOTHING = 1e-6  # of the strongest direction
-_LEAST = 0.02  # of a direction's information, that cannot be lost
+_MOST = 60  # most directions of the offsets that are kept
+_NOTHING = 1e-6  # relative strength below which a direction is dropped
+_LEAST = 0.02  # least share of a direction's information that remains
 
 
 def target_coupling(data: PixelData, tables: Tables, target: Target, variance: float) -> Array:
@@ -32,7 +32,7 @@ def target_coupling(data: PixelData, tables: Tables, target: Target, variance: f
     Parameters
     ----------
     data : PixelData
-        With the points where they were found.
+        With the points at their estimated coordinates.
     tables : Tables
         With the poses of all views.
     target : Target
@@ -87,12 +87,12 @@ def _block_diagonal(blocks: Array) -> Array:
 
 
 def with_target_uncertain(covariance: Array, J: Array, coupling: Array, variance: float) -> Array:
-    """Covariance of weights and constants, with that of the target.
+    """Covariance of weights and constants, including the uncertainty of the target.
 
     Parameters
     ----------
     covariance : (P + Q, P + Q) array
-        With the target as found.
+        For a fixed target.
     J : (S, L, P) array
         Derivatives of the local parameters.
     coupling : (S, L + Q, r) array

@@ -97,9 +97,9 @@ class ZoomLens:
     unit : str
     warnings : tuple of str
     target : Target or None
-        The one that was found from all settings together; the lens rests on it.
+        The target estimated from several settings together, to which the lens was fitted.
     target_coupling : (S, L + Q, r) array or None
-        What the target's uncertainty does to each setting; see `zoom_lens.target_coupling`.
+        Effect of the target's uncertainty on each setting; see `zoom_lens.target_coupling`.
     """
 
     controls: tuple[str, ...]
@@ -144,7 +144,7 @@ class ZoomLens:
 
     @property
     def noise_floor_px(self) -> float:
-        """Rms error of a separate camera at each setting, freedom accounted for [px]."""
+        """Rms error of a separate camera at each setting, corrected for degrees of freedom [px]."""
         return float(np.sqrt(2 * self.variance))
 
     def scaled(self, settings: Array) -> Array:

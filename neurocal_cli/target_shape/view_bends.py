@@ -1,7 +1,7 @@
-"""A flat board that bends anew in each view, found where the evidence for it is clear.
+"""Estimate a bend of the board in each view if the evidence for it is clear.
 
-Beside the target that all views share, given or found, each view has a bend of its own (`bends`). The
-alternatives are compared by their evidence: bends alone, and bends of a target that is found with them.
+Besides the common target, given or estimated, each view has a bend of its own (`bends`). Two models are
+compared by their evidence: bends of the given target, and bends with a target estimated together with them.
 """
 
 from __future__ import annotations
@@ -16,24 +16,24 @@ from neurocal_cli.target_shape.find import LEAST_GAIN, Found, Search, searched
 from neurocal_cli.target_shape.information import of_views, without_points
 from neurocal_cli.target_shape.posterior import evidence_of_given
 
-_FEWEST = 4  # views
-_EARLY = 0.5  # of the least gain, that the first step must promise
+_FEWEST = 4  # fewest views
+_EARLY = 0.5  # share of the required gain that the first step must predict
 
 
 def find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | None:
-    """Find how a board is bent in each view.
+    """Estimate the bend of the board in each view.
 
     Parameters
     ----------
     fit : (Problem, Adjusted)
-        A camera at its minimum for the board as it is given.
+        A camera at its minimum for the given board.
     common : Found, optional
-        The board that all views share, where one was found.
+        The estimated common shape of the board, if there is one.
 
     Returns
     -------
     Found or None
-        The board with its bends; the common one where these are not clearly more probable.
+        The board with its bends; `common` if the evidence for bends is not clear.
     """
     if not _may_bend(fit[0]):
         return common
@@ -52,7 +52,7 @@ def find_bends(fit: tuple[Problem, Adjusted], common: Found | None) -> Found | N
 
 
 def _may_bend(problem: Problem) -> bool:
-    """Whether there are enough views of one plane."""
+    """Whether there are enough views of a single plane, without measured distances."""
     if not problem.free_poses or problem.views.n_views < _FEWEST or problem.points.distances:
         return False
     given, _, ids = distinct_points([problem.points])
@@ -60,7 +60,7 @@ def _may_bend(problem: Problem) -> bool:
 
 
 def _promise(search: Search) -> tuple[float, float]:
-    """Logarithms of the evidence without and with bends, the points that all views share being certain."""
+    """Log evidence without and with bends, for fixed common points."""
     (sight,) = search.sights()
     info = of_views(sight, without_points(sight), np.ones(sight.views.n_views, dtype=bool))
     bent = info.held(most_probable_precision(info, search.prior.size, roughly=True))

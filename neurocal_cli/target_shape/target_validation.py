@@ -1,11 +1,12 @@
-"""Whether a target that was found explains views that it was not found from.
+"""Cross-validation of an estimated target: the offsets must explain held-out views.
 
-The evidence takes errors for independent noise of the stated size. Where they are not, as with a view whose
-stated sigma is far too small, offsets of the target can follow the errors of a few views. Views left out
-tell: the offsets that the other views give must lower their squared error, alone or together with the
-cameras that the other views give. Alone, beside cameras of their own: those of one or two views of a board
-take in its stretch or its bend, and then this tells nothing. Together, by what the views left out add to the
-squared error of the others: where a few views tell cameras and offsets only as a whole, this tells less.
+The evidence assumes independent noise of the stated size. If that is wrong, for example if the stated sigma
+of a view is far too small, the offsets of the target can fit the errors of a few views. Therefore the offsets
+estimated from the other views must lower the squared error of the held-out views in one of two tests. In the
+first, the held-out views have cameras of their own; it is inconclusive if these absorb the stretch or
+bend, as with one or two views of a board. In the second, all views share the cameras, and the increase of the
+total squared error by the held-out views counts; it is less sensitive if few views determine cameras and
+offsets only together.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from neurocal_cli.target_shape.posterior import camera_step, offsets_of, prior_c
 from neurocal_cli.target_shape.prior import Prior
 from neurocal_cli.target_shape.without_poses import WithoutPoses
 
-_FEWEST = 4  # views, so that the others determine a camera
+_FEWEST = 4  # fewest views, so that the others determine a camera
 _FOLDS = 5
 
 
-def holds_for_views_left_out(
+def passes_cross_validation(
     sights: Sequence[Sight],
     prior: Prior,
     offsets: Array,
@@ -33,12 +34,12 @@ def holds_for_views_left_out(
     variance: float,
     precision: float = 1.0,
 ) -> bool:
-    """See whether the offsets of the other views suit those left out; True where nobody can tell.
+    """Whether offsets estimated from the other views fit the held-out ones; True if that cannot be tested.
 
     Parameters
     ----------
     sights : sequence of Sight
-        At the minimum for the target that was found.
+        At the minimum for the estimated target.
     prior : Prior
     offsets : (n, 3) array
         Along each point's axes.
@@ -46,7 +47,7 @@ def holds_for_views_left_out(
     variance : float [px^2]
         Of the noise.
     precision : float
-        Of bends of each view, in units of the noise's, where the target has some.
+        Prior precision of the bends of single views, if any, in units of the noise precision.
     """
     n_views = max(sight.views.n_views for sight in sights)
     if sum(sight.views.n_views for sight in sights) < _FEWEST:
@@ -60,23 +61,23 @@ def holds_for_views_left_out(
 
     n_folds = min(n_views, _FOLDS)
     parts = [information(np.array([fold])) for fold in range(n_folds)]
-    # A camera with fewer views than there are folds is missing in some.
+    # A camera with fewer views than folds is missing in some folds.
     by_parts = len({len(part.camera) for part in parts}) == 1
     folds = np.arange(n_folds)
     try:
         if by_parts:
-            told = _told(parts, prior, sizes, variance)
+            estimated = _offsets_without_each(parts, prior, sizes, variance)
         else:
             others = [information(folds[folds != fold]) for fold in range(n_folds)]
-            told = [offsets_of(some, prior, sizes, variance) for some in others]
+            estimated = [offsets_of(some, prior, sizes, variance) for some in others]
     except np.linalg.LinAlgError:
         return True
-    tried = np.stack([np.zeros_like(offsets), *told])
+    tried = np.stack([np.zeros_like(offsets), *estimated])
     if by_parts:
         terms = [WithoutPoses(part).at(tried) for part in parts]
 
     def costs(which: NDArray[np.intp]) -> Array:
-        """At the best cameras and poses, without offsets and with those that each fold was not asked for."""
+        """Costs minimised over cameras and poses: without offsets, and with those from all but each fold."""
         if not by_parts:
             return _least(WithoutPoses(information(which)).at(tried))
         some = [terms[fold] for fold in which]
@@ -91,10 +92,10 @@ def holds_for_views_left_out(
     return bool(alone < 0 or together < 0)
 
 
-def _told(
+def _offsets_without_each(
     parts: Sequence[Information], prior: Prior, sizes: Mapping[str, float], variance: float
 ) -> list[Array]:
-    """Offsets that all parts but one tell, for each one that is left out."""
+    """Offsets estimated from all parts but one, for each part left out."""
     if 3 * len(prior.axes) > sum(part.pose_right.size for part in parts):
         others = [joined([part for part in parts if part is not out]) for out in parts]
         return [offsets_of(some, prior, sizes, variance) for some in others]
@@ -103,15 +104,15 @@ def _told(
     precision = np.zeros_like(matrices[0][:-1, :-1])
     precision[f:, f:] = variance * np.linalg.inv(prior_covariance(prior, sizes))
     whole = sum(matrices)
-    told = []
+    estimated = []
     for out in matrices:
         M = whole - out
         x = np.linalg.solve(M[:-1, :-1] + precision, M[:-1, -1])
-        told.append(np.asarray(x[f:].reshape(-1, 3)))
-    return told
+        estimated.append(np.asarray(x[f:].reshape(-1, 3)))
+    return estimated
 
 
 def _least(terms: tuple[Array, Array, Array]) -> Array:
-    """Costs (k,) at the best cameras."""
+    """Costs (k,) minimised over the cameras."""
     S, g, cost = terms
     return np.asarray(cost - (g * camera_step(S, g)).sum(axis=0))

@@ -1,8 +1,9 @@
-"""Whether bends of a board predict points of views that the camera was not found from.
+"""Cross-validation of bends: they must predict points of views from which the camera was not estimated.
 
-Of each view that is left out, every second point tells the pose and, from what the size of the bends is, the
-bend; the other points are predicted. With bends they must be predicted better than without. And no view may
-be bent far more than the others, because one odd view is no board that bends; nor all views in the same way.
+In each held-out view, half of the points determine the pose and, with the size of the bends as its prior, the
+bend; the other half is predicted. The prediction must be better with bends than without. In addition, no view
+may bend far more than the others, because a single odd view is no bending board, and the bends must not be
+common to all views.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from neurocal_cli.target_shape.information import Information, Sight, of_views, 
 from neurocal_cli.target_shape.posterior import camera_step_of
 
 _FOLDS = 5
-_FAR = 6.0  # times the rms of the other views
-_COMMON = 30.0  # times the mean square of what differs: one set in 200 of views that are bent at random
+_FAR = 6.0  # largest bend of a view over the rms of the other views
+_COMMON = 30.0  # largest common part over the mean square of the rest: exceeded in one random set of 200
 
 
-def bends_hold(sight: Sight, bends: Array, precision: float) -> bool:
-    """See whether bends explain views that are left out, and all views alike.
+def bends_are_valid(sight: Sight, bends: Array, precision: float) -> bool:
+    """Whether the bends are consistent over the views and improve the prediction of held-out views.
 
     Parameters
     ----------
@@ -28,13 +29,13 @@ def bends_hold(sight: Sight, bends: Array, precision: float) -> bool:
         At the minimum for these bends.
     bends : (V, 3) array [world unit]
     precision : float
-        Of the bends a priori, in units of the noise's.
+        Prior precision of the bends, in units of the noise precision.
     """
-    if not _alike(bends):
+    if not _consistent(bends):
         return False
     views = sight.views.index
     rank = np.arange(len(views)) - sight.views.first[views]
-    ratio = 0.0  # its logarithm, because a fold that needs a camera of few views would outweigh the others
+    ratio = 0.0  # log ratio, so that a fold whose camera comes from few views does not outweigh the others
     n_folds = min(sight.views.n_views, _FOLDS)
     halves = [without_points(sight.of_points(rank % 2 == half)) for half in (0, 1)]
     whole = halves[0] + halves[1]
@@ -45,8 +46,8 @@ def bends_hold(sight: Sight, bends: Array, precision: float) -> bool:
     return bool(ratio < 0)
 
 
-def _alike(bends: Array) -> bool:
-    """Whether no view is bent far more than the others, and not all in the same way."""
+def _consistent(bends: Array) -> bool:
+    """Whether no view is bent far more than the others, and the bends are not common to all views."""
     V, mean = len(bends), bends.mean(axis=0)
     squares = (bends**2).sum(axis=1)
     of_others = (squares.sum() - squares) / (V - 1)
@@ -55,7 +56,7 @@ def _alike(bends: Array) -> bool:
 
 
 def _lost(others: Information, halves: list[Information], precision: float | None) -> float:
-    """Squared error of each half of the points, its poses and bends being those of the other half."""
+    """Squared error of both halves of the points, each predicted with poses and bends of the other half."""
     if precision is None:
         others, halves = others.straight(), [half.straight() for half in halves]
         held = others, *halves
@@ -66,7 +67,7 @@ def _lost(others: Information, halves: list[Information], precision: float | Non
 
 
 def _own(info: Information, camera: Array) -> Array:
-    """(P, p) steps of the poses and their bends for the cameras' steps."""
+    """(P, p) steps of the poses and bends, given the step of the cameras."""
     right = info.pose_right - info.pose_camera @ camera
     return np.asarray(solve_scaled(info.pose, right[..., None])[..., 0])
 
