@@ -20,8 +20,8 @@ from neurocal_cli.geometry import Array
 Triple = tuple[float, float, float]
 
 _AXIS_TOLERANCE = 1e-6
-_FEWEST_MEASURED = 4  # places that tell a plane's bend
-_MOST_VERTICES = 1000  # along one side; no printer makes more, and a typing error asks for gigabytes
+_FEWEST_MEASURED = 4  # places that determine a plane's bend
+_MOST_VERTICES = 1000  # along one side; no printer makes more, and a typing error would need gigabytes
 
 
 @frozen_dataclass
@@ -41,8 +41,8 @@ class Plane:
     x_axis, y_axis : 3 floats
         Unit vectors, perpendicular to each other.
     measured : tuple of 5 floats each
-        Places (c, r) in squares, and X, Y, Z where the point there really is; none: all are where they
-        should be.
+        Places (c, r) in squares, and the measured X, Y, Z of the point there; none: all points are at their
+        nominal positions.
 
     Raises
     ------
@@ -104,9 +104,9 @@ class Plane:
         return lengths @ np.array([self.x_axis, self.y_axis]) + np.array(self.origin)
 
     def truly_at(self, grid: ArrayLike) -> Array:
-        """World coordinates where points really are: as measured, and smoothly in between.
+        """True world coordinates: as measured, and interpolated smoothly in between.
 
-        A thin-plate spline through what was measured of the plane's points.
+        A thin-plate spline through the measured points of the plane.
 
         Parameters
         ----------
@@ -187,7 +187,7 @@ class Board:
     unit : str
         Of all lengths.
     distances : tuple of Distance
-        Measured on the board; they hold its scale.
+        Measured on the board; they determine its scale.
 
     Raises
     ------
@@ -219,7 +219,7 @@ class Board:
         return cls((Plane("", cols, rows, square),), unit)
 
     def place(self, label: str) -> Array:
-        """World coordinates (3,) of a vertex ``[plane/]c:r``, where it really is; c and r may be any numbers.
+        """True world coordinates (3,) of a vertex ``[plane/]c:r``; c and r may be any numbers.
 
         Raises
         ------
@@ -232,11 +232,11 @@ class Board:
 
     @property
     def scale(self) -> Scale:
-        """What the measured distances say of the scale."""
+        """The scale from the measured distances."""
         return fitted_scale(self.place, self.distances)
 
     def as_measured(self) -> Board:
-        """The board as large as its measured distances say."""
+        """The board scaled to its measured distances."""
         factor = self.scale.factor
         return replace(self, planes=tuple(plane.rescaled(factor) for plane in self.planes))
 

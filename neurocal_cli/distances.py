@@ -1,4 +1,4 @@
-"""Distances that were measured on a target: they hold its scale, which no photograph tells."""
+"""Distances measured on a target, which determine its scale; photographs cannot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from neurocal_cli.geometry import Array
 
 _NUMBER = r"-?(?:[0-9]+\.?[0-9]*|\.[0-9]+)"
 _LABEL = rf"(?:(?P<plane>.*)/)?(?P<c>{_NUMBER}):(?P<r>{_NUMBER})"
-_ANOTHER_UNIT = 0.1  # a scale further from 1 is no print of the stated board
+_ANOTHER_UNIT = 0.1  # a scale further from 1 is not that of a print of the stated board
 
 
 @frozen_dataclass
@@ -26,12 +26,12 @@ class Distance:
         Ids ``[plane/]c:r`` of vertices. c and r may be any numbers: -1:-1 is the outer corner of the first
         square.
     length, std : float [world unit]
-        What was measured, and its standard deviation.
+        Measured distance and its standard deviation.
 
     Raises
     ------
     InputError
-        A place that is no id, or a length or standard deviation that is not positive.
+        An invalid id, or a length or standard deviation that is not positive.
     """
 
     start: str
@@ -54,16 +54,16 @@ class Distance:
 
 @frozen_dataclass
 class Scale:
-    """What measured distances say of the scale of a target.
+    """The scale of a target from measured distances.
 
     Attributes
     ----------
     factor : float
         By which all lengths have to be multiplied.
     std : float
-        Of the factor. Distances that contradict each other make it larger.
+        Standard deviation of the factor. Distances that contradict each other increase it.
     contradiction : str
-        What contradicts the others, if so.
+        The distance that contradicts the others, if any.
     """
 
     factor: float = 1.0
@@ -90,18 +90,18 @@ def grid_place(label: str) -> tuple[str, float, float]:
 
 
 def fitted_scale(places: Callable[[str], Array], distances: Sequence[Distance]) -> Scale:
-    """Fit the scale of a target to distances, each weighed by its standard deviation.
+    """Fit the scale of a target to distances, each weighted by its standard deviation.
 
     Parameters
     ----------
     places : callable
-        World coordinates (3,) of an id, as they are believed to be.
+        Nominal world coordinates (3,) of an id.
     distances : sequence of Distance
 
     Raises
     ------
     InputError
-        A place that the target does not have; distances of another unit.
+        An id that the target does not have; distances in another unit.
     """
     if not distances:
         return NO_SCALE

@@ -1,7 +1,7 @@
-"""Everything that can go wrong, under one root.
+"""The exceptions of the library, under one base class.
 
-The library raises these and nothing else on purpose; the command layer turns each into one line
-and the exit code that the class names. A message says what is wrong, where, and what to do.
+The library deliberately raises only these; the command layer turns each into one line and the exit code of
+its class. A message says what is wrong, where, and what to do.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 
 class NeurocalError(Exception):
-    """Root of all errors that a caller of neurocal may want to catch."""
+    """Base class of all errors that a caller of neurocal may want to catch."""
 
     exit_code = 1
 
@@ -20,7 +20,7 @@ class InputError(NeurocalError, ValueError):
 
 
 class FormatError(NeurocalError, ValueError):
-    """A file that cannot be read as what it should be.
+    """A file that cannot be read as the expected format.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class FormatError(NeurocalError, ValueError):
 
 
 class DegenerateGeometryError(NeurocalError):
-    """Points that are well formed but cannot determine what is asked for."""
+    """Points that are well formed but do not determine the requested parameters."""
 
 
 class CoincidentCamerasError(DegenerateGeometryError):
@@ -49,13 +49,13 @@ class CoincidentCamerasError(DegenerateGeometryError):
 
 
 class UsageError(NeurocalError):
-    """A request that makes no sense as put, whatever the data: the user's to change."""
+    """A request that is invalid whatever the data, and that the user must change."""
 
     exit_code = 2
 
 
 def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    """Refuse a value that an option does not have.
+    """Refuse a value that is not one of an option's choices.
 
     Raises
     ------

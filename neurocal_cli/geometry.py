@@ -1,7 +1,7 @@
-"""Rotations, similarities and the conventions that everything else relies on.
+"""Rotations, similarities and the conventions of the whole package.
 
-Conventions, stated once
-------------------------
+Conventions
+-----------
 * Pixels: the centre of the top-left pixel is (0, 0); u grows to the right, v downwards.
 * World to camera: ``Xc = R M + t``, column vectors, right-handed; camera x right, y down, z forward.
 * Euler angles in radians, fixed axes: ``R = Rz(R_z) Ry(R_y) Rx(R_x)``, R_y in [-pi/2, pi/2].
@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 # Below this cosine of R_y the x and z axes coincide and only R_x -/+ R_z is defined.
 _GIMBAL_COSINE = 1e-12
-_SINGULAR = 1e-9  # below it only the combination is taken to move with a rotation
+_SINGULAR = 1e-9  # below it only the combination is taken to vary with a rotation
 
 
 def euler_to_rotation(R_x: float, R_y: float, R_z: float) -> Array:
@@ -64,8 +64,8 @@ def rotation_to_euler(R: Array) -> Array:
     locked = cy < _GIMBAL_COSINE
     R_y = np.arctan2(-R[..., 2, 0], cy)
     R_z = np.where(locked, 0.0, np.arctan2(R[..., 1, 0], R[..., 0, 0]))
-    # From Rz^-1 R, whose second row is (0, cos R_x, -sin R_x): near the lock R_z is rounding, and
-    # this R_x makes up for it where the third row's would have an error of its own.
+    # From Rz^-1 R, whose second row is (0, cos R_x, -sin R_x): near gimbal lock R_z is only rounding, and
+    # this R_x compensates for it, while R_x from the third row would have an independent error.
     cz, sz = np.cos(R_z), np.sin(R_z)
     R_x = np.arctan2(sz * R[..., 0, 2] - cz * R[..., 1, 2], cz * R[..., 1, 1] - sz * R[..., 0, 1])
     return np.stack([R_x, R_y, R_z], axis=-1)
@@ -157,7 +157,7 @@ def rotation_to_axis(directions: Array) -> Array:
 
 
 def orthonormalised(R: Array) -> Array:
-    """Take the rounding off rotations: one step of Newton and Schulz; (..., 3, 3)."""
+    """Remove rounding errors from rotations by one Newton-Schulz step; (..., 3, 3)."""
     return np.asarray(R @ (1.5 * np.eye(3) - 0.5 * (np.swapaxes(R, -1, -2) @ R)))
 
 
@@ -170,7 +170,7 @@ def nearest_rotation(M: Array) -> Array:
 
 
 def nearest_similarity(points: Array, to: Array) -> tuple[float, Array, Array]:
-    """Scale s, rotation R (3, 3) and shift t (3,) that bring ``s R x + t`` nearest to other points.
+    """Least-squares scale s, rotation R (3, 3) and translation t (3,) from points x to others, ``s R x + t``.
 
     Umeyama, Least-squares estimation of transformation parameters, IEEE PAMI 13 (1991).
     """
@@ -182,9 +182,9 @@ def nearest_similarity(points: Array, to: Array) -> tuple[float, Array, Array]:
 
 
 def distinct_rows(table: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Where each different row of a table (N, m) comes first, in the rows' order, and which one each row is.
+    """Index of the first occurrence of each distinct row (N, m), sorted by rows, and the inverse indices.
 
-    As `numpy.unique` along the first axis has it, in a tenth of the time.
+    The same as `numpy.unique` along the first axis, in a tenth of the time.
     """
     order = np.lexsort(table.T[::-1])
     ordered = table[order]
@@ -199,7 +199,7 @@ def similarity(points: Array) -> tuple[Array, float]:
     """Centre and scale that bring points into [-1, 1], the paper's s_1 and s_2 with an origin.
 
     Dividing by s alone leaves data far from the origin badly conditioned (Hartley 1997), so the
-    centroid is taken off first.
+    centroid is subtracted first.
 
     Parameters
     ----------

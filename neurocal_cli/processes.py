@@ -1,4 +1,4 @@
-"""Processes that share a work, each with one core; they end with the one that started them."""
+"""Worker processes with one core each, which end with their parent."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ def work_through(
     Parameters
     ----------
     work : callable
-        Of a module, so that another process finds it.
+        A function of a module, so that another process can import it.
     tasks : sequence
     jobs : int
-        Processes; with 1 the work is done here.
+        Number of processes; with 1 the work is done in this one.
     prepare : callable, optional
         Called in each process before its first task; `start_worker` by default.
 
@@ -83,7 +83,7 @@ def start_worker() -> None:
 
 
 def _end_with_parent() -> None:
-    """End when the parent was killed: a worker would wait for work for ever, and hold its pipes open."""
+    """End if the parent was killed: otherwise a worker would wait for ever and hold its pipes open."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         parent.join()

@@ -1,4 +1,4 @@
-"""Picture of a target as it was found. matplotlib is imported only when a picture is asked for."""
+"""Picture of an estimated target. matplotlib is imported only when a picture is drawn."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _WIDTH, _HEIGHT = 5.5, 4.5  # inches of a panel
 
 
 def draw_target(target: Target, unit: str, kind: str = "png") -> bytes:
-    """Draw where the points of each plane are: height as contours, offsets in the plane as arrows.
+    """Draw the estimated points of each plane: height as contours, offsets in the plane as arrows.
 
     Parameters
     ----------

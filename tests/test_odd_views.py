@@ -27,7 +27,7 @@ def with_sigma(sigma: np.ndarray) -> Correspondences:
         (moved(POINTS, pixels=np.where(ONE, POINTS.pixels / 2, POINTS.pixels)), "of half the size"),
         (moved(POINTS, pixels=POINTS.pixels * np.where(ONE, [1, 0.5], 1)), "its v is of half resolution"),
         (of_cameras([600.0] * 9 + [750.0]), "another zoom or focus: a focal length of 7"),
-        (moved(POINTS, pixels=POINTS.pixels - ONE * [60, 40]), "another camera or crop: the centre (2"),
+        (moved(POINTS, pixels=POINTS.pixels - ONE * [60, 40]), "another camera or crop: the image centre (2"),
         (moved(POINTS, pixels=POINTS.pixels + 3 * ONE * RNG.normal(size=(930, 2))), "blurred"),
     ],
 )

@@ -1,6 +1,6 @@
-"""The methods that the paper compares its network with, and OpenCV: from points to a camera, each by itself.
+"""The calibration methods that the paper compares its network with, and OpenCV's.
 
-Each is a function of a `Problem` that returns a `Found`; `calibrate_by` makes a `Calibration` of it, as the
-network's is made. None of them shares its way to the answer with the network, so that each is also an
-independent check of it.
+Each is a function of a `Problem` that returns a `Found`, which `calibrate_by` makes into a `Calibration` as
+for the network. None of them shares its algorithm with the network, so each is also an independent check
+of it.
 """

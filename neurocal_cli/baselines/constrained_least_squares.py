@@ -15,8 +15,8 @@ _SINGULAR = 1e-12  # of a diagonal entry over the largest, below which rounding 
 def smallest(rows: Array, constrained: int) -> Array:
     """Minimise ``|C y + D z|`` over y, and over z with ``|z| = 1``, where ``rows = [C D]``.
 
-    QR takes y out: what is left is the smallest right singular vector of D's triangular remainder
-    (Faugeras and Toscani 1986 do the same on the normal equations, which costs half of the digits).
+    QR eliminates y; z is then the smallest right singular vector of D's triangular remainder
+    (Faugeras and Toscani 1986 do the same on the normal equations, which loses half of the digits).
 
     Parameters
     ----------
@@ -28,12 +28,12 @@ def smallest(rows: Array, constrained: int) -> Array:
     Returns
     -------
     solution : (K, n) array
-        (y, z), each problem's sign open.
+        (y, z), each up to its sign.
 
     Raises
     ------
     DegenerateGeometryError
-        The equations leave y open.
+        The equations do not determine y.
     """
     K, m, n = rows.shape
     if m < n:

@@ -14,16 +14,16 @@ class Found:
     Attributes
     ----------
     problem : Problem
-        What was asked for; a method may take more for given than the user did.
+        The problem solved; a method may take more parameters as given than the user did.
     state : CameraState
         Normalised.
     minimised : bool
-        Whether the reprojection error is at a minimum there, which only least squares on (3) promises.
+        Whether the state is a minimum of the reprojection error, which only least squares on (3) ensures.
     iterations : int
     converged : bool
         False where an iteration was cut short.
     remarks : tuple of str
-        What the user should know.
+        Warnings for the user.
     """
 
     problem: Problem
@@ -35,7 +35,7 @@ class Found:
 
 
 def as_seen(problem: Problem, state: CameraState) -> tuple[Problem, CameraState]:
-    """Put a given distortion back, which was taken off the pixels for a method that knows a pinhole only."""
+    """Restore a given distortion, which was removed from the pixels for a pinhole-only method."""
     distortion = problem.distortion
     if distortion.model == "none" or problem.free_distortion:
         return problem, state

@@ -1,4 +1,4 @@
-"""SciPy's least squares, as the baselines use it: none of this package's own descent."""
+"""SciPy's least squares for the baselines, independent of this package's own minimiser."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def least_squares(
         From unknowns (n,) to residuals (m,).
     start : (n,) array
     view : (m,) int array, optional
-        View of each residual. None: every unknown moves every residual.
+        View of each residual. None: every residual depends on every unknown.
     shared : int
         With `view`: the first unknowns, which all views share; the others are each view's own, in order.
     """
@@ -79,7 +79,7 @@ def least_squares(
 def _differences(
     residuals: Callable[[Array], Array], x: Array, view: NDArray[np.intp] | None, shared: int, sparse: bool
 ) -> Any:
-    """Derivatives (m, n) by differences; the unknowns of different views are varied at once."""
+    """Jacobian (m, n) by finite differences; the unknowns of different views are varied together."""
     at = residuals(x)
     if view is None:
         view, shared = np.zeros(len(at), dtype=np.intp), len(x)

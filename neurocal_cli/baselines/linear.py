@@ -1,24 +1,25 @@
-"""Linear calibration: closed forms, no start and no iteration (Faugeras and Toscani 1986; Zhang 2000).
+"""Linear calibration in closed form, without iteration (Faugeras and Toscani 1986; Zhang 2000).
 
 Solid views. Each point gives two equations that are linear in P,
 
     (p_1.M + p_14) - u (p_3.M + p_34) = 0,   (p_2.M + p_24) - v (p_3.M + p_34) = 0,
 
-and their squares are minimised with |p_3| = 1. That constraint is Faugeras and Toscani's, and it is the one
-that makes sense: under a rotation, a shift or another scale of the world, and a shift or another scale of the
-pixels, the sum of squares and |p_3| change by constant factors only, so the answer does not depend on the
-coordinates. The naive p_34 = 1 has neither property. It weighs the points by where somebody put the world's
-origin, and fails where that lies in the camera's focal plane, as a corner of a room behind which the camera
-stands may.
+and their squares are minimised with |p_3| = 1, the constraint of Faugeras and Toscani. It makes the answer
+independent of the coordinates: if the world is rotated, shifted or scaled, or the pixels are shifted or
+scaled, the sum of squares and |p_3| change by constant factors only. The naive constraint p_34 = 1 lacks
+this property. It weights the points according to the choice of the world's origin, and fails if that origin
+lies in the camera's focal plane, as the corner of a room may.
 
 Flat views have no third column of P. Their homographies are found with the whole of H of unit length, in
 normalised coordinates (Hartley 1997).
 
-Intrinsics. Zhang's closed form for omega = A^-T A^-1: the columns of each A^-1 P are perpendicular and of one
-length, two linear equations in omega for a flat view and five for a solid one. For a single solid view that
-is the decomposition of Faugeras. A given centre and a given right angle are zeros of omega.
+Intrinsics. Zhang's closed form for omega = A^-T A^-1: the columns of each A^-1 P are perpendicular and of
+equal length, which gives two linear equations in omega for a flat view and five for a solid one. For a single
+solid view this is the decomposition of Faugeras. A given centre and a given right angle set entries of omega
+to zero.
 
-The squares are not those of pixels, so that noise hurts more than it has to: this is no minimum of (3).
+The residuals are algebraic, not pixel errors, so the answer is not the minimum of (3) and is more sensitive
+to noise.
 """
 
 from __future__ import annotations
@@ -48,9 +49,9 @@ def linear(problem: Problem) -> Found:
     Raises
     ------
     UsageError
-        A distortion model: linear calibration knows none.
+        A distortion model, which linear calibration cannot estimate.
     DegenerateGeometryError
-        Too few points in a view; noise that leaves no camera.
+        Too few points in a view; noise so large that no camera fits.
     """
     if problem.free_distortion:
         raise UsageError("the method linear estimates no distortion; give distortion none, or another method")
@@ -138,7 +139,7 @@ def _intrinsics(problem: Problem, groups: list[Group]) -> Array:
     equations = []
     for group in groups:
         columns = np.swapaxes(shift @ group.product, 1, 2)[:, :-1]  # (K, 2 or 3, 3)
-        # Equal and perpendicular columns: what each view says does not depend on its product's length.
+        # Equal and perpendicular columns: the scale of each view's product does not matter.
         columns = columns / np.sqrt((columns**2).sum(axis=(1, 2), keepdims=True))
         pairs = [(0, 1)] if group.flat else [(0, 1), (0, 2), (1, 2)]
         equations += [_product_of(columns[:, a], columns[:, b]) for a, b in pairs]
@@ -176,7 +177,7 @@ def _upper_factor(omega: Array) -> Array:
 
 
 def _camera_of_given_poses(problem: Problem) -> CameraState:
-    """Type 4: with the poses given, (3) itself is linear in A's entries; two linear least squares."""
+    """Type 4: with the poses given, (3) is linear in A's entries and separates into two linear problems."""
     views = problem.views
     assert problem.poses is not None  # type 4
     R = np.stack([problem.poses[name].R for name in views.names])

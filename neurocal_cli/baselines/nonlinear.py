@@ -1,7 +1,7 @@
 """Nonlinear calibration: Levenberg-Marquardt on the pixel error (3) from the linear answer.
 
-The paper's second method of comparison. The descent is MINPACK's, through SciPy, with derivatives by
-differences: it shares no code with `bundle_adjustment` but the projection, and ends at the same minimum.
+The paper's second method of comparison. It uses MINPACK through SciPy with finite differences: it shares only
+the projection with `bundle_adjustment`, and reaches the same minimum.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def nonlinear(problem: Problem) -> Found:
 
 
 def descend(problem: Problem, start: CameraState) -> Found:
-    """Minimise the pixel error (3) from any normalised state; a pinhole is given its distortion."""
+    """Minimise the pixel error (3) from any normalised state; a pinhole's distortion starts at zero."""
     model = problem.distortion.model
     if problem.free_distortion and start.model != model:
         start = replace(start, model=model, k=pinhole_coefficients(model))

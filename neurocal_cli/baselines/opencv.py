@@ -1,8 +1,8 @@
-"""OpenCV's `calibrateCamera`, for comparison: the tool that most people use.
+"""OpenCV's `calibrateCamera`, the most widely used tool, for comparison.
 
-It has no skew, and a distortion model of its own choice; here the one that is asked for. Flat boards start
-from its closed form. For other targets it wants a first camera: it gets the one that tutorials give, with the
-centre in the middle of the image and a focal length of the image's width.
+It has no skew; its distortion model is set to the requested one. Flat boards start from its closed form.
+Other targets need an initial camera: as in its tutorials, the centre is the middle of the image and the focal
+length is the image's width.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6
 
 
 def without_skew(problem: Problem) -> Problem:
-    """The problem as OpenCV has it: with right angles given."""
+    """The problem as OpenCV solves it: with zero skew given."""
     free = problem.free.copy()
     free[1] = False
     return replace(problem, free=free, fixed=problem.fixed | {"theta"})
@@ -42,9 +42,9 @@ def opencv(problem: Problem) -> Found:
     Raises
     ------
     UsageError
-        Types 3 and 4; a distortion model that it does not have.
+        Types 3 and 4; a distortion model that OpenCV lacks.
     DegenerateGeometryError
-        OpenCV refuses, with its reason, or ends at numbers that are no camera.
+        OpenCV fails, with its reason, or returns numbers that are not a camera.
     """
     import cv2
 

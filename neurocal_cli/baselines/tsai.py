@@ -1,4 +1,4 @@
-"""Tsai's two stages (Tsai 1987): the radial alignment of each view first, then what it leaves open.
+"""Tsai's two stages (Tsai 1987): the radial alignment of each view, then the remaining parameters.
 
 With the image's centre c known and the image axes at right angles, a radial distortion moves a pixel along
 the ray from c, whatever its law. So (x, y) = m - c has the direction of (s X_c, Y_c), s = alpha_u / alpha_v:
@@ -6,19 +6,19 @@ the ray from c, whatever its law. So (x, y) = m - c has the direction of (s X_c,
     x (r_2.M + t_y) = y s (r_1.M + t_x)
 
 1. R, t_x and t_y of each view from these equations, which are linear in s r_1, s t_x and r_2 over t_y. That
-   fails where t_y is 0; Tsai asks the user for a world's origin that is seen well above or below the centre,
-   and here it is moved to the target's point of which that holds best. Solid views tell s. A flat view has
-   two columns of R; what is left of them has length 1 each and a right angle, and of the two signs the one
-   whose focal length is positive is taken.
+   fails where t_y is 0: Tsai asks the user for a world's origin that is imaged well above or below the
+   centre; here the origin is moved to the target's point that is imaged farthest from the centre's row. Solid
+   views determine s. A flat view gives two columns of R without their last entries; these follow because the
+   columns are orthonormal, with the sign that makes the focal length positive.
 2. alpha_v and t_z by linear least squares, then with k1 (and s, where all views are flat) by nonlinear least
    squares on the pixels. R, t_x and t_y stay.
 
-The distortion acts here as everywhere in this package, x' = x (1 + k1 r^2); Tsai's own polynomial takes the
-distortion off. Stage 1 sees neither.
+The distortion acts as everywhere in this package, x' = x (1 + k1 r^2); Tsai's own polynomial removes it
+instead. Stage 1 depends on neither.
 
-The equations of stage 1 have the noise in their coefficients too, so that its errors have a mean that is not
-0 (tests/test_tsai.py; with the world's origin of the paper's scene left where it is, it would be ten times as
-large). Stage 2 does not mend that, and a wrong centre goes into everything.
+The coefficients of stage 1's equations are noisy too, so its result is biased (tests/test_tsai.py; with the
+origin of the paper's scene left in place, the bias would be ten times as large). Stage 2 does not remove the
+bias, and an error of the centre affects all parameters.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def tsai(problem: Problem) -> Found:
     UsageError
         Type 4; a distortion other than k1; no image centre.
     DegenerateGeometryError
-        Too few points; equations that no camera fulfils.
+        Too few points; equations that no camera satisfies.
     """
     if problem.type == 4:
         raise UsageError("the method tsai estimates poses, which type 4 gives; choose another method")
@@ -78,7 +78,7 @@ def tsai(problem: Problem) -> Found:
 
 
 def with_known_centre(problem: Problem) -> Problem:
-    """The problem as Tsai has it: with the image centre and right angles given (types 1 and 2).
+    """The problem as Tsai solves it: with the image centre and zero skew given (types 1 and 2).
 
     Raises
     ------
@@ -113,15 +113,15 @@ def _remarks(problem: Problem) -> tuple[str, ...]:
 
 @frozen_dataclass(eq=False)
 class _Alignment:
-    """What stage 1 finds of a group of views.
+    """The result of stage 1 for a group of views.
 
     Attributes
     ----------
     views : (K,) int array
     flat : bool
     rows : (K, 2, 4) array
-        s r_1 with s t_x, and r_2 with t_y; of flat views up to scale, and without the columns of R that are
-        not seen, in the coordinates of the plane.
+        s r_1 with s t_x, and r_2 with t_y; of flat views up to scale, in the coordinates of the plane,
+        without the entries that the plane does not determine.
     """
 
     views: NDArray[np.intp]
@@ -130,7 +130,7 @@ class _Alignment:
 
     @property
     def aspect(self) -> Array:
-        """(K,) s as each solid view tells it."""
+        """(K,) s of each solid view."""
         return np.asarray(np.linalg.norm(self.rows[:, 0, :3], axis=1))
 
     def poses(self, s: float, sign: Array) -> tuple[Array, Array, Array]:
@@ -155,7 +155,7 @@ def _align(views: Views, x: Array, y: Array, members: NDArray[np.intp], flat: bo
     rank = np.minimum(np.arange(M.shape[1]), views.counts[members][:, None] - 1)
     place = views.first[members][:, None] + rank
     px, py = x[place][..., None], y[place][..., None]
-    # The world's origin, where Tsai wants it: at the point that is seen farthest from the line y = 0.
+    # The world's origin, moved as Tsai requires: to the point imaged farthest from the line y = 0.
     highest = np.abs(py * (w > 0)).argmax(axis=1)[:, :, None]
     origin = np.take_along_axis(M, highest, axis=1)
     M = M - origin
@@ -170,14 +170,14 @@ def _align(views: Views, x: Array, y: Array, members: NDArray[np.intp], flat: bo
     rows[:, 1, 3] = 1.0 - (r2 * origin[:, 0]).sum(axis=1)
     if not flat:
         rows /= np.linalg.norm(r2, axis=1)[:, None, None]
-    # t_y < 0 where the points would lie on the other side of the centre from where they are seen.
+    # t_y < 0 if the points would project to the side of the centre opposite to their image.
     X, Y = M @ r1[..., None] + found[:, None, n, None], M @ r2[..., None] + 1.0
     side = ((px * X + py * Y) * w**2).sum(axis=(1, 2))
     return _Alignment(members, flat, rows * np.where(side < 0, -1.0, 1.0)[:, None, None])
 
 
 class _Stages:
-    """Both stages of all views, as functions of what stage 2 varies."""
+    """Both stages of all views, as functions of the parameters that stage 2 varies."""
 
     def __init__(self, problem: Problem, x: Array, y: Array) -> None:
         self.views = problem.views
@@ -189,7 +189,7 @@ class _Stages:
 
     @property
     def aspect(self) -> float | None:
-        """Mean aspect that solid views tell, weighted by their points; None where all are flat."""
+        """Mean aspect of the solid views, weighted by their points; None if all views are flat."""
         for group in self.groups:
             if not group.flat:
                 return float(np.average(group.aspect, weights=self.views.counts[group.views]))
@@ -257,7 +257,7 @@ def _camera_and_poses(problem: Problem) -> tuple[CameraState, Least]:
             "the radial alignment of these points has no positive focal length; tilt the target more, check "
             "the image centre and that each pixel belongs to its point, or use the method neuro"
         )
-    # Stage 2: f, s where no solid view tells it, k1 where it is asked for, and t_z of each view.
+    # Stage 2: f, s if no solid view determines it, k1 if requested, and t_z of each view.
     model = problem.distortion.model if problem.free_distortion else "none"
     V, free_s, free_k = views.n_views, known is None, model == "k1"
     start = np.concatenate([[np.log(f)], [0.0] * free_s, [0.0] * free_k, depth / f])

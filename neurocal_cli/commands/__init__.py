@@ -32,11 +32,11 @@ _SUMMARIES = {
     "detect": "Detect chessboards in images and measure points on them.",
     "evaluate": "Measure the error of a calibrated camera or stereo rig.",
     "lens": "Calibrate a zoom lens, whose zoom and focus change.",
-    "simulate": "Calibrate simulated cameras, and compare methods where the truth is known.",
+    "simulate": "Calibrate simulated cameras, and compare the methods' errors.",
     "rectify": "Rectify pairs of images and points of two cameras.",
     "report": "Show a calibration, a rig or a zoom lens as one HTML page.",
     "stereo": "Calibrate two cameras and the pose of the right one relative to the left one.",
-    "target": "Write the board as it was found.",
+    "target": "Write the board with its estimated shape.",
     "triangulate": "Compute points in space from their pixels in the left and the right image.",
     "undistort": "Remove the lens distortion from images and points.",
     "man": None,
@@ -136,11 +136,9 @@ def _explain(error: Exception) -> str:
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
 )
 @click.option(
-    "-q", "--quiet", count=True, show_default="no", help="Tell warnings and errors only; twice: errors only."
+    "-q", "--quiet", count=True, show_default="no", help="Print only warnings and errors; twice: only errors."
 )
-@click.option(
-    "-v", "--verbose", is_flag=True, show_default="no", help="Tell also how the work goes, with times."
-)
+@click.option("-v", "--verbose", is_flag=True, show_default="no", help="Also print progress, with times.")
 @click.version_option(__version__, message="%(prog)s %(version)s", help="Show the version and exit.")
 def neurocal(quiet: int, verbose: bool) -> None:
     """Calibrate cameras with a neural network whose weights are the camera.

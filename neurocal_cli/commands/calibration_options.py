@@ -264,10 +264,10 @@ _OPTIONS = [
     options.choice(
         "--target",
         "auto given flat free",
-        "Where the points of the target are: given takes X, Y, Z as they are; free finds with the "
-        "camera how the target is bent and printed, which takes 3 views or more; flat does so within its "
-        "plane; auto finds it where the points ask for it. Points with columns sX, sY, sZ are found by these "
-        "standard deviations, unless given.",
+        "Treatment of the target's shape: given uses X, Y, Z as they are; free estimates with the "
+        "camera how the target is bent and printed, which needs 3 views or more; flat does so within its "
+        "plane; auto does so if the points support it. Points with columns sX, sY, sZ are adjusted within "
+        "these standard deviations, unless given.",
         default="auto",
     ),
 ]

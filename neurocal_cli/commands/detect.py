@@ -72,7 +72,7 @@ _SECOND = 2  # images of another size that are no longer a single stray one
     "--watch",
     "SECONDS",
     "Wait for more images, in folders and patterns, until none has come for so long or Ctrl-C is "
-    "pressed. After each image, tell the verdict so far and the view that would help most.",
+    "pressed. After each image, report the verdict so far and the view that would help most.",
     without="no",
     positive=True,
 )

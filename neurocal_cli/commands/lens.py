@@ -86,9 +86,9 @@ def lens() -> None:
 @options.choice(
     "--target",
     "auto given flat free",
-    "Where the points of a board in several views are, the same at all settings: given takes X, Y, Z as "
-    "they are; free finds how the board is bent and printed; flat does so within its plane; auto finds it "
-    "where the points ask for it.",
+    "Treatment of the shape of a board in several views, the same at all settings: given uses X, Y, Z as "
+    "they are; free estimates how the board is bent and printed; flat does so within its plane; auto does "
+    "so if the points support it.",
     default="auto",
 )
 @options.seed

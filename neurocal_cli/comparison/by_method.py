@@ -1,4 +1,4 @@
-"""One call for every method, each with the distortion model nearest to the one that is asked for."""
+"""One interface for all methods, each with the distortion model nearest to the requested one."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ METHODS = ("neuro", "backprop", "nonlinear", "linear", "tsai", "opencv")
 def calibrate_with(
     method: str, points: Correspondences, model: str, skew: bool = True, seed: int = 0
 ) -> Calibration:
-    """Calibrate a camera of which nothing is given (type 1) from all points by a method; the target is given.
+    """Calibrate a camera with no given parameters (type 1) from all points by a method; the target is given.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def calibrate_with(
     Raises
     ------
     NeurocalError
-        The method cannot answer.
+        The method fails.
     """
     if method == "opencv":
         return calibrate_by("opencv", problem_for(points, 1, skew=skew, distortion=Distortion(model)))
@@ -47,5 +47,5 @@ def calibrate_with(
         skew=skew,
         outliers="keep",
         seed=seed,
-        target="given",  # what the other methods do not find
+        target="given",  # the other methods do not estimate it
     )

@@ -22,18 +22,18 @@ Progress = Callable[[str, float], None]
 
 @frozen_dataclass(eq=False)
 class Compared:
-    """What one method makes of one camera's points.
+    """The result of one method for one camera's points.
 
     Attributes
     ----------
     calibration : Calibration or None
-        None where the method has no answer.
+        None if the method fails.
     held_out_px : float [px]
-        Rms error on points that the fit did not see, in five folds; nan where a fold has no answer.
+        Rms error of five-fold cross-validation; NaN if the method fails on a fold.
     seconds : float
         Of the calibration.
     problem : str
-        Why there is no answer.
+        Why the method failed.
     """
 
     calibration: Calibration | None
@@ -44,12 +44,12 @@ class Compared:
 
 @frozen_dataclass(eq=False)
 class Comparison:
-    """What `compare` finds.
+    """The result of `compare`.
 
     Attributes
     ----------
     points : tuple of Correspondences
-        Of one camera or two, those that every method got.
+        Of one camera or two, as given to every method.
     cameras : tuple of dict of Compared by method
     stereo : dict of StereoEvaluation by method, or None
         Of two cameras, each calibrated alone as in the paper's section 5.2; for one camera None.
@@ -90,7 +90,7 @@ def compare(
     Raises
     ------
     NeurocalError
-        Points from which the network's calibration has no answer either.
+        Points for which the network's calibration fails too.
     """
     report = progress or (lambda stage, share: None)
     notes: list[str] = []
@@ -124,7 +124,7 @@ def _compared(method: str, points: Correspondences, model: str, skew: bool, seed
 
 
 def _held_out(method: str, points: Correspondences, model: str, skew: bool, seed: int) -> float:
-    """Rms error [px] of points of each view that the camera and the view's pose were found without."""
+    """Rms error [px] of held-out points of each view, which neither the camera nor the pose was fitted to."""
     rng = np.random.default_rng(seed)
     # Every fifth point of each view, in a random order of its points.
     order = np.lexsort((rng.random(len(points)), points.view_index))

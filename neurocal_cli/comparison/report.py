@@ -92,7 +92,7 @@ def _triangulation(comparison: Comparison) -> list[list[str]]:
 
 
 def _below(comparison: Comparison) -> list[str]:
-    """Which method has the lowest errors, and why a method has none."""
+    """The method with the lowest errors, and why methods failed."""
     lines = []
     for side, camera in enumerate(comparison.cameras):
         name = f"{_SIDES[side]} camera: " if len(comparison.cameras) == 2 else ""
@@ -110,7 +110,7 @@ def _below(comparison: Comparison) -> list[str]:
 
 
 def _lowest(what: str, errors: dict[str, float], unit: str) -> list[str]:
-    """The best method, with those that no digit of the table tells from it."""
+    """The best method, with those that are equal to it in the table's digits."""
     known = {method: error for method, error in errors.items() if math.isfinite(error)}
     if not known:
         return []

@@ -1,4 +1,4 @@
-"""From images to points: find chessboards, and measure the mid-points of their square edges.
+"""Detection of chessboards in images, and measurement of the mid-points of their square edges.
 
 Data flows one way, from an image to mid-points with covariances:
 

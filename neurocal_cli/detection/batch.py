@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from neurocal_cli.detection.memory import Memory
 
 _WORTH_A_PROCESS = 4  # images; fewer take less time than the start of a process
-_KEPT = 31 << 20  # bytes; glibc learns nothing from blocks of 32 MiB and more
+_KEPT = 31 << 20  # bytes; glibc does not adapt to blocks of 32 MiB and more
 
 
 @frozen_dataclass
@@ -43,7 +43,7 @@ class DetectionOptions:
     strict : bool
         Raise unexpected errors instead of reporting them as the problem of one image.
     memory : Memory, optional
-        Where what was found is kept, and looked up.
+        Cache of detections.
     """
 
     board: Board
@@ -120,7 +120,7 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
         problem = str(error)
     except MemoryError:
         problem = "not enough memory; scale the image down"
-    except Exception as error:  # one image must not cost the user all the others
+    except Exception as error:  # one failing image must not stop the others
         if options.strict:
             raise
         problem = f"internal error: {type(error).__name__}: {error}; run with NEUROCAL_DEBUG=1 to see where"
@@ -128,12 +128,12 @@ def detect_file(path: str, options: DetectionOptions) -> Outcome:
 
 
 def _named(found: Outcome, path: str, source: str) -> Outcome:
-    """What was found, with the name of the image that it was found in."""
+    """The outcome of an image, with its name."""
     return replace(found, path=path, problem=found.problem and f"{source}: {found.problem}")
 
 
 def _detected(image: Image, options: DetectionOptions) -> Outcome:
-    """What was found in an image, without its name."""
+    """The outcome of an image, without its name."""
     grids = find_grids(image.grey, wanted_sizes(options.board))
     overlay: bytes | None = None
     try:

@@ -77,8 +77,8 @@ class Detection:
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
     across : (N, 2) array or None
-        Unit vector across the edge of each mid-point, the direction in which it has a measurement of its
-        own; None for vertices.
+        Unit vector across the edge of each mid-point, the direction in which it was measured; None for
+        vertices.
     image_size : (width, height) [px]
     rejected : int
         Number of points rejected for their fits.

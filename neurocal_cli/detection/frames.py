@@ -1,8 +1,8 @@
-"""Which frames of a video are worth measuring: the sharp ones that differ from each other.
+"""Selection of sharp frames of a video that differ from each other.
 
-Each short stretch of the video gives its sharpest frame. Of those that are about as sharp as most, the
-sharpest one is taken first, and then again and again the one that differs most from all taken so far, until
-the next one would hardly differ: a board that is held still gives one frame.
+Each short stretch of the video gives its sharpest frame. Among those of about typical sharpness or better,
+the sharpest is taken first, then repeatedly the one that differs most from all taken so far, until the next
+one would hardly differ: a board that is held still gives one frame.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_STRETCH = 0.25  # seconds: of a hand that shakes, some moment is still
+_STRETCH = 0.25  # seconds; a shaking hand is still for a moment in each
 _LONGEST = 60  # frames
-_WIDTH = 640  # px; sharpness is seen there as well, and costs less
+_WIDTH = 640  # px; enough to compare sharpness, at less cost
 _THUMB = (48, 36)  # px
 _SHARP = 0.4  # of the median sharpness of the stretches
 _DIFFERENT = 6.0  # DN, rms; noise of a still camera leaves 1 after averaging

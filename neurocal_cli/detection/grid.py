@@ -1,8 +1,8 @@
 """Results of finding and measuring: the vertices of a chessboard, and the mid-points of its edges.
 
-Grid coordinates are whole numbers (c, r), c along a row of vertices and r along a column, oriented
-like the image: growing c turns to growing r as u turns to v. The origin and the choice of c are arbitrary
-here; `identity` finds those of the board.
+Grid coordinates are whole numbers (c, r), c along a row of vertices and r along a column, with the
+handedness of the image's u and v. The origin and the choice of c are arbitrary here; `identity` finds those
+of the board.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Measured:
     covariance : (N, 3) array [px^2]
         suu, suv, svv.
     across : (N, 2) array or None
-        Unit vectors across the edges of mid-points, the direction of their own measurement; None for
+        Unit vectors across the edges of mid-points, the directions in which they were measured; None for
         vertices.
     vertices : (rows, cols, 2) array [px]
         The grid's vertices after refinement, NaN where not found or not fitted.

@@ -1,10 +1,10 @@
-"""Mid-points or vertices of a grid, measured to the limit that the noise of the pixels sets.
+"""Mid-points or vertices of a grid, measured to the limit set by the pixel noise.
 
 In: an image and a grid with vertices known to half a pixel. Out: `Measured` points with covariances. Every
 edge is fitted to all the pixels around it. A smooth map from grid to pixels, fitted to all edges, gives the
 coordinates of the mid-points along their edges, and the curvature of the edges. Across its edge, a mid-point
 is measured by that edge alone. Gamma, ink spread and blooming displace all edges towards the dark or the
-light side: an alternating shift between edges and map, which is estimated and removed.
+light side; this alternating shift between edges and map is estimated and removed.
 """
 
 from __future__ import annotations

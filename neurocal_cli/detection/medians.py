@@ -14,12 +14,12 @@ CHI2_MEDIAN = 0.455  # of chi-squared with one degree of freedom
 
 
 def median(x: Array) -> float:
-    """The median of an array of any shape, without its NaNs; NaN where nothing is left."""
+    """The median of an array of any shape, ignoring NaNs; NaN if all are NaN."""
     return quantile(x, 0.5)
 
 
 def quantile(x: Array, share: float) -> float:
-    """A quantile of an array, without its NaNs, by linear interpolation; NaN where nothing is left."""
+    """A quantile of an array by linear interpolation, ignoring NaNs; NaN if all are NaN."""
     ordered = x.flatten()
     ordered.sort()  # nan comes last
     count = len(ordered) - int(np.count_nonzero(np.isnan(ordered)))

@@ -1,7 +1,7 @@
-"""What was found in images, kept in a folder by their content, so that a later run need not look again.
+"""Cache of detections in a folder, by the content of the images, so that a later run can reuse them.
 
-Each image has a file of its own, named after the hash of its bytes, of what was asked for, and of neurocal's
-version. It is written at once, so that a run that was stopped goes on where it was.
+Each image has its own file, named after the hash of its bytes, the detection options and neurocal's version.
+It is written at once, so that an interrupted run can be resumed.
 """
 
 from __future__ import annotations
@@ -27,21 +27,21 @@ _FORMAT = 1
 
 
 class Memory:
-    """A folder of what was found.
+    """A folder of cached detections.
 
     Parameters
     ----------
     folder : str
-        Made where it does not exist.
+        Created if it does not exist.
     asked : str
-        What was asked for, in words that differ where it does.
+        The detection options as text; different options give different texts.
     """
 
     def __init__(self, folder: str, asked: str) -> None:
         self._folder, self._asked = folder, f"{_FORMAT} {__version__} {asked}".encode()
 
     def recall(self, image: bytes) -> Outcome | None:
-        """What was found in an image, by the bytes of its file; None if nobody has looked."""
+        """The cached detection of an image, by the bytes of its file; None if there is none."""
         path = self._place(image)
         if not os.path.exists(path):
             return None
@@ -59,7 +59,7 @@ class Memory:
             return None
 
     def keep(self, image: bytes, outcome: Outcome) -> None:
-        """Write what was found, at once: outputs that a command holds back would be lost with it.
+        """Write a detection at once, so that it is not lost if the command is interrupted.
 
         Raises
         ------
@@ -95,7 +95,7 @@ def _tree(found: Detection) -> dict[str, Any]:
 
 
 def _detection(tree: dict[str, Any]) -> Detection:
-    """A detection without the grids that it was found on, which only its picture needs."""
+    """A detection without its grids, which only its picture needs."""
     ids = tuple(map(str, tree["ids"]))
     width, height = tree["image_size"]
     return Detection(

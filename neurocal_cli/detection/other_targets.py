@@ -1,4 +1,4 @@
-"""What an image shows in place of a chessboard: a board of markers, or a grid of circles."""
+"""Recognition of other targets than chessboards: boards of markers and grids of circles."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-# Repeated by tests/test_other_targets.py: none is seen in noise, in blurred boards and in the sample images.
-_LONGEST = 1000  # px of the image that is looked at; markers and circles of a target are no smaller
+# tests/test_other_targets.py checks that none is found in noise, blurred boards and the sample images.
+_LONGEST = 1000  # px of the reduced image; enough for the markers and circles of a target
 _MARKERS = 3  # of one family; noise shows one at times
 _WINDOW = 23  # px
 _FAMILIES = ("DICT_4X4_1000", "DICT_5X5_1000", "DICT_6X6_1000", "DICT_7X7_1000", "DICT_APRILTAG_36h11")
@@ -21,7 +21,7 @@ _WANTED = "neurocal takes a chessboard; `neurocal detect --help` says which"
 
 
 def other_target(grey: NDArray[np.generic]) -> str:
-    """Say what other target an image shows.
+    """Recognise another target in an image.
 
     Parameters
     ----------
@@ -31,7 +31,7 @@ def other_target(grey: NDArray[np.generic]) -> str:
     Returns
     -------
     str
-        A message, empty where nothing is recognised.
+        A message, empty if nothing is recognised.
     """
     small = _small(grey)
     if _shows_markers(small):
@@ -53,7 +53,7 @@ def _small(grey: NDArray[np.generic]) -> NDArray[np.uint8]:
 
 
 def _shows_markers(grey: NDArray[np.uint8]) -> bool:
-    aruco = getattr(cv2, "aruco", None)  # older builds of OpenCV come without
+    aruco = getattr(cv2, "aruco", None)  # missing in older builds of OpenCV
     if aruco is None or not hasattr(aruco, "ArucoDetector"):
         return False
     how = aruco.DetectorParameters()
@@ -96,7 +96,7 @@ def _is_grid(image: NDArray[np.uint8]) -> bool:
 
 
 def _matched(found: NDArray[np.float64], others: NDArray[np.float64], near: float) -> NDArray[np.float64]:
-    """(n,) area of the other ellipse at the same place as each; nan where there is none."""
+    """(n,) area of the other ellipse at the same place as each; NaN if there is none."""
     if not len(others):
         return np.full(len(found), np.nan)
     apart = np.hypot(*(found[:, None, :2] - others[None, :, :2]).T).T

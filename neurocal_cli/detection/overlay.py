@@ -164,7 +164,7 @@ class _Canvas:
     def _at(self, pixel: ArrayLike) -> tuple[int, int]:
         """Place in the picture, in units of 1/16 px; the middle of a pixel stays the middle."""
         u, v = (np.asarray(pixel) + 0.5) * self.scale - 0.5
-        limit = 1 << 24  # against overflow by outliers
+        limit = 1 << 24  # prevents overflow by outliers
         u, v = np.clip([u, v + self.top], -limit >> _SHIFT, limit >> _SHIFT)
         return round(float(u) * (1 << _SHIFT)), round(float(v) * (1 << _SHIFT))
 

@@ -1,4 +1,4 @@
-"""Residuals of measured points from a smooth map of their plane: a view of the noise without a camera."""
+"""Residuals of measured points from a smooth map of their plane, which show the noise without a camera."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from neurocal_cli.detection.grid import EDGE_H, EDGE_V, Measured
 from neurocal_cli.detection.wide_lens import fit_wide_lens
 from neurocal_cli.geometry import Array
 
-_FEWEST_WIDE = 12  # points for the lens of equal angles
+_FEWEST_WIDE = 12  # points for the equidistant lens
 _POINTS_A_TERM = 6  # least number of points for each coefficient of the polynomial; for pictures only
 
 
 def plane_residuals(measured: Measured, size: tuple[int, int] | None = None) -> Array:
     """Measured pixels minus those of a plane and a polynomial fitted to them.
 
-    The plane is seen through a pinhole or a lens of equal angles, whichever is nearer. The polynomial models
-    what the real lens does differently; its degree is five, or less for few points.
+    The plane is seen through a pinhole or an equidistant lens, whichever fits better. The polynomial models
+    the real lens's deviations from it; its degree is five, or less for few points.
 
     Parameters
     ----------

@@ -1,9 +1,9 @@
-"""A lens of equal angles, and the one that best shows a flat lattice as a plane.
+"""The equidistant lens, and its fit to a flat lattice.
 
-A pixel at the distance r from the centre sees at the angle r / focal from the axis: roughly what fisheyes do,
-also beyond 90 degrees. A plane is then a homography from grid coordinates to directions. One focal length
-tells a lens that bends straight lines from a board that is crooked; what the real lens does differently is
-smooth and small. In: vertices with their places in a grid. Out: `WideFit`.
+A pixel at distance r from the centre sees at the angle r / focal from the axis: roughly what fisheyes do,
+also beyond 90 degrees. A plane is then a homography from grid coordinates to directions. The single focal
+length distinguishes a lens that bends straight lines from a crooked board; the real lens's deviations from it
+are smooth and small. In: vertices with their places in a grid. Out: `WideFit`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _FARTHEST = 3.0  # rad; no lens sees farther
 
 @frozen_dataclass(eq=False)
 class WideLens:
-    """A lens of equal angles.
+    """An equidistant lens.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class WideLens:
     centre: Array
 
     def angles(self, pixels: Array) -> Array:
-        """Angles (...) from the axis at which pixels (..., 2) see [rad]."""
+        """Angles (...) from the axis of the rays of pixels (..., 2) [rad]."""
         away = pixels - self.centre
         return np.asarray(np.hypot(away[..., 0], away[..., 1]) / self.focal)
 
@@ -127,7 +127,7 @@ def fit_wide_lens(grid: Array, pixels: Array, size: tuple[int, int]) -> WideFit:
 
 
 def _errors(lenses: Array, grid: Array, pixels: Array) -> tuple[Array, Array]:
-    """The planes (K, 3, 3) that lenses (K, 3) see best, and the errors of the vertices (K, 2 N) [px].
+    """The best-fitting planes (K, 3, 3) for lenses (K, 3), and the errors of the vertices (K, 2 N) [px].
 
     The errors are those along the radius, then those around the centre; infinite behind the camera.
     """

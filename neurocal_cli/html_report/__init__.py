@@ -1,1 +1,1 @@
-"""Reports as one HTML page each, which needs no network and prints well."""
+"""Reports as self-contained HTML pages, which also print well."""

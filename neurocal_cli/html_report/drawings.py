@@ -1,6 +1,6 @@
 """Drawings for a page, as SVG: residuals in the image, their scatter, and errors by view.
 
-Colours are those of the page, so that they are right in the light and in the dark.
+Colours are those of the page, so that they suit its light and its dark theme.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ def residual_map(
     scale : float, optional
         How many times residuals are enlarged; `enlargement` of these by default.
     bold : float
-        How many times lines are thicker, for a small drawing.
+        Factor on the thickness of lines, for a small drawing.
     left_out : (M, 2) array, optional [px]
-        Points that are drawn as crosses.
+        Rejected points, drawn as crosses.
     photograph : bytes, optional
         A JPEG file that shows the image.
     """

@@ -1,4 +1,4 @@
-"""The frame of a page: style, tables that sort, drawings that open large, and how the result is repeated."""
+"""The frame of a page: style, sortable tables, enlargeable drawings, and how to reproduce the result."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def page(title: str, parts: Iterable[str]) -> str:
 
 
 def section(title: str, *parts: str) -> str:
-    """A headed part of a page; nothing if it has no content."""
+    """A section with a heading; nothing if it has no content."""
     content = "\n".join(part for part in parts if part)
     return f"<h2>{escape(title)}</h2>\n{content}" if content else ""
 
@@ -120,18 +120,18 @@ def figure(drawing: str, caption: str) -> str:
 
 
 def verdict_block(verdict: Verdict | None) -> str:
-    """The word, what it rests on, the reasons and the advice."""
+    """The verdict's word, its basis, the reasons and the advice."""
     if verdict is None:
         return '<div class="verdict">no verdict: the file has no points to be judged by. </div>'
     lists = ""
     for title, entries in (("Reasons", verdict.reasons), ("Advice", verdict.advice)):
         if entries:
             lists += f"<p>{title}</p><ul>{''.join(f'<li>{escape(entry)}</li>' for entry in entries)}</ul>"
-    word = escape(verdict.word)  # of a file that anybody may have written
+    word = escape(verdict.word)  # read from a file that may be malicious
     return f'<div class="verdict {word}"><b>{word}</b> <span>{escape(facts(verdict))}</span>{lists}</div>'
 
 
 def definitions(entries: Mapping[str, str]) -> str:
-    """Names and what they are."""
+    """A list of names with their values."""
     lines = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in entries.items())
     return f"<dl>{lines}</dl>"

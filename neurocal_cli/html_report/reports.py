@@ -103,7 +103,7 @@ def _over_settings(lens: ZoomLens) -> str:
     settings = low + span * grid.reshape(-1, 2)[:, : len(low)]
     try:
         prediction = lens.predict(settings)
-    except InputError:  # nothing to show of networks that give no camera there
+    except InputError:  # the networks give no camera there
         return ""
     percent = 100 * prediction.std[:, 0] / prediction.local[:, 0]
     height = 0.75 if len(low) > 1 else 0.15
@@ -126,7 +126,7 @@ def _over_settings(lens: ZoomLens) -> str:
 def _camera_parts(
     calibration: Calibration, photographs: Mapping[str, bytes], parameters: bool = True
 ) -> list[str]:
-    """Sections on one camera: parameters, pictures, views, what was left out, warnings."""
+    """Sections on one camera: parameters, pictures, views, rejected points, warnings."""
     parts = [section("Parameters", table(parameter_rows(calibration)))] if parameters else []
     residuals = _residuals(calibration)
     pixels = calibration.points.pixels
@@ -155,7 +155,7 @@ def _camera_parts(
 
 
 def _uncertainty(calibration: Calibration) -> str:
-    """A map of the standard deviation of projected pixels at the points' middle distance."""
+    """A map of the standard deviation of projected pixels at the points' median distance."""
     found = uncertainty_over_image(calibration)
     if found is None or calibration.image_size is None:
         return ""
@@ -224,7 +224,7 @@ def _view_parts(
 
 
 def _left_out(calibration: Calibration, view: str) -> Array:
-    """(M, 2) pixels of a view's points that were left out."""
+    """(M, 2) pixels of a view's rejected points."""
     points = calibration.rejected.points
     if points is None or view not in points.view_names:
         return np.zeros((0, 2))
@@ -284,7 +284,7 @@ def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:
 
 
 def _origin(likely: str, origin: Origin, facts: Mapping[str, str]) -> str:
-    """The run; where it is not known, the command that would give the like."""
+    """The run; if it is not known, a command that would give a similar result."""
     entries = {"command" if origin.command else "a command that gives the like": origin.command or likely}
     entries |= facts
     if origin.versions:

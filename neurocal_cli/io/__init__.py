@@ -1,1 +1,1 @@
-"""Files in and out: the only part of the package that knows about text formats and paths."""
+"""Reading and writing files: the only part of the package that handles file formats and paths."""

@@ -17,7 +17,7 @@ from neurocal_cli.errors import InputError
 from neurocal_cli.geometry import Array
 from neurocal_cli.printing.sheet import Line, Sheet, Text
 
-_POINT = 72 / 25.4  # points of a millimetre
+_POINT = 72 / 25.4  # points per millimetre
 _DASH = 1.0  # mm
 _MOST_PIXELS = 200_000_000
 
@@ -106,7 +106,7 @@ def board_png(sheet: Sheet, dpi: float) -> bytes:
     InputError
         More than 200 million pixels.
     """
-    pixels = dpi / 25.4  # of a millimetre
+    pixels = dpi / 25.4  # per millimetre
     width, height = round(sheet.width * pixels), round(sheet.height * pixels)
     if width * height > _MOST_PIXELS:
         raise InputError(f"the picture would have {width} x {height} pixels; give a smaller --dpi")
@@ -137,7 +137,7 @@ def _dashes(line: Line) -> list[tuple[Array, Array]]:
 
 
 def _cover(ink: NDArray[np.float32], low: Array, high: Array) -> None:
-    """Add a rectangle along the axes, each pixel by the part of it that is covered; [px] from the edge."""
+    """Add an axis-aligned rectangle, each pixel by its covered fraction; [px] from the edge."""
     parts = []
     for axis, count in ((1, ink.shape[0]), (0, ink.shape[1])):
         first, last = max(int(low[axis]), 0), min(int(np.ceil(high[axis])), count)

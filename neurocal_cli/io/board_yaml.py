@@ -97,7 +97,7 @@ def _distances(root: Field, board: Board) -> tuple[Distance, ...]:
 
 
 def _plane(field: Field, *, alone: bool) -> Plane:
-    """One plane; without company it may leave out its name and where it lies."""
+    """One plane; the only plane of a board may omit its name and position."""
     _only(field, _PLANE_KEYS)
     cols, rows = (field[key].integer(2) for key in _COUNTS)
     square = field["square"].number()
@@ -112,7 +112,7 @@ def _plane(field: Field, *, alone: bool) -> Plane:
 
 
 def _only(field: Field, known: tuple[str, ...]) -> None:
-    """Refuse keys that would be passed over: a misspelt axis would silently be the default one."""
+    """Refuse unknown keys: a misspelt axis would silently become the default."""
     for key in field.entries():
         if key not in known:
             where = f"{field.path}: " if field.path else ""

@@ -88,7 +88,7 @@ def calibration_from_field(root: Field) -> Calibration:
 
 
 def neurocal_block(root: Field) -> Field:
-    """Find the ``neurocal`` block, after a look at what kind of file this is."""
+    """Find the ``neurocal`` block, after checking the kind of file."""
     if not isinstance(root.value, dict):
         raise FormatError("is not a calibration; give a file that calibrate wrote", root.source)
     if "neurocal" not in root:

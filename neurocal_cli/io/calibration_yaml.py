@@ -1,11 +1,11 @@
-"""Calibration files: a camera, how sure it is, and what it was found from, in one YAML file.
+"""Calibration files: a camera, its uncertainty and its points, in one YAML file.
 
-The file is a ROS camera_info file with a block ``neurocal``; numbers read back to the last bit. Mappings
-are written as blocks with flow collections inside, one entry a line however long it gets, so the lines can
-be indented to become a part of another file, such as a rig's.
+The file is a ROS camera_info file with a block ``neurocal``; numbers are restored to the last bit. Mappings
+are written as blocks with flow collections inside, one entry a line of any length, so that the lines can be
+indented to become part of another file, such as a rig's.
 
-A long file, of more views or points than PyYAML reads within seconds, has its tables as texts of numbers; see
-`text_columns`.
+A long file, with more views or points than PyYAML reads within seconds, stores its tables as texts of
+numbers; see `text_columns`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from neurocal_cli.io.rejected_yaml import rejected_lines
 from neurocal_cli.io.target_yaml import target_lines
 from neurocal_cli.io.text_columns import column_lines
 from neurocal_cli.io.verdict_yaml import verdict_lines
-from neurocal_cli.io.views_yaml import alike, view_lines
+from neurocal_cli.io.views_yaml import same_std_keys, view_lines
 from neurocal_cli.io.yaml_text import flow, flows, list_lines, mapping, number, quoted, text
 
 if TYPE_CHECKING:
@@ -79,7 +79,7 @@ def read_calibration(path: str | Path) -> Calibration:
     FormatError
         The file cannot be read, is no YAML, or a key is missing or wrong.
     """
-    # Parsing YAML takes 20 ms to load, which a command that only writes does not wait for.
+    # Loading the YAML parser takes 20 ms, which a command that only writes can save.
     from neurocal_cli.io.calibration_tree import calibration_from_field
     from neurocal_cli.io.file_storage import read_tree
 
@@ -100,7 +100,7 @@ def calibration_lines(
         See `format_calibration`.
     """
     large = len(cal.views) > _MOST_VIEWS or len(cal.points) > _MOST_POINTS
-    long = large and not by_rows and alike(cal.views)
+    long = large and not by_rows and same_std_keys(cal.views)
     yield from camera_info_lines(cal.camera, rectified)
     yield "neurocal:"
     for lines in (
@@ -139,7 +139,7 @@ def _record_lines(cal: Calibration, long: bool) -> Iterator[str]:
 
 def _parameter_lines(cal: Calibration) -> Iterator[str]:
     values: dict[str, float] = dict(zip(INTRINSIC_NAMES, cal.intrinsics.values().tolist(), strict=True))
-    # Distortion is no parameter of the paper's, but where its accuracy is known, it stands here too.
+    # Distortion is not one of the paper's parameters, but it is listed here too if its accuracy is known.
     lens = dict(zip(coefficient_names(cal.distortion_model), cal.distortion.tolist(), strict=False))
     values.update({name: value for name, value in lens.items() if name in cal.std})
     yield "parameters:"

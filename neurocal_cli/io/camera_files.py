@@ -24,7 +24,7 @@ def read_intrinsics(path: str | Path) -> Camera:
     Raises
     ------
     FormatError
-        No camera matrix, or one that is none; several cameras.
+        No camera matrix, or an invalid one; several cameras.
     """
     found = read_cameras([path], whole=False)
     if len(found.cameras) > 1:

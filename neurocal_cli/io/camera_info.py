@@ -49,7 +49,7 @@ def format_camera_info(camera: Camera, rectified: tuple[Array, Array] | None = N
 
 
 def format_panorama(panorama: Panorama) -> str:
-    """Text of the file of a picture on a cylinder or a sphere, without a camera matrix, which it has not."""
+    """Text of the file for a cylindrical or spherical picture, which has no camera matrix."""
     width, height = panorama.image_size
     lines = [
         f"# A point (X, Y, Z) is seen at {_FORMULAS[panorama.shape]}.",

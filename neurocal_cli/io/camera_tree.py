@@ -1,8 +1,8 @@
-"""A camera from the tree of a file, by the names that its keys have in use.
+"""A camera from the tree of a file, by the key names in common use.
 
-Keys of ROS, of OpenCV's samples and of the many programs that store what ``calibrateCamera`` returned. A key
-that may be the distortion and is none of those is refused: a camera without its distortion looks right and
-is wrong.
+The keys are those of ROS, of OpenCV's samples and of the many programs that store what ``calibrateCamera``
+returned. An unknown key that may be the distortion is refused: a camera without its distortion looks right
+but is wrong.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _WIDTH_KEYS = ("image_width", "width")
 _HEIGHT_KEYS = ("image_height", "height")
 _SIZE_KEYS = ("imageSize", "image_size", "img_size", "resolution")
 _BOOFCV = ("pinhole", "pinhole_radial_tangential", "omnidirectional_universal")
-# Speak of distortion and are not its coefficients.
+# Keys that mention distortion but do not hold its coefficients.
 _OTHERS = ("distortion_model", "dist_model", "distortion_type")
 
 
@@ -42,14 +42,14 @@ def camera_from_tree(root: Field, side: str = "", whole: bool = True) -> Camera:
     root : Field
         The whole file.
     side : str
-        What the keys of one camera of several end in, such as ``1`` of M1 and D1.
+        Suffix of the keys of one camera of several, such as ``1`` of M1 and D1.
     whole : bool
-        Whether the file is of this camera alone, so that all its keys are looked at.
+        Whether the file is of this camera alone, so that all its keys are examined.
 
     Raises
     ------
     InputError, FormatError
-        No camera matrix, or one that is none; a distortion that cannot be read.
+        No camera matrix, or an invalid one; a distortion that cannot be read.
     """
     if "projection" in root and "f" in root:
         raise InputError("is the file of an undistorted panorama; give the camera of the original images")
@@ -133,7 +133,7 @@ def _channels(field: Field) -> int:
 
 
 def _ended(keys: tuple[str, ...], side: str) -> tuple[str, ...]:
-    """The keys of one camera of several, with the ending straight behind them or after an underscore."""
+    """The keys of one camera of several, with the suffix appended directly or after an underscore."""
     if not side:
         return keys
     # One letter is a coefficient's name, k1, in another file.
@@ -204,7 +204,7 @@ def _refuse_unread(root: Field) -> None:
 
 
 def image_size(root: Field, side: str = "") -> tuple[int, int] | None:
-    """Width and height [px] under one of their usual names, None where they are unknown."""
+    """Width and height [px] under one of their usual names, None if they are unknown."""
     width, height = (
         _first(root, (*(_ended(keys, side) if side else ()), *keys)) for keys in (_WIDTH_KEYS, _HEIGHT_KEYS)
     )

@@ -42,12 +42,12 @@ def to_ros(model: str, coefficients: Array) -> tuple[str, Array]:
 def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
     """Find our name of a ROS (or OpenCV) model and its coefficients.
 
-    All zeros are no distortion, but for a fisheye, whose image they let grow evenly with the angle.
+    All zeros mean no distortion, except for a fisheye, where they give the equidistant projection.
 
     Raises
     ------
     InputError
-        A model or coefficients that we don't have; the message tells which there are.
+        An unknown model or wrong coefficients; the message lists the known ones.
     """
     values = np.asarray(coefficients, dtype=float).ravel()
     if name in ("equidistant", "fisheye") and values.size:
@@ -79,5 +79,5 @@ def from_ros(name: str, coefficients: Array) -> tuple[str, Array]:
 
 
 def own_length(model: str) -> int:
-    """Tell how many coefficients one of our models has."""
+    """Number of coefficients of one of our models."""
     return len(coefficient_names(model))

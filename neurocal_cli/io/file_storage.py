@@ -1,4 +1,4 @@
-"""Trees from YAML, JSON or XML text: the three faces of OpenCV's FileStorage."""
+"""Trees from YAML, JSON or XML text, the three formats of OpenCV's FileStorage."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DEEPEST = 40
 
 
 def read_tree(path: str | Path) -> Field:
-    """Read a YAML, JSON or XML file; its content tells which.
+    """Read a YAML, JSON or XML file; the format is detected from the content.
 
     Raises
     ------

@@ -12,7 +12,7 @@ import numpy as np
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.yaml_text import number, quoted
 
-_PER_LINE = 4  # numbers; OpenCV's reader takes no line of more than some thousand characters
+_PER_LINE = 4  # numbers; OpenCV's reader limits a line to some thousand characters
 
 
 def storage_text(entries: Mapping[str, Any], ending: str = ".yaml") -> str:
@@ -82,5 +82,5 @@ def _xml(key: str, value: Any) -> str:
 
 
 def _xml_text(text: str) -> str:
-    """A text in quotes, so that it is taken neither for a number nor for several words."""
+    """A text in quotes, so that it is read neither as a number nor as several words."""
     return '"' + escape(text, {'"': "&quot;"}) + '"'

@@ -1,4 +1,4 @@
-"""Files in, as bytes or text; failures in one line. ``-`` is stdin."""
+"""Reading files as bytes or text, with one-line errors. ``-`` is stdin."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def read_blocks(path: str | Path, size: int) -> Iterator[bytes]:
 
 
 def _protect(file: IO[bytes]) -> None:
-    """See to it that the command that runs does not write over what it reads."""
+    """Prevent the running command from writing over its inputs."""
     outputs = held_back()
     if outputs is not None:
         outputs.protect_status(os.fstat(file.fileno()))
@@ -100,7 +100,7 @@ def _whole_lines(file: IO[bytes], size: int) -> Iterator[bytes]:
 
 @contextmanager
 def reading_failures(source: str) -> Iterator[None]:
-    """Turn what can go wrong with a file into a line."""
+    """Turn failures to read a file into one-line errors."""
     try:
         yield
     except FileNotFoundError as error:
@@ -115,7 +115,7 @@ def reading_failures(source: str) -> Iterator[None]:
 
 @contextmanager
 def value_failures(source: str, where: str = "") -> Iterator[None]:
-    """Turn a value that cannot be used into a line about its file, and the place in it."""
+    """Turn an invalid value into a one-line error with its file and the location in it."""
     try:
         yield
     except InputError as error:
@@ -175,7 +175,7 @@ def _stdin_failures() -> Iterator[None]:
 
 
 def reason(error: BaseException) -> str:
-    """What the system says of a failure."""
+    """The system's reason for a failure."""
     return (getattr(error, "strerror", None) or str(error)).lower()
 
 

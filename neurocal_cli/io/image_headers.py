@@ -1,9 +1,9 @@
-"""What an image file says of itself, read without decoding it: its size above all.
+"""Headers of image files, mainly their size, read without decoding.
 
-A file of a kilobyte can state a terabyte of pixels, and decoders differ in what they make of half a
-file; both are settled here, before any of them sees it. No library that neurocal needs anyway does this:
-OpenCV tells no size but that of decoded pixels (0.4 s for 12 megapixels, where this takes 0.03 s, nearly
-all of it checksums), and its versions from 4.8 to 5.0 fill, cut or refuse half a file, without a reason.
+A file of a kilobyte can state a terabyte of pixels, and decoders treat truncated files differently; both are
+checked here, before decoding. No library that neurocal needs anyway does this: OpenCV gives only the size of
+decoded pixels (0.4 s for 12 megapixels; this takes 0.03 s, mostly for checksums), and its versions from 4.8
+to 5.0 fill, cut or refuse truncated files without a reason.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _TIFF_TYPES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _JPEG_ALONE = frozenset({0x01, *range(0xD0, 0xD9)})  # markers without a length
 
-# What a file may be instead, by its first bytes.
+# Other kinds of files, by their first bytes.
 _VIDEO = "video"
 _OTHERS = (
     (rb".{4}ftyp(heic|heix|hevc|mif1|msf1)", "HEIC"),
@@ -63,7 +63,7 @@ class _TruncatedError(Exception):
 
 
 def read_header(data: bytes, source: str) -> Header:
-    """Read the header of an image file and check that the file is all there.
+    """Read the header of an image file and check that the file is complete.
 
     Parameters
     ----------
@@ -103,10 +103,10 @@ def read_header(data: bytes, source: str) -> Header:
 
 
 def stated_sizes(paths: Iterable[str]) -> Iterator[tuple[int, int] | None]:
-    """Larger and smaller side [px] of PNG and JPEG files by their beginnings, for a look before the work.
+    """Larger and smaller side [px] of PNG and JPEG files from their headers, for a quick check in advance.
 
     Sorted, so that images turned by their EXIF orientation have one size. None for standard input, other
-    kinds of files and unreadable ones: this serves to find different cameras, and decoding says the rest.
+    kinds of files and unreadable ones: this only finds different cameras; decoding reports the rest.
     """
     for path in paths:
         size = None if path == "-" else _stated_size(path)
@@ -141,7 +141,7 @@ def is_video_header(head: bytes) -> bool:
 
 
 def _other(data: bytes) -> str | None:
-    """What a file is that is no image of a known kind."""
+    """The kind of a file that is not a supported image."""
     return next((what for mark, what in _OTHERS if re.match(mark, data, re.DOTALL)), None)
 
 

@@ -1,4 +1,4 @@
-"""Which image files the words of a command line name."""
+"""The image files named by the words of a command line."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def is_image(path: str) -> bool:
 
 
 def find_images(words: Iterable[str]) -> tuple[str, ...]:
-    """Find the files that are meant by names, folders and patterns.
+    """Find the files named by files, folders and patterns.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def _in_folder(folder: str) -> list[str]:
         names = sorted(os.listdir(folder), key=natural_order)
     except OSError as error:
         raise FormatError("may not be read; change its permissions", one_line(folder)) from error
-    # Hidden files are other programs' business: previews, half of a copy.
+    # Hidden files belong to other programs: previews, unfinished copies.
     names = [name for name in names if is_image(name) and not name.startswith(".")]
     paths = [path for path in (os.path.join(folder, name) for name in names) if os.path.isfile(path)]
     if not paths:

@@ -65,8 +65,8 @@ class Image:
 def read_image(path: str | Path, most_pixels: int = MOST_PIXELS) -> Image:
     """Read an image: PNG, JPEG, TIFF, BMP, PGM or PPM, grey or colour, of 8 or 16 bits.
 
-    As in OpenCV's ``imread``, an image whose EXIF orientation says so is turned upright, and pixel
-    coordinates are those of the turned image; a note tells.
+    As in OpenCV's ``imread``, an image is turned upright by its EXIF orientation, and pixel
+    coordinates are those of the turned image; a note says so.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def parse_image(data: bytes, source: str = "image", most_pixels: int = MOST_PIXE
 
 
 def _upright(data: bytes, source: str, most_pixels: int, flags: int) -> tuple[Pixels, tuple[str, ...]]:
-    """Pixels of a file, its EXIF orientation applied, and what is to be said of that."""
+    """Pixels of a file with its EXIF orientation applied, and the note on it."""
     header = read_header(data, source)
     if header.width * header.height > most_pixels:
         raise FormatError(
@@ -194,7 +194,7 @@ def encode_image(pixels: Pixels, ending: str, quality: int = _QUALITY) -> bytes:
 
 
 def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
-    """Pixels of a file that looks whole; the decoder's complaints stay off the user's screen."""
+    """Pixels of a file whose header is intact; the decoder's messages are kept off the user's screen."""
     with captured_stderr() as complaints:
         try:
             pixels = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), flags)
@@ -206,7 +206,7 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
             "save it as PNG of 8 or 16 bits",
             source,
         )
-    # The JPEG decoder fills what it cannot make out with grey and only says so here.
+    # The JPEG decoder fills damaged parts with grey, and reports it on stderr only.
     if any(mark in text for text in complaints for mark in ("Corrupt JPEG", "Premature end")):
         raise FormatError("is damaged; copy the image again", source)
     turned = header.orientation >= 5
@@ -224,7 +224,7 @@ def _decoded(data: bytes, header: Header, source: str, flags: int) -> Pixels:
 
 @contextmanager
 def captured_stderr() -> Iterator[list[str]]:
-    """Catch what the C libraries below OpenCV write to stderr, past Python; yields its lines."""
+    """Capture what the C libraries below OpenCV write directly to stderr; yields its lines."""
     lines: list[str] = []
     with _ONE_AT_A_TIME, tempfile.TemporaryFile() as file:
         try:

@@ -21,7 +21,7 @@ _PARAMETERS = ("alpha_u", "alpha_v", "u0", "v0")
 _FILES = "camera"
 _TABLE = Schema(kind="cameras", required=_PARAMETERS, optional=("t_z", *CONTROLS))
 _LIST = Schema(kind="cameras", required=(_FILES,), optional=("t_z", *CONTROLS), labels=frozenset({_FILES}))
-_NESTED = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")  # each begins with the one before
+_NESTED = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob", "rational")  # each extends the one before
 
 
 # Of one file: columns of settings, `_PARAMETERS`, theta and perhaps t_z; each camera's lens; image sizes.

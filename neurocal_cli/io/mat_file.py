@@ -1,7 +1,7 @@
 """The variables of a MATLAB file of version 5 to 7: numbers, texts, cells and structs.
 
-Read here and not by ``scipy.io.loadmat``, which damaged files crash. The format is MathWorks' "MAT-File
-Format": elements of a type, a length and as many bytes, the matrices among them made of further elements.
+Read here and not by ``scipy.io.loadmat``, which crashes on damaged files. The format is MathWorks' "MAT-File
+Format": elements of a type, a length and as many bytes; matrices consist of further elements.
 """
 
 from __future__ import annotations

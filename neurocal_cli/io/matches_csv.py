@@ -1,4 +1,4 @@
-"""Matches CSV: pixels of the same point in the left and the right image, as many as there may be."""
+"""Matches CSV: pixels of the same point in the left and the right image, in any number."""
 
 from __future__ import annotations
 

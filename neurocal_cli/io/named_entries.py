@@ -1,7 +1,7 @@
 """Values by the names of views, as YAML.
 
-A mapping where all names can be keys of OpenCV's FileStorage, which opens the file; else a list of pairs,
-because a key such as ``"01"`` stops it.
+A mapping if all names are valid keys of OpenCV's FileStorage; otherwise a list of pairs, because FileStorage
+cannot open a file with a key such as ``"01"``.
 """
 
 from __future__ import annotations

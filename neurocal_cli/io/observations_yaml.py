@@ -1,7 +1,7 @@
-"""The points that a calibration was found from, as a block of its file.
+"""The points of a calibration, as a block of its file.
 
-A row for each point; or, in a long file, each place of the target once, and a row for each view whose numbers
-are texts: decimals, or packed where there are so many digits that PyYAML would take long.
+A short file has a row for each point. A long file has each target point once and a row for each view, whose
+numbers are texts: decimals, or packed if there are so many digits that PyYAML would be slow.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def observation_lines(points: Correspondences, long: bool) -> Iterator[str]:
 
 
 def _rows(points: Correspondences, numbers: Array) -> Iterator[str]:
-    # They are further in than their key: OpenCV's FileStorage wants that.
+    # They are indented more than their key, as OpenCV's FileStorage requires.
     heads = [f"    - [{quoted(name)}, " for name in points.view_names]
     heads = [heads[k] for k in points.view_index.tolist()]
     if points.point is not None:
@@ -94,7 +94,7 @@ def _long_lines(points: Correspondences, values: Array) -> Iterator[str]:
 
 
 def _places(points: Correspondences) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The place of each row among the different ones, and the first row at each place."""
+    """Index of each row's target point among the distinct ones, and the first row of each."""
     bits = np.ascontiguousarray(points.world).view(np.dtype((np.void, 24))).ravel().tolist()
     keys = bits if points.point is None else list(zip(bits, np.asarray(points.point).tolist(), strict=True))
     number: dict[Any, int] = {}

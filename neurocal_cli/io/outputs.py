@@ -1,7 +1,7 @@
-"""What a command writes: all of it or nothing, and never over a file that it reads.
+"""The outputs of a command: all or none are written, and never over a file that the command reads.
 
-Within `all_or_none` every file is written beside its place, and all take their places together at the end.
-Files are told apart by their identity on the disk, not by their names: links lead to the same file.
+Within `all_or_none` every file is written under a temporary name, and all are renamed together at the end.
+Files are compared by device and inode, not by name, because links lead to the same file.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _Identity = tuple[int, int]  # device and inode
 
 
 class Outputs:
-    """The files that are read and written between the beginning and the end of one command."""
+    """The files that one command reads and writes."""
 
     def __init__(self) -> None:
         self._inputs: set[_Identity] = set()
@@ -26,9 +26,9 @@ class Outputs:
         self._stdout: list[bytes] = []
 
     def protect(self, *paths: str | None) -> None:
-        """Never write over these files; the ones that do not exist are left to their readers.
+        """Never write over these files; their readers report those that do not exist.
 
-        ``-`` is what the shell made stdin of, which may be a file: ``< FILE``.
+        ``-`` is standard input, which the shell may have opened from a file: ``< FILE``.
         """
         for path in paths:
             if path is not None:
@@ -50,15 +50,15 @@ class Outputs:
             raise UsageError(f"{shown} is an input and would be overwritten; give another output")
 
     def stage(self, temporary: str, target: str) -> None:
-        """Let a written file take its place at the end."""
+        """Register a temporary file, to be renamed at the end."""
         self._staged.append((temporary, target))
 
     def hold(self, data: bytes) -> None:
-        """Let this go to stdout at the end."""
+        """Keep this for stdout until the end."""
         self._stdout.append(data)
 
     def commit(self) -> list[bytes]:
-        """Put all files into their places; return what is for stdout."""
+        """Rename all files to their final names; return what is for stdout."""
         while self._staged:
             temporary, target = self._staged[0]
             os.replace(temporary, target)
@@ -78,20 +78,20 @@ _CURRENT: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
 
 
 def held_back() -> Outputs | None:
-    """The outputs of the command that runs; None outside of `all_or_none`: files are written at once."""
+    """The outputs of the running command; None outside `all_or_none`, where files are written at once."""
     return _CURRENT.get()
 
 
 @contextmanager
 def all_or_none(finishing: Iterable[type[BaseException]] = ()) -> Iterator[Outputs]:
-    """Hold back everything that is written until the end of the block; leave nothing when it fails.
+    """Hold back all outputs until the end of the block; write none of them if it fails.
 
-    Within such a block this one is its part.
+    A nested block is part of the outer one.
 
     Parameters
     ----------
     finishing : exception types
-        That end the block with its work done.
+        Exceptions that end the block successfully.
     """
     outer = _CURRENT.get()
     if outer is not None:

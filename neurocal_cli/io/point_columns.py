@@ -12,7 +12,7 @@ OPTIONAL = {"covariance": ("suu", "suv", "svv"), "world_std": ("sX", "sY", "sZ")
 
 
 def measured(points: Correspondences) -> tuple[list[str], list[Array]]:
-    """Names and values of the columns behind the place: pixels, and what else is known of the points."""
+    """Names and values of the columns after X, Y, Z: pixels, and the other known values of the points."""
     names, blocks = list(PIXEL), [points.pixels]
     for attribute, columns in OPTIONAL.items():
         values = getattr(points, attribute)

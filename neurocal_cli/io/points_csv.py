@@ -55,7 +55,7 @@ def read_points(
     FormatError
         A file that cannot be read; the message begins with ``FILE:LINE:``.
     InputError
-        Rows that are well formed but do not fit together.
+        Rows that are well formed but inconsistent.
     """
     several = [paths] if isinstance(paths, (str, os.PathLike)) else list(paths)
     if not several:

@@ -14,7 +14,7 @@ from neurocal_cli.stereo.triangulation import Triangulated
 COLUMNS = ("X", "Y", "Z", "sXX", "sXY", "sXZ", "sYY", "sYZ", "sZZ", "epipolar", "flag")
 FLAGS = np.array(["ok", "off", "behind"])
 
-# Ten digits of the coordinates, more than any pixel tells; six of what says how sure they are.
+# Ten digits for coordinates, more than pixels can determine; six for the other columns.
 _ROW = ",".join(["%.10g"] * 3 + ["%.6g"] * 7 + ["%s"])
 
 
@@ -50,7 +50,7 @@ def format_space_points(
 def _rows(found: Triangulated, labels: NDArray[Any] | None, sigma: float, limit: float) -> str:
     assert found.covariance is not None
     numbers = np.column_stack([found.points, sigma**2 * found.covariance, found.epipolar])
-    numbers[~np.isfinite(numbers)] = np.nan  # one word for what has no place
+    numbers[~np.isfinite(numbers)] = np.nan  # one word for values that do not exist
     flags = FLAGS[np.where(found.behind, 2, found.off(limit).astype(int))].tolist()
     columns: list[list[Any]] = [*numbers.T.tolist(), flags]
     row = _ROW

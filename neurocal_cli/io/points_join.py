@@ -1,4 +1,4 @@
-"""Points from the tables of one or several files: what fits together becomes one data set."""
+"""Points from the tables of one or several files, joined into one data set."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
     Raises
     ------
     FormatError, InputError
-        Tables that contradict each other or themselves.
+        Tables that are inconsistent with each other or in themselves.
     """
     for table in tables:
         table.note_unknown(notes)
@@ -58,7 +58,7 @@ def correspondences(tables: list[Table], notes: list[str]) -> Correspondences:
 
 
 def _joined(blocks: list[NDArray[Any]]) -> NDArray[Any]:
-    """One below the other; a single one is not copied, as it may have a million rows."""
+    """Concatenate arrays; a single one is not copied, as it may have a million rows."""
     return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
 
 
@@ -80,7 +80,7 @@ def _views_of_file(table: Table) -> NDArray[Any]:
 
 
 def _owners(tables: list[Table], views: list[NDArray[Any]]) -> dict[str, str]:
-    """Tell which file each view is in."""
+    """The file of each view."""
     owners: dict[str, str] = {}
     for table, labels in zip(tables, views, strict=True):
         first_of_run = np.concatenate([[True], labels[1:] != labels[:-1]])
@@ -98,7 +98,7 @@ def _owners(tables: list[Table], views: list[NDArray[Any]]) -> dict[str, str]:
 
 
 def _agreed(key: str, tables: list[Table]) -> Any:
-    """Take the value of a metadata key, on which all the files that give it must agree."""
+    """The value of a metadata key, on which all files that state it must agree."""
     given = [(getattr(table.metadata, key), table.source) for table in tables]
     given = [(value, source) for value, source in given if value is not None]
     for value, source in given:
@@ -164,7 +164,7 @@ def _covariance_of(table: Table) -> Array | None:
 
 
 def _together(table: Table, names: tuple[str, ...]) -> Array | None:
-    """Columns of which a file has all or none."""
+    """Columns that each file must have all of or none."""
     given = [name for name in names if name in table.numbers]
     if given and len(given) < len(names):
         raise FormatError(
@@ -175,7 +175,7 @@ def _together(table: Table, names: tuple[str, ...]) -> Array | None:
 
 
 def _where_known(tables: list[Table], names: tuple[str, ...]) -> Array | None:
-    """Columns of several files, zero where one has none."""
+    """Columns of several files, zero for files without them."""
     blocks = [_together(table, names) for table in tables]
     if all(block is None for block in blocks):
         return None

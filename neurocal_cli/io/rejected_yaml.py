@@ -20,7 +20,7 @@ _NUMBERS = ("X", "Y", "Z", "u", "v", "error_px")
 
 
 def rejected_lines(rejected: Rejected, long: bool) -> Iterator[str]:
-    """Lines of the block ``rejected``; none where nothing was."""
+    """Lines of the block ``rejected``; none if no point was."""
     if not len(rejected) and not rejected.views:
         return
     yield "rejected:"

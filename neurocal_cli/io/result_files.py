@@ -1,8 +1,7 @@
-"""A calibration or a rig in the form that a file's name asks for: YAML, JSON, or OpenCV's XML.
+"""A calibration or a rig as YAML, JSON or OpenCV's XML, by the ending of the file's name.
 
-JSON holds the same tree as YAML. XML is `cv2.FileStorage`'s, which has no place for more than the cameras and
-the poses of views. A lean file holds the camera and the verdict alone: no points, no poses, no record of the
-network.
+JSON holds the same tree as YAML. XML is that of `cv2.FileStorage`, which holds only the cameras and the poses
+of views. A lean file holds only the camera and the verdict: no points, no poses, no record of the network.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ def write_result(
     ----------
     result : Calibration or Rig
     path : str or Path
-        ``.json`` and ``.xml`` are what they say; all others are YAML.
+        ``.json`` gives JSON and ``.xml`` XML; all other names give YAML.
     lean : bool
         Whether points, poses and the record of the network are left out.
     alpha : float, optional
@@ -41,17 +40,17 @@ def write_result(
     Returns
     -------
     losses : tuple of str
-        What the file cannot hold as it was: an XML file has no skew.
+        What the file cannot hold exactly: an XML file has no skew.
 
     Raises
     ------
     InputError
-        An XML file of a camera that OpenCV has no distortion model for.
+        An XML file of a camera whose distortion model OpenCV lacks.
     """
     if lean:
         result = lean_calibration(result) if isinstance(result, Calibration) else lean_rig(result)
     ending = os.path.splitext(str(path))[1].lower()
-    # Formats that nobody asked for are not loaded.
+    # Formats that are not needed are not loaded.
     if ending == ".xml":
         from neurocal_cli.io.exchange.dictionary import OPENCV
         from neurocal_cli.io.exchange.fitting_in import fitted_in
@@ -72,7 +71,7 @@ def write_result(
 
 
 def lean_calibration(calibration: Calibration) -> Calibration:
-    """The camera with its accuracy and its verdict, without what it was found from."""
+    """The camera with its accuracy and its verdict, without points and poses."""
     return replace(
         calibration,
         points=Correspondences.none(calibration.image_size, calibration.unit),
@@ -85,7 +84,7 @@ def lean_calibration(calibration: Calibration) -> Calibration:
 
 
 def lean_rig(rig: Rig) -> Rig:
-    """Both cameras and how they stand to each other, without what they were found from."""
+    """Both cameras and their relative pose, without points and poses of views."""
     return replace(
         rig,
         left=lean_calibration(rig.left),

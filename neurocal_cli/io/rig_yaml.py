@@ -1,4 +1,4 @@
-"""Rig files: two calibrations and how the right camera stands to the left, in one YAML file.
+"""Rig files: two calibrations and the relative pose of the right camera, in one YAML file.
 
 ``left`` and ``right`` are each a calibration file's content, whose rectification and projection matrices
 are those of the rectified pair; ``stereo`` is the rest.
@@ -181,7 +181,7 @@ def _names(entry: Field, count: int) -> tuple[str, ...]:
 
 
 def _check_consistent(rig: Rig, block: Field) -> None:
-    """Refuse a file in which one of several statements of the same was edited."""
+    """Refuse a file in which one of several redundant values was edited."""
     values = [block[g][n]["value"].number() for g, names in _GROUPS for n in names]
     stated = (
         ("E", block["E"].array(3, 3), rig.E),

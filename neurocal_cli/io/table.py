@@ -1,9 +1,9 @@
-"""Tables of numbers and labels as text, columns found by name: what all our CSV files share.
+"""Text tables of numbers and labels, with columns found by name, as all our CSV files are.
 
-NumPy's C reader takes the rows in bulk, a million in a second. It is laxer than the format, so text in
-which the two could differ (quotes, comments among the rows, blank lines, other alphabets, ...) is read
-line by line, as is what it refuses: that finds the line to complain about. Both ways give the same
-table. Without NumPy's reader, by `str.split` or the `csv` module and `float`, a million rows take 4 s.
+NumPy's C reader parses the rows in bulk, a million per second. It is laxer than the format, so text that the
+two could read differently (quotes, comments among the rows, blank lines, other alphabets, ...) is read line
+by line, as is text that NumPy refuses, to find the faulty line. Both ways give the same table. With
+`str.split` or the `csv` module and `float` instead of NumPy's reader, a million rows take 4 s.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 _BLOCK = 1 << 22  # bytes of a stream at a time: some ten thousand rows
-# Printable ASCII without quotes, tabs and line ends: nothing here is blank in one reader's eyes only.
+# Printable ASCII without quotes, tabs and line ends: both readers agree on which of these are blanks.
 _PLAIN = bytes(c for c in range(32, 127) if c != ord('"')) + b"\t\n"
 
 
@@ -55,7 +55,7 @@ class Table:
     metadata : Metadata
         From the lines that begin with ``#``.
     unknown : tuple of str
-        Names of columns that were kept out.
+        Names of columns that were ignored.
     """
 
     source: str
@@ -77,7 +77,7 @@ class Table:
         return columns
 
     def note_unknown(self, notes: list[str]) -> None:
-        """Append a remark that names the columns which were kept out."""
+        """Append a remark that names the ignored columns."""
         if self.unknown:
             names = ", ".join(repr(name[:40]) for name in self.unknown)
             notes.append(f"{self.source}: column{'s' * (len(self.unknown) > 1)} not used: {names}")
@@ -125,7 +125,7 @@ def stream_table(path: str | Path, schema: Schema, block: int = _BLOCK) -> Itera
     Raises
     ------
     FormatError
-        The file cannot be read, or a line of it is wrong; the rows before it have come by then.
+        The file cannot be read, or a line of it is wrong; the rows before it have been yielded by then.
     """
     source = "<stdin>" if str(path) == "-" else one_line(path)
     layout, rows = None, False
@@ -137,7 +137,7 @@ def stream_table(path: str | Path, schema: Schema, block: int = _BLOCK) -> Itera
         if table is not None and len(table):
             rows = True
             yield table
-        # The next block's first line follows on this one's last.
+        # The next block's line numbers continue after this one's.
         layout = replace(layout, offset=0, line=layout.line + data.count(b"\n", layout.offset))
     if layout is None:
         find_layout(b"", source, schema)  # says that the file is empty
@@ -162,7 +162,7 @@ def _read_rows(data: bytes, source: str, schema: Schema, layout: Layout) -> Tabl
 
 
 def read_in_bulk(data: bytes, source: str, schema: Schema, layout: Layout) -> Table | None:
-    r"""Read the rows below a header by NumPy, or return None where it is not certain to read them right.
+    r"""Read the rows below a header by NumPy, or return None if it might read them wrongly.
 
     Parameters
     ----------
@@ -215,7 +215,7 @@ def _is_plain(data: bytes, schema: Schema, layout: Layout) -> bool:
     if separator is None:
         return True
     if data.find(b" ", layout.offset) >= 0 and any(name in schema.labels for name in layout.names):
-        # Labels would keep the blanks around them.
+        # NumPy would keep the blanks around labels.
         mark = separator.encode()
         blanks = (mark + b" ", b" " + mark, b"\n ", b" \n")
         if any(data.find(blank, before) >= 0 for blank in blanks) or data.endswith(b" "):
@@ -248,7 +248,7 @@ def read_line_by_line(data: bytes, source: str, schema: Schema, layout: Layout) 
 
 
 def _rows(data: bytes, source: str, layout: Layout) -> Iterator[tuple[int, list[str]]]:
-    """Line number and fields of each row; metadata among them is taken note of."""
+    """Line number and fields of each row; metadata among the rows is stored."""
     expected = len(layout.names)
     text = data[layout.offset :].decode("utf-8")
     for number, line in enumerate(text.split("\n"), start=layout.line + 1):

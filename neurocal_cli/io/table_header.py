@@ -1,4 +1,4 @@
-"""What a table says above its rows: its metadata, its separator and the names of its columns."""
+"""The head of a table: its metadata, its separator and the names of its columns."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.io.files import one_line
 
-# What a number looks like in our files; Python's float() would also take 1_0 and other alphabets.
+# Numbers as our files may contain them; Python's float() would also accept 1_0 and other alphabets.
 is_number = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 
 # 1,5 for 1.5, as spreadsheets of half of Europe write it.
@@ -27,17 +27,17 @@ _QUOTED = re.compile(r'"(?:[^"]|"")*"')
 
 @frozen_dataclass
 class Schema:
-    """Which columns a kind of table has.
+    """The columns of a kind of table.
 
     Attributes
     ----------
     kind : str
-        What a row is, in the plural.
+        Plural noun for the rows, such as "points".
     required, optional : tuple of str
     labels : frozenset of str
         The columns that hold text; all others hold numbers.
     instead : str
-        What to do with a file that is none at all, for messages.
+        Advice for a file that is no such table, for messages.
     headerless : tuple of str
         Columns of a file without a header; empty: the header is required.
     """
@@ -57,7 +57,7 @@ class Schema:
 
 @dataclass
 class Metadata:
-    """What the ``#`` lines of a file say, gathered line by line.
+    """Metadata from the ``#`` lines of a file, collected line by line.
 
     Attributes
     ----------
@@ -73,7 +73,7 @@ class Metadata:
     distances: tuple[Distance, ...] | None = None
 
     def take(self, line: str, source: str, number: int) -> None:
-        """Note a ``# key: value`` line; other comments are passed over."""
+        """Store a ``# key: value`` line; other comments are ignored."""
         match = _METADATA.fullmatch(line.strip(" \t"))
         if match is None:
             return
@@ -118,7 +118,7 @@ _VALUES: dict[str, tuple[Callable[[str], Any], str]] = {
 
 @frozen_dataclass
 class Layout:
-    """Where a table's rows begin and how to split them.
+    """The start of a table's rows and how to split them.
 
     Attributes
     ----------
@@ -185,7 +185,7 @@ def split_fields(line: str, separator: str | None, source: str, number: int) -> 
     """Split a line at its separators, outside quotes.
 
     Blanks around a field are dropped, unless they are inside quotes; ``""`` in quotes is a quote. The
-    csv module would read on in the next line where a quote is not closed, and keep blanks after one.
+    csv module would continue an unclosed quote on the next line, and keep blanks after a quote.
 
     Raises
     ------
@@ -227,9 +227,9 @@ def _lines(data: bytes) -> Iterator[tuple[int, int, int, str]]:
 
 
 def _find_separator(line: str) -> str | None:
-    """Find what separates the fields of the first line; None: blanks."""
+    """Find the separator of the fields in the first line; None: blanks."""
     line = _QUOTED.sub("q", line)
-    # In 1,5;2,5;... the commas are decimal ones, so semicolons go first where there are enough.
+    # In 1,5;2,5;... the commas are decimal, so semicolons take precedence if there are enough.
     semicolons = line.count(";") >= min(line.count(","), 4)
     separators = ";\t," if semicolons else ",\t;"
     for separator in separators:

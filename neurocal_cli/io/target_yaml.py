@@ -1,4 +1,4 @@
-"""The target that a calibration found, as a block of its file."""
+"""The target estimated by a calibration, as a block of its file."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _SHAPES = ("bowl", "saddle", "twist")
 
 
 def target_lines(target: Target | None, long: bool) -> Iterator[str]:
-    """Lines of the block ``target``; none where the target was taken as given."""
+    """Lines of the block ``target``; none if the target was taken as given."""
     if target is None:
         return
     yield "target:"

@@ -1,7 +1,7 @@
 """Names of temporary files, and the removal of those that a killed process left behind.
 
-A name tells the computer and the process that it is of. Files of a process of this computer that has ended
-are removed by the next one that writes into the same folder; all others are left alone.
+A name contains the computer and the process. Files of an ended process of this computer are removed by the
+next process that writes into the same folder; all others are kept.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _seen: set[str] = set()  # folders that this process has cleared
 
 
 def temporary_name() -> str:
-    """A name that no other process chooses."""
+    """A name unique to this process."""
     return f".neurocal-{_computer()}-{os.getpid()}-{os.urandom(8).hex()}.tmp"
 
 

@@ -1,9 +1,9 @@
-"""Long columns as texts of numbers between commas, ``X: ['0.0,20.0,40.0']``, or packed.
+"""Long columns as texts of comma-separated numbers, ``X: ['0.0,20.0,40.0']``, or packed.
 
 PyYAML's own parser takes 50 us for a number, but 0.3 us for a character of a text, whichever character it is.
-A number of 17 digits has 20 characters as a decimal, 11 in base64, and 4 packed: each of them holds two bytes
-of a float64, as a character of Unicode's private use. A text has 160 numbers at most, because OpenCV's
-FileStorage takes no text of more than 4095 bytes.
+A number of 17 digits takes 20 characters as a decimal, 11 in base64, and 4 packed: each of these is a
+character of Unicode's private use that encodes two bytes of a float64. A text has at most 160 numbers,
+because OpenCV's FileStorage limits a text to 4095 bytes.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from neurocal_cli.io.yaml_text import flows, quoted
 
 LONGEST = 160  # numbers in a text, each of 24 characters at most
 
-_PRIVATE = 0xF0000  # the first of 65536 characters that mean what programs agree on
+_PRIVATE = 0xF0000  # the first of 65536 private-use characters
 
 _NUMBERS = re.compile(r"(?:[-+0-9.eE, ]|null)+").fullmatch
 _RANGES = re.compile(r"[0-9]{1,12}(?:-[0-9]{1,12})?(?:,[0-9]{1,12}(?:-[0-9]{1,12})?)*").fullmatch
 
 
 def number_words(values: NDArray[Any]) -> list[str]:
-    """Write each number as text; ``null`` for what is not finite."""
+    """Write each number as text; ``null`` for values that are not finite."""
     flat = np.ravel(values)
     return list(map(str, flat.tolist())) if flat.dtype.kind in "iu" else flows(flat)
 
@@ -63,7 +63,7 @@ def table_lines(
 
 
 def read_table(field: Field, labels: frozenset[str]) -> dict[str, Field]:
-    """Read either form of a table: its columns, each a list of what is in it.
+    """Read either form of a table: its columns, each as a list of values.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def read_columns(field: Field, labels: frozenset[str]) -> dict[str, list[Any]]:
     Raises
     ------
     FormatError
-        What is no column, or columns of different lengths.
+        Not a column, or columns of different lengths.
     """
     columns: dict[str, list[Any]] = {
         name: column.texts() if name in labels else read_numbers(list(column.items()))
@@ -106,7 +106,7 @@ def as_fields(columns: Mapping[str, list[Any]], table: Field) -> dict[str, Field
 
 
 def numbers_of(columns: Mapping[str, Field], names: Sequence[str], unknown: bool = False) -> Array:
-    """(k, N) numbers of some columns; NaN for null, where that may be."""
+    """(k, N) numbers of some columns; NaN for null if that is allowed."""
     return np.array([columns[name].array(-1, unknown=unknown) for name in names])
 
 
@@ -161,7 +161,7 @@ def read_ranges(field: Field, below: int) -> list[int]:
     Raises
     ------
     FormatError
-        Text that is none, or numbers that are not below the limit.
+        Text that is not a list of ranges, or numbers that are not below the limit.
     """
     text = field.text()
     if not _RANGES(text):

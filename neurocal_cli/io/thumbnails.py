@@ -11,7 +11,7 @@ from neurocal_cli.errors import FormatError, InputError
 from neurocal_cli.io.image_paths import find_images, view_names
 from neurocal_cli.io.images import encode_image, read_image, shrink
 
-_WIDEST = 960  # px; a page shows no more of one
+_WIDEST = 960  # px; a page shows none wider
 _NARROWEST = 120
 
 
@@ -43,7 +43,7 @@ def photographs_of(views: tuple[str, ...], word: str) -> dict[str, str]:
 
 
 def thumbnails(images: Mapping[str, str], size: tuple[int, int] | None, most_bytes: int) -> dict[str, bytes]:
-    """Images as small JPEG files, of which all together take no more than so many bytes.
+    """Images as small JPEG files, with a limit on their total size.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ from neurocal_cli.io.yaml_text import mapping, number, quoted, text
 
 
 def verdict_lines(verdict: Verdict | None) -> Iterator[str]:
-    """Lines of the block ``verdict``; none where there is no verdict."""
+    """Lines of the block ``verdict``; none if there is no verdict."""
     if verdict is None:
         return
     yield "verdict:"

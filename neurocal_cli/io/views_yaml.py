@@ -21,8 +21,8 @@ _NAME = "name"
 _SAME = 1e-6
 
 
-def alike(views: Mapping[str, ViewResult]) -> bool:
-    """Whether the same is known of all views, so that they fit into columns."""
+def same_std_keys(views: Mapping[str, ViewResult]) -> bool:
+    """Whether all views have the same standard deviations known, so that they fit into columns."""
     return len({frozenset(view.std) for view in views.values()}) <= 1
 
 

@@ -1,4 +1,4 @@
-"""Files out, complete or not at all: a reader never sees half of one, a failure leaves the former content.
+"""Atomic writing of files: a reader never sees half a file, and a failure leaves the old content.
 
 ``-`` is stdout.
 """
@@ -53,9 +53,9 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
 
 
 def write_chunks(path: str | Path, chunks: Iterable[str | bytes]) -> None:
-    """Write a file from its parts as they come, or, where one of them fails, nothing; see `write_whole`.
+    """Write a file from parts as they are produced, or nothing if one of them fails; see `write_whole`.
 
-    What has gone to stdout or a pipe by then stays there.
+    Parts already sent to stdout or a pipe stay there.
     """
     if str(path) in _STDOUT_NAMES:
         for chunk in chunks:
@@ -122,7 +122,7 @@ def _check_place(path: str | Path, former: os.stat_result | None) -> None:
 
 @contextmanager
 def _writing_failures(path: str | Path) -> Iterator[None]:
-    """Turn what can go wrong with a place into a line."""
+    """Turn failures to write a file into one-line errors."""
     try:
         yield
     except (BrokenPipeError, NeurocalError):
@@ -183,7 +183,7 @@ def _status(path: str | Path) -> os.stat_result | None:
 
 
 def _written_beside(target: str, chunks: Iterable[str | bytes], former: os.stat_result | None) -> str:
-    """A temporary file in the target's folder, complete and like the one that it is to replace."""
+    """Write the content to a temporary file in the target's folder, with the permissions of the old file."""
     folder = os.path.dirname(target)
     remove_stale(folder)
     temporary = os.path.join(folder, temporary_name())
@@ -205,7 +205,7 @@ def _written_beside(target: str, chunks: Iterable[str | bytes], former: os.stat_
 
 
 def _take_over(temporary: str, former: os.stat_result) -> None:
-    """Give the new file the owner, where allowed, and the permissions of the one it replaces."""
+    """Give the new file the permissions and, if allowed, the owner of the file that it replaces."""
     if hasattr(os, "chown"):
         with suppress(OSError):
             os.chown(temporary, former.st_uid, former.st_gid)

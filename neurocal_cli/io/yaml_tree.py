@@ -1,13 +1,12 @@
-"""YAML text to plain dicts, lists, strings and numbers, whatever the text does.
+"""YAML text to plain dicts, lists, strings and numbers, safely for any text.
 
-The events of PyYAML (of libyaml, where it is there) are put together here and not by its loaders:
-that is 9 times faster on calibration files (100 views: 37 ms, by ``CSafeLoader`` 345 ms), and it is
-the place to refuse aliases (a few lines of them can ask for gigabytes), doubled keys and absurd
-nesting. Tags are passed over, so OpenCV's ``!!opencv-matrix`` reads like any mapping. Mapping keys
-stay text: a view called ``1e5`` or ``null`` keeps its name.
+The tree is assembled from the events of PyYAML (of libyaml if installed) instead of by its loaders: that is
+9 times faster on calibration files (100 views: 37 ms, by ``CSafeLoader`` 345 ms), and allows refusing aliases
+(a few lines of them can demand gigabytes), duplicate keys and absurd nesting. Tags are ignored, so OpenCV's
+``!!opencv-matrix`` reads like any mapping. Mapping keys stay text: a view called ``1e5`` or ``null`` keeps
+its name.
 
-A long table of JSON-compatible rows, which is how observations are written, goes to the JSON
-parser, 50 times faster.
+A long table of JSON-compatible rows, as observations are written, is parsed as JSON, 50 times faster.
 """
 
 from __future__ import annotations

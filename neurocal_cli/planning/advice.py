@@ -1,4 +1,4 @@
-"""The views that lower the uncertainty of a camera most, one after the other."""
+"""Greedy choice of the views that reduce the uncertainty of a camera most."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class Candidate:
     width : float
         Share of the image's width that the target takes, seen frontally.
     tilt, way : float [degrees]
-        By how much the target is tilted, and which side comes nearer: 0 the right one, 90 the lower one.
+        The target's tilt, and the side that comes nearer: 0 for the right one, 90 for the lower one.
     roll : float [degrees]
-        By how much it is turned in its plane, clockwise.
+        The target's rotation in its plane, clockwise.
     outline : (n, 2) array [px]
         Corners of the target in the image.
     """
@@ -78,7 +78,7 @@ class Advice:
 
 
 def advise(calibration: Calibration, count: int = 3) -> Advice:
-    """Choose views: each time the one that lowers the worst uncertainty most, given those before it.
+    """Choose views one by one: each reduces the worst uncertainty most, given those before it.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
     Raises
     ------
     InputError
-        No points, no image size, no free parameter, or no view that the camera could see whole.
+        No points, no image size, no free parameter, or no candidate view that fits in the image.
     """
     known, world = _Known.of(calibration), _target(calibration)
     options = candidates(calibration)
@@ -113,17 +113,17 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
 
 @frozen_dataclass(eq=False)
 class _Known:
-    """What is known of a camera, by the views that were taken.
+    """The information on a camera from the views that were taken.
 
     Attributes
     ----------
     camera : Camera
-        With the coefficients, here 0, that its model was chosen without.
+        With the coefficients that model selection left out, here 0.
     free : (5 + K,) bool array
     information : (f, f) array
-        Normal matrix of what is free, and what is known of those coefficients beforehand.
+        Normal matrix of the free parameters, plus the prior on those coefficients.
     places : (g, 2, f) array
-        See `pixel_changes`: where the camera is judged.
+        See `pixel_changes`: the pixels at which the uncertainty is evaluated.
     sigma : float [px]
         Of the points.
     """
@@ -135,7 +135,7 @@ class _Known:
     sigma: float
 
     def worst(self, more: Array | float = 0.0) -> float:
-        """Largest standard deviation of a projected pixel [px], with what further views tell."""
+        """Largest standard deviation of a projected pixel [px], with the information of further views."""
         return worst_std(self.information + more, self.places, self.sigma)
 
     @classmethod
@@ -167,7 +167,7 @@ class _Known:
 
 
 def _free(calibration: Calibration) -> NDArray[np.bool_]:
-    """(5 + K,) which of A's entries and of the coefficients were estimated."""
+    """(5 + K,) whether each of A's entries and of the coefficients was estimated."""
     names = (*_ORDER, *coefficient_names(calibration.distortion_model))
     free = np.array([name not in calibration.fixed and name not in NODES for name in names])
     if not calibration.camera.intrinsics.skewed:
@@ -188,7 +188,7 @@ def _target(calibration: Calibration) -> Array:
 
 
 def candidates(calibration: Calibration) -> list[Candidate]:
-    """Views in which the whole target is in the image: all positions, three sizes, tilts and two turns."""
+    """Views with the whole target in the image: all positions, three sizes, tilts and two rotations."""
     camera, world = calibration.camera, _target(calibration)
     assert camera.image_size is not None
     size = np.array(camera.image_size, dtype=float)
@@ -199,7 +199,7 @@ def candidates(calibration: Calibration) -> list[Candidate]:
     turns = [(*tilt, roll) for tilt in _TILTS for roll in _ROLLS]
     rolled = {roll: euler_to_rotation(0, 0, np.radians(roll)) for roll in _ROLLS}
     R = np.array([_tilted(tilt, way) @ rolled[roll] @ frontal for tilt, way, roll in turns])
-    # Where the corners of a flat target are in the image, all of it is.
+    # If the corners of a flat target are in the image, all of it is.
     flat = np.ptp((world - middle) @ frontal[2]) <= _FLAT * extent.max()
     checked = corners if flat else world - middle
     found = []
@@ -224,7 +224,7 @@ def candidates(calibration: Calibration) -> list[Candidate]:
 
 
 def _frontal(calibration: Calibration, centred: Array) -> Array:
-    """The rotation in which the camera sees the target frontally, upright as its views do on the mean."""
+    """The rotation in which the camera sees the target frontally, upright as in the mean of its views."""
     mean = nearest_rotation(np.mean([view.pose.R for view in calibration.views.values()], axis=0))
     _, spread, axes = np.linalg.svd(centred, full_matrices=False)
     if spread[2] > _FLAT * spread[0]:
@@ -238,7 +238,7 @@ def _frontal(calibration: Calibration, centred: Array) -> Array:
 
 
 def _outline(centred: Array, frontal: Array) -> Array:
-    """(n, 3) the target's points that make its outline, seen frontally, in order."""
+    """(n, 3) the target's points on its outline, seen frontally, in order."""
     from scipy.spatial import ConvexHull
 
     flat = (centred @ frontal.T)[:, :2]
@@ -246,7 +246,7 @@ def _outline(centred: Array, frontal: Array) -> Array:
 
 
 def _tilted(tilt: float, way: float) -> Array:
-    """Turn that brings the side in a direction of the image nearer; degrees."""
+    """Rotation that brings the target's side in the given image direction nearer; degrees."""
     a, b = np.radians(tilt), np.radians(way)
     K = cross_matrix(np.array([-np.sin(b), np.cos(b), 0.0]))
     return np.asarray(np.eye(3) + np.sin(a) * K + (1 - np.cos(a)) * K @ K)

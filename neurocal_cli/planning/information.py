@@ -1,13 +1,12 @@
-"""What views tell of a camera, and how uncertain its pixels then are.
+"""The information that views give on a camera, and the resulting uncertainty of its pixels.
 
-Each view adds the normal matrix of the camera's parameters with the view's pose eliminated,
-``A - C B^-1 C^T``, whoever has taken it: so views that were never taken can be weighed. All points count
-alike, with the noise of the calibration.
+Each view, real or planned, adds the normal matrix of the camera's parameters with the view's pose eliminated
+(Schur complement ``A - C B^-1 C^T``). All points have the noise of the calibration.
 
-A change of the camera that a motion of its frame makes up for costs nothing, as in
-`verdict.projection_uncertainty`. There the frame moves as the poses of the views do; here it moves so that
-the pixels of near and far points all over the image move least, which does not depend on the views. So no
-view can make the camera less certain, and the numbers of both are of the same size but not equal.
+A change of the camera that a motion of its frame compensates does not count, as in
+`verdict.projection_uncertainty`. There the frame moves with the poses of the views; here it moves so that the
+pixels of near and far points all over the image change least, which does not depend on the views. So no view
+can make the camera less certain, and the two modules give similar but not equal numbers.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _SINGULAR = 1e-13  # a smaller eigenvalue of a matrix with unit diagonal is roun
 
 
 def view_information(camera: Camera, free: NDArray[np.bool_], pose: Pose, world: Array) -> Array:
-    """What a view of these points tells.
+    """Information on the camera from one view of these points.
 
     Parameters
     ----------
@@ -46,16 +45,16 @@ def view_information(camera: Camera, free: NDArray[np.bool_], pose: Pose, world:
 
 
 def pixel_changes(camera: Camera, free: NDArray[np.bool_], pixels: Array, depths: Array) -> Array:
-    """Derivative of pixels by the free parameters, less what a motion of the frame makes up for.
+    """Derivative of pixels by the free parameters, minus the part that a motion of the frame compensates.
 
     Parameters
     ----------
     camera : Camera
     free : (5 + K,) bool array
     pixels : (G, 2) array [px]
-        All over the image; those that see nothing are left out.
+        All over the image; those without a ray are left out.
     depths : (D,) array
-        Of the points that they see, each pixel one at each depth.
+        Depths of the points on each pixel's ray.
 
     Returns
     -------

@@ -13,7 +13,7 @@ _SIDES = ("right", "lower right", "lower", "lower left", "left", "upper left", "
 
 
 def advice_lines(advice: Advice) -> list[str]:
-    """A line for each view, with what it brings."""
+    """A line for each view, with the uncertainty after it."""
     lines = [
         "largest std of a projected pixel, for points at half to ten times the distance of the views: "
         f"{_px(advice.before)}"

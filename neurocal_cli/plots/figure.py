@@ -1,4 +1,4 @@
-"""The canvas of all pictures. matplotlib is imported only when a picture is asked for."""
+"""The canvas of all pictures. matplotlib is imported only when a picture is drawn."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ INK, ACCENT = "#1f4e79", "#c0392b"
 
 
 def check_available() -> None:
-    """Make sure that pictures can be drawn.
+    """Check that pictures can be drawn.
 
     Raises
     ------
@@ -52,7 +52,7 @@ def picture(draw: Callable[[Figure], None], size: tuple[float, float], pad: floa
 
 
 def plain(text: str) -> str:
-    """Text that matplotlib takes as it is, not as mathematics."""
+    """Text escaped so that matplotlib does not read it as mathematics."""
     return (text if text.isprintable() else ascii(text)[1:-1]).replace("$", r"\$")
 
 
@@ -65,6 +65,6 @@ def style(axes: Axes, title: str) -> None:
 
 
 def say(axes: Axes, text: str) -> None:
-    """A text in the place of a panel that cannot be drawn."""
+    """Show a text instead of a panel that cannot be drawn."""
     axes.text(0.5, 0.5, text, ha="center", va="center", transform=axes.transAxes, wrap=True)
     axes.set_axis_off()

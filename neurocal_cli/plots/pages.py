@@ -29,7 +29,7 @@ Draw = Callable[["Axes"], None]
 
 
 def draw_camera(subject: Subject, kind: str = "png", panel: str | None = None) -> bytes:
-    """Draw how well a camera fits, where it can be trusted, and how its network learned.
+    """Draw a camera's residuals, coverage and uncertainty, and the training of its network.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ def draw_points_in_space(
     ----------
     evaluation : StereoEvaluation
     rig : Rig or None
-        Both cameras, where they are known, for the poses.
+        Both cameras, if known, for the poses.
     panel : str, optional
         One of `plots.SPACE_PANELS`.
     """

@@ -1,4 +1,4 @@
-"""Panels of a camera's reprojection errors: where they are, how they scatter, by view, and while learning."""
+"""Panels of a camera's reprojection errors: in the image, scattered, by view, and during training."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from neurocal_cli.plots.subject import Subject
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_MOST_ARROWS = 500  # more cannot be told apart
+_MOST_ARROWS = 500  # more cannot be distinguished
 _MANY_DOTS = 2000  # from here on they overlap, and an .svg of them grows large
 _MOST_BARS = 40  # views that still have room for their names
 _LONGEST_ARROW = 0.04  # of the image's width, for the length of a typical arrow
@@ -46,7 +46,7 @@ def _round_scale(scale: float) -> float:
 
 
 def draw_residuals(axes: Axes, subject: Subject) -> None:
-    """Residuals of all views where they occur in the image, enlarged."""
+    """Residuals of all views at their points in the image, enlarged."""
     evaluation = subject.evaluation
     left, right, _, _ = _frame(subject)
     seen = np.flatnonzero(np.isfinite(evaluation.residuals[:, 0]))
@@ -105,7 +105,7 @@ def draw_views(axes: Axes, subject: Subject) -> None:
 
 
 def draw_learning(axes: Axes, subject: Subject) -> None:
-    """Loss of the network along its training, and the error after the last steps."""
+    """Loss of the network during training, and the error after the last steps."""
     style(axes, "Learning curve of the best start")
     calibration = subject.calibration
     network = None if calibration is None else calibration.network

@@ -25,7 +25,7 @@ _CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 def draw_poses(
     axes: Axes, calibration: Calibration | None, others: Sequence[tuple[Camera, Pose]] = ()
 ) -> None:
-    """Targets as the camera saw them, coloured by their error.
+    """Draw the camera and the targets of its views in space, coloured by their error.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def draw_poses(
         With ``projection="3d"``.
     calibration : Calibration or None
     others : sequence of (Camera, Pose)
-        Other cameras on the rig, and how they stand: from the frame of the first to theirs.
+        Other cameras of the rig, each with its pose from the frame of the first.
     """
     space: Any = axes
     style(axes, "Poses")

@@ -1,4 +1,4 @@
-"""What the panels of a camera show: a calibration, or a camera with the points that it is judged by."""
+"""The subject of a camera's panels: a calibration, or a camera with the points of its evaluation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Subject:
     evaluation : CameraEvaluation
         Of these points.
     calibration : Calibration or None
-        What the camera was calibrated from, where it is known.
+        The calibration of the camera, if known.
     """
 
     camera: Camera
@@ -39,7 +39,7 @@ class Subject:
         points: Correspondences | None = None,
         evaluation: CameraEvaluation | None = None,
     ) -> Subject:
-        """A camera with points that it was judged by; of a calibration its own by default."""
+        """A camera with the points of its evaluation; by default those of the calibration."""
         calibration = camera if isinstance(camera, Calibration) else None
         if points is None:
             points = Correspondences.none() if calibration is None else calibration.points
@@ -52,7 +52,7 @@ class Subject:
 
     @cached_property
     def evidence(self) -> Evidence | None:
-        """What the points of the calibration tell of it; None without a calibration."""
+        """The evidence of the calibration for its verdict; None without a calibration."""
         if self.calibration is None or not len(self.calibration.points):
             return None
         return gather_evidence(self.calibration)

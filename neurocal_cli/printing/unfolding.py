@@ -1,6 +1,6 @@
 """Several planes of a board side by side on one sheet, joined at the lines along which it is folded.
 
-The printed side is the one that sees the other planes: the inside of a corner. The sheet's coordinates are x
+The printed side is the one that faces the other planes: the inside of a corner. The sheet's coordinates are x
 to the right and y downwards, in the board's unit.
 """
 
@@ -30,7 +30,7 @@ class Laid:
     axes : (2, 2) array
         Rows: x_axis and y_axis on the sheet, unit vectors.
     reach : (2, 2) array [squares]
-        How far the pattern goes on beyond the outer vertices, ``[axis, low or high]``.
+        How far the pattern extends beyond the outer vertices, ``[axis, low or high]``.
     """
 
     plane: Plane
@@ -65,7 +65,7 @@ class Fold:
 
 @frozen_dataclass(eq=False)
 class _Map:
-    """Where points of a plane come to lie on the sheet, ``B X + b``; B (2, 3), b (2,)."""
+    """Map from points of a plane to the sheet, ``B X + b``; B (2, 3), b (2,)."""
 
     B: Array
     b: Array

@@ -17,14 +17,14 @@ from neurocal_cli.geometry import Array
 _ASIDE = 0.16  # squares; to either side of an edge, half-way between two vertices
 _LEAST_EDGE = 0.3  # of the contrast, across an edge
 _EDGES = 0.9  # share of the edges that are seen
-# Vertices may be off from where their neighbours put them, rms, by so many squares and px, and by
-# so many px per ratio of the noise (of second derivatives) to the contrast.
+# Rms limits of the vertices' deviations from their neighbours' predictions: squares, px, and px per
+# ratio of the noise (of second derivatives) to the contrast.
 _OFF, _OFF_PX, _OFF_NOISE = 0.021, 0.09, 20.0
-_MANY, _FEW_SMOOTH = 18, 0.6  # few vertices are in line by chance: less is tolerated of them
+_MANY, _FEW_SMOOTH = 18, 0.6  # few vertices may be in line by chance: a stricter limit
 
 
 def has_block(lattice: Lattice) -> bool:
-    """Whether a block of 3 x 3 vertices is known. In smaller lattices no line is tested by a third vertex."""
+    """Whether a block of 3 x 3 vertices is known. In smaller lattices no third vertex tests a line."""
     seen = lattice.seen
     if min(seen.shape) < 3:
         return False

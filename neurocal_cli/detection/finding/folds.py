@@ -22,7 +22,7 @@ _UNKNOWN = 0.03  # squares; second difference of distant rows where there are no
 _LEAST_ROWS = 4
 _BETWEEN = 1.4  # factor that makes a jump shared by two rows comparable with that of one row
 _ONE_SIDED = 0.7  # weight of a jump that can be compared with one side only
-_ALIKE = 2.0  # so that errors that are independent, whose means are 1.4 times smaller, change nothing
+_ALIKE = 2.0  # independent errors, whose means are 1.4 times smaller, stay below it
 
 
 def split_at_folds(lattice: Lattice) -> list[Lattice]:
@@ -103,8 +103,8 @@ def _sharpest_fold(second: Array, width: float) -> tuple[float, float]:
 def _jump(values: Array) -> Array:
     """Size of each row's jump, at most `_ALIKE` times that of the means of neighbouring columns.
 
-    A fold makes all columns jump alike. Vertices that are off to alternate sides, as those of overexposed
-    boards may be, jump to opposite sides in neighbouring columns, and no less than at a fold.
+    A fold makes all columns jump in the same way. Vertices displaced to alternate sides, as on overexposed
+    boards, jump to opposite sides in neighbouring columns, as far as at a fold.
     """
     beside = np.concatenate([values[:, 1:], values[:, -2:-1]], axis=1)
     means = np.where(np.isnan(beside), values, 0.5 * (values + beside))

@@ -1,4 +1,4 @@
-"""A short cut for growth: most of a grid at once, by following links from vertex to vertex.
+"""A shortcut for growth: most of a grid at once, by following links from vertex to vertex.
 
 In: linked saddles, and the middle of a seed. Out: a lattice, or None. The lattice is only accepted
 where every vertex passes the tests that `grow` applies; growing layer by layer gives the same, more slowly.

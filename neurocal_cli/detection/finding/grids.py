@@ -70,7 +70,7 @@ def find_grids(image: NDArray[np.generic], sizes: Collection[Size] = ()) -> list
 
 
 def _find(levels: list[Level], wanted: frozenset[Size], straight: bool = False) -> list[Lattice]:
-    """Lattices on the finest level of a pyramid; `straight` where no lens is left to bend them."""
+    """Lattices on the finest level of a pyramid; `straight` if the lens's bends are already removed."""
     lattices: list[Lattice] = []
     bent: list[Lattice] = []
     links: Links | None = None

@@ -1,6 +1,6 @@
 """Joining the two parts of a board that an occluder divides.
 
-In: the lattices of a level. Out: the same, with those joined that continue each other on one grid.
+In: the lattices of a level. Out: the same, with lattices joined that continue each other on one grid.
 """
 
 from __future__ import annotations

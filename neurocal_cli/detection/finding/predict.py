@@ -49,7 +49,7 @@ class PredictedVertices:
     spread: Array
 
     def __getitem__(self, which: NDArray[np.generic]) -> PredictedVertices:
-        """Some of them."""
+        """A subset of the vertices."""
         return PredictedVertices(self.points[which], self.steps[which], self.spread[which])
 
     @property
@@ -75,11 +75,11 @@ class PredictedVertices:
         return np.asarray(np.abs(self.area) / np.maximum(longest, 1e-9))
 
     def around(self, shares: Array, points: Array) -> Array:
-        """Places (N, K, 2) around points (N, 2), at shares (K, 2) of `c` and `r`."""
+        """Places (N, K, 2) around points (N, 2), at fractions (K, 2) of `c` and `r`."""
         return np.asarray(points[:, None] + shares @ self.steps)
 
     def in_squares(self, away: Array) -> Array:
-        """Pixel offsets (N, 2) as shares of `c` and `r`."""
+        """Pixel offsets (N, 2) as fractions of `c` and `r`."""
         area = self.area
         area = np.where(np.abs(area) > 1e-9, area, 1e-9)
         out = np.empty(away.shape)

@@ -50,7 +50,7 @@ class Saddles:
     contrast: Array
 
     def __len__(self) -> int:
-        """Count them."""
+        """Number of saddles."""
         return len(self.points)
 
 

@@ -1,11 +1,11 @@
-"""Searching a board in a view without the bends that a wide lens gives its lines.
+"""Searching for a board in a rectified view, in which a wide lens does not bend its lines.
 
-The squares of a board near a wide lens bend, and change from one to the next, more than growth allows
-elsewhere. Their links are seen nevertheless, and tell the lens and the plane. In a view of that plane from
-straight above, lines are straight and squares are equal, so that growth finds the others.
+The squares of a board near a wide lens bend, and change from one to the next, more than growth tolerates.
+Their links are found nevertheless, and determine the lens and the plane. In a frontal view of that plane
+lines are straight and squares are equal, so that growth finds the remaining vertices.
 
 In: a level with its linked saddles, and the lattices already known. Out: the lattice of a linked group of
-saddles as that view shows it, in the level's pixels.
+saddles found in that view, in the level's pixels.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from neurocal_cli.detection.wide_lens import WideFit, fit_wide_lens
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_OWN, _BESIDE = 0.4, 2.0  # squares; nearer saddles are the lattice's own, farther ones not its next line
+_OWN, _BESIDE = 0.4, 2.0  # squares; nearer saddles belong to the lattice, farther ones not to its next line
 _LIKE, _LINE = 0.5, 3  # least contrast relative to the lattice's, and least number of saddles of such a line
 _GROUPS = 3  # of linked saddles that are tried
 _OFF = 0.12  # squares; greatest rms distance of vertices from the fit of the lens ...
 _OUTLIER = 0.3  # ... and greatest distance of a vertex that is not left out of it
 _ROUNDS = 3  # of leaving such vertices out
-_WIDE = 0.5  # rad; least angle from the axis at which a lens may be why a lattice is not finished
+_WIDE = 0.5  # rad; least angle from the axis at which a lens may have stopped the growth of a lattice
 _MORE = 1.1  # least ratio of a group to the known vertices in it, to be searched again
 _AROUND, _LEAST_AROUND = 0.75, 4.0  # of the group's extent, and squares, that the view shows around it
 _SQUARE = 24.0  # px; a square of the view ...
@@ -45,7 +45,7 @@ _SIGMA = 0.15  # of a square's width; smoothing of derivatives, in steps of 0.25
 
 @frozen_dataclass(eq=False)
 class PlaneView:
-    """A plane seen from straight above, through the lens that shows it in the image.
+    """A frontal view of a plane, and the lens through which the image shows it.
 
     Attributes
     ----------
@@ -77,7 +77,7 @@ class PlaneView:
         return self.fit.at(self.first + points / self.square)
 
     def seen(self, image: NDArray[np.float32]) -> NDArray[np.float32]:
-        """The view, from the image."""
+        """The view, resampled from the image."""
         width, height = self.size
         v, u = np.mgrid[0:height, 0:width].astype(float)
         places = self.back(np.stack([u, v], axis=-1)).astype(np.float32)
@@ -146,7 +146,7 @@ def find_bent(
 
 
 def _groups(links: Links) -> Iterator[tuple[Index, Index]]:
-    """Places (N, 2) and saddles (N,) of linked groups of at least 3 x 3, from different middles."""
+    """Places (N, 2) and saddles (N,) of linked groups of at least 3 x 3, from different starting vertices."""
     middles = whole_blocks(links)
     covered = np.zeros(len(links.to), dtype=bool)
     for _ in range(_GROUPS):
@@ -169,7 +169,7 @@ def _shared(lattice: Lattice, pixels: Array) -> int:
 
 
 def _fitted(places: Array, pixels: Array, level: Level) -> WideFit | None:
-    """The lens by most vertices of a group; None if they lie on no plane seen through one."""
+    """The lens fitted to most vertices of a group; None if they do not lie on a plane seen through a lens."""
     height, width = level.image.shape
     kept = np.ones(len(places), dtype=bool)
     for _ in range(_ROUNDS):

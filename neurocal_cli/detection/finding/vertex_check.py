@@ -24,7 +24,7 @@ _LEAST_EDGE = 0.3  # of the contrast, across every edge
 
 @frozen_dataclass(eq=False)
 class VertexCheck:
-    """What the samples around points say.
+    """Results of the samples around points.
 
     Attributes
     ----------

@@ -112,13 +112,13 @@ class ProfileShape:
     half: Array | None = None
 
     def part(self, which: Part) -> ProfileShape:
-        """That of some fits."""
+        """The part of some fits."""
         return ProfileShape(
             self.tails[which], self.nonlinearity, None if self.half is None else self.half[which]
         )
 
     def elsewhere(self, half: Array) -> ProfileShape:
-        """That of other fits of the same image, with half widths of the pixel's box where they matter."""
+        """The shape for other fits of the same image, with half widths of the pixel's box if they matter."""
         tails = np.tile(self.tails.mean(axis=0), (len(half), 1))
         return ProfileShape(tails, self.nonlinearity, None if self.half is None else half)
 
@@ -150,7 +150,7 @@ class Linearised:
         return (self.rows @ self.rows.swapaxes(1, 2))[:, : count + 1, : count + 1].astype(float)
 
     def part(self, which: NDArray[np.intp]) -> Linearised:
-        """That of some fits."""
+        """The part of some fits."""
         return Linearised(self.rows[which], self.z[which], self.x[which])
 
     def put(self, which: NDArray[np.intp], part: Linearised) -> None:
@@ -248,7 +248,7 @@ def fit_batch(
     steps: int,
     more: int = _MORE_STEPS,
 ) -> BatchFit:
-    """Fit all at once, and then those that have not converged by themselves.
+    """Run all fits together, then continue those that have not converged separately.
 
     Parameters
     ----------
@@ -268,7 +268,7 @@ def fit_batch(
 
     whole = model_of(slice(None))
     state = _State.of(whole, start, prior)
-    # A few fits that cannot converge must not hold up the others.
+    # A few fits that do not converge must not delay the others.
     state.iterate(whole, prior, steps, _MOST)
     unconverged = np.flatnonzero(state.size >= _CONVERGED)
     if len(unconverged) and more:

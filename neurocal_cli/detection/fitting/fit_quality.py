@@ -1,6 +1,7 @@
 """Rejecting fits that disagree with their pixels, with the rest of the board, or with the map.
 
-In: fits. Out: masks of the typical ones, to learn common parameters from, and of those that are reported.
+In: fits. Out: masks of the typical fits, from which common parameters are estimated, and of the reliable
+ones, which are reported.
 """
 
 from __future__ import annotations

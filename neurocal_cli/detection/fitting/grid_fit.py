@@ -52,11 +52,11 @@ Image = NDArray[np.generic]
 # Insensitive: later stages correct the errors of earlier ones.
 _START_SIGMA = 0.3  # px, of the coordinates of the found vertices
 _GOOD_START = 1.3  # chi2 per coordinate of these vertices at which no richer map is tried
-# Displacement by the lens, relative to the distance from its centre, from which on a wide lens is tried: at
+# Displacement by the lens, relative to the distance from its centre, above which a wide lens is tried: at
 # once, after the first fit, and there if the residuals are ...
 _STRONGLY_BENT, _BENT, _WEAKLY_BENT = 0.25, 0.15, 0.05
 _UNEVEN = 100.0  # ... below so many variances of the noise
-_NOT_NOISE, _CLEARLY = 2.0, 0.5  # variance over that of the noise which a wide lens may lower, to this share
+_NOT_NOISE, _CLEARLY = 2.0, 0.5  # least variance over the noise's, and its share with a wide lens
 _PARAMETER = 2.0  # chi2 that a parameter must be worth, in the choice between two kinds of lenses
 _ANCHOR = 2.0  # px, of these vertices in later maps, which they only keep regular
 _ENOUGH = 60  # edges that need no such anchors
@@ -228,7 +228,7 @@ def fit_grid(grid_image: GridImage) -> GridFit:
 def _wide_if_better(
     grid_image: GridImage, found: MapFit, observations: Observations, enough: float = 0.0
 ) -> MapFit:
-    """The map of a wide lens, where that fits better than a lens that displaces slopes."""
+    """The map of a wide lens if it fits better than radial distortion of a pinhole."""
     start = wide_start(found.map.frame, grid_image.vertices, grid_image.pixels, grid_image.size)
     if start is None:
         return found
@@ -241,9 +241,9 @@ def _wide_if_better(
 
 
 def _may_be_wide(found: MapFit, vertices: Array) -> bool:
-    """Whether a wide lens, of which the map knows nothing, can be what is left of the variance.
+    """Whether a wide lens, which the map does not model, can explain the remaining variance.
 
-    A weak bend follows slopes up to hundredths of a pixel, and what is more comes from an uneven board.
+    The map follows a weak bend to hundredths of a pixel; more than that comes from an uneven board.
     """
     if isinstance(found.map, WideMap) or not found.excess > _NOT_NOISE:
         return False
@@ -308,8 +308,8 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     mapped = select_map(first.map.map, observations, first.map.shift, least=first.map.model_index)
     expected = variance + mapped.map.variance(grid_image.edges.centre, lines.normal)
     departure = mapped.residual[:n] / np.sqrt(expected * mapped.excess)
-    # An uneven board departs from its map everywhere: no single edge is an outlier for that, but all
-    # of them are less certain.
+    # An uneven board deviates from its map everywhere: that makes no single edge an outlier, but all
+    # of them less certain.
     uneven = max(MAD_TO_SIGMA * upper_median(np.abs(departure)), 1.0)
     mapped, departure = replace(mapped, excess=mapped.excess * uneven**2), departure / uneven
     return GridFit(lines, fit, mapped, shading, noise, is_reliable(fit, departure))
@@ -325,7 +325,7 @@ def _fine_fit(
     blur = _blur(first, lines, lines)
     offset = first.map.residual[:n] + first.map.shift[0]
     if isinstance(first.map.map, WideMap):
-        # A fit that went astray in the dark of the rim starts at the map again.
+        # A fit that diverged in the dark of the rim restarts at the map.
         offset = np.where(first.good, offset, first.map.shift[0])
     fit = _fitted(grid_image.image, lines, offset, blur, shading, shape, noise)
     usual = upper_median(blur[0])
@@ -347,7 +347,7 @@ def _fitted(
     noise: PixelNoise,
     crossed: NDArray[np.bool_] | None = None,
 ) -> BatchFit:
-    """Fits of edges to all their pixels, begun at offsets (E,), with what the whole board has in common."""
+    """Fits of edges to all their pixels, started at offsets (E,), with the common parameters of the board."""
     sigma, spread = blur
     data = edge_pixels(image, lines, sigma, shading, REACH * sigma, 1, crossed)
     prior = level_prior(shading, lines.middle, sigma, spread, noise.edge)
@@ -373,7 +373,7 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     )
     variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
     departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
-    # A rim that is bad all around would agree with itself.
+    # A rim that is bad all around would be consistent with itself.
     good = is_reliable(fit, departure, known=fitted.fit.roughness[fitted.good])
     return edges, replace(fitted, lines=lines, fit=fit, good=good)
 

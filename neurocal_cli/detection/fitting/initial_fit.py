@@ -1,7 +1,7 @@
 """The first fits of a board's edges, each with its own levels, to estimate blur and profile.
 
-In: lines from the map, rough offsets and blur. Out: `BatchFit`, from which `grid_fit` estimates what all
-edges have in common.
+In: lines from the map, rough offsets and blur. Out: `BatchFit`, from which `grid_fit` estimates the common
+parameters of all edges.
 """
 
 from __future__ import annotations

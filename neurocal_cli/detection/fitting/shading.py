@@ -84,7 +84,7 @@ class Shading:
         return 0.5 * (light + dark), 0.5 * (light - dark)
 
     def off(self, place: Array, u: Single, v: Single, value: Single) -> tuple[Single, Single]:
-        """Take the slopes of the levels at places (N, 2) off the pixels around them.
+        """Subtract the slopes of the levels at places (N, 2) from the pixels around them.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class LocalShading(Shading):
     near : pair of (N, 2) arrays [px]
         Where dark and light levels were measured.
     above : pair of (N,) arrays [DN]
-        What they are above the polynomials there.
+        Their differences from the polynomials there.
     """
 
     near: tuple[Array, Array]
@@ -208,7 +208,7 @@ def _fit(frame: Frame, levels: Levels) -> tuple[Array, float]:
         normal.ravel()[:: used + 1] *= 1 + _RIDGE
         coefficients[:used] = np.linalg.solve(normal, weighted @ (levels.level * root))
         residual = levels.level - terms[:, :used] @ coefficients[:used]
-        # Spread of the squares is only what the errors of the levels cannot explain.
+        # The spread of the squares is only the part that the errors of the levels do not explain.
         chance = 1 + 4 / np.sqrt(n)
         spread = max(scatter - chance * upper_median(levels.variance), 0.0)
     return coefficients, spread + most / n * upper_median(levels.variance)

@@ -1,4 +1,4 @@
-"""The smooth map of a board before a wide lens: a plane of directions, a radial profile, a polynomial.
+"""The smooth map of a board seen by a wide lens: a plane of directions, a radial profile, a polynomial.
 
 A homography of slopes ends at 90 degrees from the axis, and a series in slopes long before. Here, with x the
 scaled grid coordinates, a homography gives directions, and their angle t from the axis the radius:
@@ -137,7 +137,7 @@ class WideMap(SmoothMap):
 
 
 def wide_start(frame: Frame, grid: Array, pixels: Array, size: tuple[int, int]) -> WideMap | None:
-    """The map of a lens of equal angles through vertices, (N, 2) arrays; None if none shows a plane there.
+    """The map of an equidistant lens through vertices, (N, 2) arrays; None if none fits a plane.
 
     Parameters
     ----------

@@ -3,9 +3,9 @@
 In: a board, the grids of an image, and the image. Out: `Located` grids. The criteria, in this order:
 
 1. A grid lies on a plane of its size. A partly hidden grid needs enough visible ends of the board to
-   leave one place only.
-2. Planes at an angle must fit one camera, which determines how each of them lies. A board in one
-   plane is seen from the side on which its axes turn as u and v do.
+   make its position unique.
+2. Planes at an angle must fit one camera, which determines the orientation of each. A board in one
+   plane is seen from the side on which its axes have the same handedness as u and v.
 3. Among the remaining arrangements, the square at vertex (0, 0) is dark on the first plane where they
    differ; for a single board, OpenCV's `findChessboardCorners` begins at the same corner.
 4. Arrangements with equal colours are distinguished by the image: of two, the one whose x axis points

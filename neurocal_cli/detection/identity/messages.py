@@ -23,7 +23,7 @@ class NoBoardError(NeurocalError):
     ----------
     message : str
     shown : (cols, rows), optional
-        Inner vertices of the board that it shows instead of the one that was asked for.
+        Inner vertices of the board that the image shows instead of the given one.
     """
 
     def __init__(self, message: str, shown: tuple[int, int] | None = None) -> None:
@@ -37,7 +37,7 @@ def wrong_size(board: Board, grid: Grid, ends: Sequence[End]) -> NoBoardError:
     shape = grid.shape
     if len(board.planes) == 1:
         plane = board.planes[0]
-        if (shape[0] < shape[1]) != (plane.cols < plane.rows):  # named as the user names them
+        if (shape[0] < shape[1]) != (plane.cols < plane.rows):  # in the user's order of columns and rows
             shape = shape[1], shape[0]
         if sorted(shape) == sorted((plane.cols, plane.rows)) and End.PATTERN in ends:
             return NoBoardError(

@@ -19,7 +19,7 @@ _SIDES: tuple[Side, ...] = (np.s_[:, 0], np.s_[:, -1], np.s_[0, :], np.s_[-1, :]
 
 # tests/test_identity.py removes such lines, and keeps them on larger boards.
 _FEW = 0.34  # greatest share of vertices of a line that may be removed
-_FEW_AT_FOLDS = 0.6  # the same for several planes, which one camera tests afterwards
+_FEW_AT_FOLDS = 0.6  # the same for several planes, because the fit of one camera tests them afterwards
 
 
 def trimmed(grid: Grid, planes: Sequence[Plane]) -> Grid:

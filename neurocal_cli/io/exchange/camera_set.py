@@ -1,4 +1,4 @@
-"""What a camera file holds, whatever program wrote it."""
+"""The content of a camera file, independent of the program that wrote it."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ class CameraSet:
     poses : dict of Pose by view
         From the world to the first camera.
     unit : str, optional
-        Of the translations; None where the file does not tell.
+        Of the translations; None if the file does not state it.
     origin : Calibration or Rig, optional
-        All that a neurocal file holds beyond that.
+        The full content of a neurocal file.
     program : str
-        What wrote the file, for messages.
+        The program that wrote the file, for messages.
     """
 
     cameras: tuple[Camera, ...]
@@ -80,16 +80,16 @@ class CameraSet:
 
 @frozen_dataclass
 class Format:
-    """What the files of one program can hold, and how they are written.
+    """The capabilities of one program's file format, and its writer.
 
     Attributes
     ----------
     program : str
         Name for messages.
     models : tuple of str
-        Distortion models that it has, by our names, the simplest first.
+        Distortion models that it supports, by our names, the simplest first.
     skew : bool
-        Whether its programs use an angle of the image axes other than 90 degrees.
+        Whether its programs support skew.
     poses : bool
         Whether it holds the poses of views.
     most_cameras : int

@@ -55,7 +55,7 @@ def is_folder(name: str) -> bool:
 
 
 def read_folder(folder: str) -> CameraSet:
-    """Read the cameras of a model, with how they stand to each other and the poses of the images.
+    """Read the cameras of a model, their relative poses and the poses of the images.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Points as other programs take them: all views of one target as an array, or mrcal's table."""
+"""Points in the formats of other programs: all views of one target as an array, or mrcal's table."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def corner_text(points: Correspondences, target: str, ending: str) -> str | byte
     Raises
     ------
     InputError
-        A program that takes no points, or points that it cannot take.
+        A program that has no format for points, or points that its format cannot hold.
     """
     if target == "neurocal":
         return format_points(points)
@@ -44,7 +44,7 @@ def corner_text(points: Correspondences, target: str, ending: str) -> str | byte
 
 
 def points_lost(points: Correspondences, target: str) -> list[str]:
-    """What the file has no place for."""
+    """What the file cannot hold."""
     if target == "neurocal":
         return []
     lost = []
@@ -59,7 +59,7 @@ def points_lost(points: Correspondences, target: str) -> list[str]:
 
 
 def _array(points: Correspondences) -> tuple[Array, list[str], Array]:
-    """World points (N, 3), their ids, and the pixels of each view (V, N, 2), NaN where it has none."""
+    """World points (N, 3), their ids, and the pixels of each view (V, N, 2), NaN for missing points."""
     if points.point is not None:
         labels = [str(label) for label in points.point]
     else:

@@ -5,8 +5,8 @@
 * mrcal's ``corners.vnl``: a line for each corner, ``filename x y [level]``, row by row;
 * text files of numbers: one with the places on the board, and one for each view.
 
-Corners that name no place on the board need the board. MATLAB counts pixels from 1, and corners down the
-columns of the board. Kalibr has no file of corners: it finds them in a bag anew in each run.
+Corners without a position on the board need the board. MATLAB counts pixels from 1, and corners down the
+columns of the board. Kalibr has no file of corners: it detects them in a bag in each run.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def read_corners(
     paths : sequence of str or Path
         One file, or the places on the board and then a file for each view.
     board : Board, optional
-        Where the corners are in the world, for files that do not say.
+        World positions of the corners, for files that do not state them.
     notes : list of str
         Remarks about what was left out are appended.
     unit : str, optional
@@ -203,7 +203,7 @@ def _stack(field: Field, width: int) -> Array:
 def _assembled(
     world: Array, pixels: Array, names: list[str], ids: list[str] | None, unit: str | None, source: str
 ) -> Correspondences:
-    """Rows of all views; corners that are NaN were not found. Places of one view are those of all."""
+    """Rows of all views; corners that are NaN were not found. Board positions of one view hold for all."""
     views, count = pixels.shape[:2]
     found = np.isfinite(pixels).all(axis=2)
     if not found.any():
@@ -314,7 +314,7 @@ def _separate(names: list[str], board: Board | None, unit: str | None) -> Corres
 
 
 def _stems(names: Iterable[str]) -> list[str]:
-    """Names of files without folder and ending, where they still differ."""
+    """Names of files without folder and ending, if they still differ."""
     stems = [Path(name).stem for name in names]
     return stems if len(set(stems)) == len(stems) else list(names)
 

@@ -96,7 +96,7 @@ def arrays_of(data: bytes, source: str) -> dict[str, Any]:
 
 
 def _sides(root: Field) -> tuple[str, str] | None:
-    """What the keys of the two cameras end in."""
+    """The suffixes of the two cameras' keys."""
     return next((pair for pair in _SIDES if all(has_matrix(root, side) for side in pair)), None)
 
 
@@ -185,7 +185,7 @@ def _json_value(value: Any) -> str:
 
 
 def npz_bytes(tree: Mapping[str, Any]) -> bytes:
-    """The dictionary for ``numpy.load``; numpy.savez would put the time of day into it."""
+    """The dictionary for ``numpy.load``; numpy.savez would write the current time into it."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for key, value in tree.items():

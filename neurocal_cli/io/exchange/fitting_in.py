@@ -1,4 +1,4 @@
-"""What of a camera set a format can hold: exactly, nearly or not at all, with the loss in pixels."""
+"""Conversion of a camera set to what a format can hold, exactly or approximately, with the loss in pixels."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 
-_NO_SKEW = 1e-3  # a loss below this [px] is nobody's concern
-_NO_LOSS = 5e-3  # nor is this share of the image
+_NO_SKEW = 1e-3  # a loss below this [px] is negligible
+_NO_LOSS = 5e-3  # as is this share of the image
 _AS_NEAR, _NEARER = 1.1, 0.01  # times the loss of the nearest model, and px
 
 _Fitting = tuple[Camera, NearestCamera | None, str]  # None, "": nothing that matters is lost
@@ -28,11 +28,11 @@ class Fitted:
     ----------
     cameras : CameraSet
     losses : tuple of str
-        What is not as it was, with the pixels that it makes, for a warning.
+        What was approximated, with its effect in pixels, for a warning.
     remarks : tuple of str
-        What is not in the file, for a note.
+        What is missing from the file, for a note.
     moved : tuple of Distance or None
-        What the losses say, as numbers: how far the pixels of each camera are moved.
+        The losses as numbers: how far the pixels of each camera move.
     """
 
     cameras: CameraSet
@@ -44,15 +44,15 @@ class Fitted:
 def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None = None) -> Fitted:
     """Make cameras fit a format, of one model if it is given.
 
-    Skew that the format's programs ignore is taken out always: written, it would be ignored silently.
-    The nearest camera without skew moves pixels by less than the ignored skew does.
+    Skew that the format's programs ignore is always removed, because they would ignore it silently. The
+    nearest camera without skew moves pixels by less than ignoring the skew does.
 
     Parameters
     ----------
     cameras : CameraSet
     target : Format
     force : bool
-        Whether the nearest camera of another distortion model will do.
+        Whether the nearest camera of another distortion model is acceptable.
     model : str, optional
         One of `MODELS`: the cameras become the nearest ones of this distortion model.
 
@@ -100,7 +100,7 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None
 
 
 def _pixels_of(cameras: CameraSet) -> list[Array | None]:
-    """Where each camera saw the points that it was calibrated with."""
+    """Pixels of the points that each camera was calibrated with."""
     origin = cameras.origin
     if origin is None:
         return [None] * len(cameras.cameras)
@@ -135,7 +135,7 @@ def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -
         )
     nearest = [nearest_camera(camera, m, target.skew, points) for m in target.models]
     best = min(nearest, key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px))
-    # More coefficients are not worth having for next to nothing.
+    # Prefer fewer coefficients if more bring next to nothing.
     most = max(_AS_NEAR * best.over_image.max_px, best.over_image.max_px + _NEARER)
     near = next(
         n for n in nearest if n.over_image.max_px <= most and (n.lost <= _NO_LOSS or best.lost > _NO_LOSS)
@@ -158,7 +158,7 @@ def _as_model(camera: Camera, model: str) -> Camera:
 
 
 def _straightened(camera: Camera) -> Camera:
-    """A camera whose angle of the axes is pi/2 to the last bit."""
+    """A camera whose skew is exactly zero."""
     a, _, b, u0, v0 = camera.entries
     return replace(camera, intrinsics=Intrinsics(a, b, u0, v0))
 

@@ -46,7 +46,7 @@ def from_tree(root: Field, whole: bool) -> CameraSet:
 
 
 def camera_set(result: Calibration | Rig) -> CameraSet:
-    """What other programs can have of a calibration or a rig, and the whole of it for our own files."""
+    """The camera set of a calibration or a rig, with the full original for our own files."""
     left = result if isinstance(result, Calibration) else result.left
     poses = {name: view.pose for name, view in left.views.items()}
     unit = None if result.unit == _UNKNOWN else result.unit

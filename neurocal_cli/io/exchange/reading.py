@@ -1,4 +1,4 @@
-"""Cameras from files of any program. The content tells which; a name or an ending never does."""
+"""Cameras from files of any program, which is recognised by the content, never by the file's name."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def read_cameras(paths: Sequence[str | Path], whole: bool = True) -> CameraSet:
         that holds it), mrcal, MATLAB (``.mat``), BoofCV, or a JSON or ``.npz`` dictionary. Or two: the left
         and the right camera of ROS or mrcal, or the two files of OpenCV's stereo sample. ``-`` is stdin.
     whole : bool
-        Whether all of a neurocal file is wanted; else its poses and points are not looked at.
+        Whether to read all of a neurocal file; otherwise its poses and points are skipped.
 
     Raises
     ------
     FormatError
-        A file that cannot be read, that is of no known kind, or that holds what no camera of ours is.
+        A file that cannot be read, is of no known kind, or holds a camera that is not supported.
     """
     names = [str(path) for path in paths]
     if len(names) > 2:

@@ -1,4 +1,4 @@
-"""ROS's camera_info files: one camera each; of a pair the rectified projections say how they stand.
+"""ROS's camera_info files: one camera each; a pair's rectified projections give the relative pose.
 
 ``projection_matrix`` of the right camera holds ``-fx b`` [px m], and the rectification matrices turn both
 cameras into parallel ones: so R = R2^T R1 and t = R2^T (P2[0, 3], P2[1, 3], 0) / f.
@@ -28,7 +28,7 @@ def is_tree(root: Field) -> bool:
 
 
 def from_tree(root: Field) -> CameraSet:
-    """Read the camera, with its place in a rectified pair where it has one."""
+    """Read the camera, with its pose in a rectified pair if it has one."""
     camera, poses = camera_from_tree(root), {}
     if "projection_matrix" in root:
         R = matrix_data(root["rectification_matrix"], 9).reshape(3, 3)

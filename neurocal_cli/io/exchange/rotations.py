@@ -1,6 +1,6 @@
 """Rotations as other programs write them: as a vector along the axis, and as a unit quaternion.
 
-SciPy gets copies, because older versions take no read-only array.
+SciPy gets copies, because older versions do not accept read-only arrays.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ def from_quaternion(q: Array) -> Array:
 
 
 def inverse(pose: Pose) -> Pose:
-    """The way back."""
+    """The inverse pose."""
     return Pose(pose.R.T, -pose.R.T @ pose.t)
 
 
 def after(second: Pose, first: Pose) -> Pose:
-    """First the one, then the other: ``X'' = R2 (R1 X + t1) + t2``."""
+    """Composition of two poses: ``X'' = R2 (R1 X + t1) + t2``."""
     return Pose(second.R @ first.R, second.R @ first.t + second.t)
