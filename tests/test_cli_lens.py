@@ -244,7 +244,10 @@ def test_one_view_name_at_several_settings_is_told_apart(folder: Path) -> None:
         ("zoom,alpha_u,alpha_v,u0\n1,1,2,3\n", "column v0 missing"),
         ("alpha_u,alpha_v,u0,v0\n1,1,2,3\n", "no column zoom or focus"),
         ("zoom,alpha_u,alpha_v,u0,v0\n1,1,2,3,4\n1,1,2,3,4\n", "one setting"),
-        ("zoom,alpha_u,alpha_v,u0,v0\n1,-1,2,3,4\n2,1,2,3,4\n3,1,2,3,4\n", "must be positive"),
+        (
+            "zoom,alpha_u,alpha_v,u0,v0\n1,-1,2,3,4\n2,1,2,3,4\n3,1,2,3,4\n",
+            "bad.csv:2: alpha_u and alpha_v",
+        ),
         ("", "empty"),
     ],
 )

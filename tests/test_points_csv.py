@@ -181,6 +181,7 @@ FAULTS = {
     "X,Y,Z,u,v\n": "a.csv:1: there are no points below the header",
     "x,y,Z,u,v\n1,2,3,4,5\n": "a.csv:1: columns X, Y missing from the header 'x,y,Z,u,v'; write x as X",
     "view,X,Y,u,v\na,1,2,3,4\n": "a.csv:1: column Z missing",
+    "left,h:0:0,12.5,0,0,301,118\n": "a.csv:1: there is no header, but 'left,h:0:0,12.5,0,0,",
     "X,Y,Z,u,v,u\n1,2,3,4,5,6\n": "a.csv:1: the column u appears twice",
     "1,2,3,4\n": "a.csv:1: there is no header, so 5 columns X,Y,Z,u,v are expected, found 4",
     "1,2,3,4,5,6\n": "a.csv:1: there is no header",

@@ -77,6 +77,11 @@ def read_cameras(contents: Sequence[tuple[bytes, str]], notes: list[str]) -> Len
 
 def _tabled(table: Table) -> _Rows:
     n, size = len(table), table.metadata.image_size
+    positive = (table.numbers["alpha_u"] > 0) & (table.numbers["alpha_v"] > 0)
+    if not positive.all():
+        line = int(table.lines[np.argmin(positive)])
+        problem = "alpha_u and alpha_v must be positive; correct or remove the row"
+        raise FormatError(problem, table.source, line)
     sizes = set() if size is None else {size}
     return {**table.numbers, "theta": np.full(n, np.pi / 2)}, [Distortion()] * n, sizes
 

@@ -259,6 +259,15 @@ def _headerless_names(
 
 
 def _check_names(names: list[str], source: str, number: int, schema: Schema) -> None:
+    numbers = [text for text in names if is_number(text)]
+    if len(numbers) >= len(schema.required) > 0 and set(names).isdisjoint(schema.required):
+        line = one_line(",".join(names))[:60]
+        raise FormatError(
+            f"there is no header, but {line!r}; add one that names the columns {','.join(schema.required)} "
+            f"and all others{schema.instead}",
+            source,
+            number,
+        )
     for name, count in Counter(names).items():
         if name and count > 1:
             raise FormatError(
