@@ -42,7 +42,7 @@ def test_a_model_that_is_not_monotonic_is_no_reason_to_refuse_one_that_fits_bett
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=pytest.mark.slow if name in ("case262", "case842") else ()) for name in HARD],
+    [pytest.param(name, marks=pytest.mark.slow if name != "case310" else ()) for name in HARD],
 )
 def test_boards_under_a_strong_lens_are_not_called_parallel(name: str, real_files: RealFiles) -> None:
     found = calibrate(read_points(real_files(f"wrong_data/{name}.csv")))

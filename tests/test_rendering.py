@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from support.clutter import KINDS, Clutter
 from support.occluders import Disc, Rectangle
 from support.picture_bound import edge_bound, noise_free, scene_bound, vertex_bound
-from support.rendered import CONDITIONS, IMAGES, RECIPES, condition, picture
+from support.rendered import CONDITIONS, RECIPES, condition, picture
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
@@ -95,7 +95,7 @@ def test_skew_acts_after_distortion() -> None:
     st.floats(-0.01, 0.01),
     st.floats(-1, 1),
 )
-@settings(max_examples=50)
+@settings(max_examples=25)
 def test_a_ray_goes_to_its_pixel_and_back(k1: float, k2: float, p1: float, p2: float, tilt: float) -> None:
     intrinsics = Intrinsics(250.0, 252.0, 81.0, 58.0, np.pi / 2 + 0.1 * tilt)
     distortion = Distortion("k1k2p1p2", [k1, k2, p1, p2])
@@ -410,12 +410,12 @@ def test_a_condition_can_be_rendered(name: str) -> None:
     [pytest.param(one, marks=[pytest.mark.slow] * (k % 3 > 0)) for k, one in enumerate(CONDITIONS)],
 )
 def test_the_images_of_a_condition_are_all_different_and_always_the_same(name: str) -> None:
-    scenes = [condition(name, seed) for seed in range(IMAGES)]
-    again = [condition(name, seed) for seed in range(IMAGES)]
+    scenes = [condition(name, seed) for seed in range(4)]
+    again = [condition(name, seed) for seed in range(4)]
     for one, other in zip(scenes, again, strict=True):
         assert one.targets == other.targets
         np.testing.assert_array_equal(one.pose.t, other.pose.t)
-    assert len({tuple(scene.pose.t) for scene in scenes}) == IMAGES
+    assert len({tuple(scene.pose.t) for scene in scenes}) == 4
 
 
 def test_conditions_with_room_for_it_show_the_same_poses_as_the_base() -> None:

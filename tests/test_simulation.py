@@ -93,10 +93,10 @@ def test_the_bound_is_what_nearly_exact_points_report() -> None:
 
 
 def test_the_number_of_processes_changes_nothing() -> None:
-    one, two = (study_noise(paper_scene(), [0.5], 7, ("neuro", "linear"), seed=3, jobs=n) for n in (1, 2))
+    one, two = (study_noise(paper_scene(), [0.5], 5, ("neuro", "linear"), seed=3, jobs=n) for n in (1, 2))
     for name in one.methods:
         assert np.array_equal(one.methods[name].rms, two.methods[name].rms)
-    other = study_noise(paper_scene(), [0.5], 7, ("neuro",), seed=4)
+    other = study_noise(paper_scene(), [0.5], 5, ("neuro",), seed=4)
     assert not np.array_equal(other.methods["neuro"].rms, one.methods["neuro"].rms)
 
 
