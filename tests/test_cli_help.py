@@ -61,7 +61,7 @@ def _slow(words: list[str]) -> bool:
     """Whether the examples take long: zoom lenses, simulations, and the longest lists."""
     slow = (
         *("detect", "calibrate", "evaluate", "stereo", "lens", "simulate", "compare"),
-        *("convert", "rectify", "undistort", "target", "report", "advise"),
+        *("convert", "rectify", "undistort", "target", "report", "advise", "triangulate"),
     )
     return not words or words[0] in slow
 

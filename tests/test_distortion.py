@@ -119,7 +119,7 @@ def test_zhangs_views_give_the_published_lens(zhang: Correspondences) -> None:
     assert calibration.rmse_px == pytest.approx(0.3364, abs=1e-4)
 
 
-@pytest.mark.parametrize("type", [1, 2, 4])
+@pytest.mark.parametrize("type", slow_but((1, 4), (1, 2, 4)))
 def test_one_view_of_a_folded_target_gives_its_lens(type: int) -> None:
     scene = table_1()
     points = Correspondences(scene.world, through(scene, "k1", [-0.2]).pixels, scene.view, scene.image_size)

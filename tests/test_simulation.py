@@ -40,7 +40,7 @@ BOARD = Board.single(9, 6, 25.0)
 
 @pytest.fixture(scope="module")
 def study() -> NoiseStudy:
-    return study_noise(paper_scene(), [0.2, 1.0], 24, METHODS, seed=1)
+    return study_noise(paper_scene(), [0.2, 1.0], 16, METHODS, seed=1)
 
 
 def test_the_papers_scene_is_that_of_table_1() -> None:

@@ -204,6 +204,7 @@ def test_what_is_no_shape_is_not_taken_for_one() -> None:
     assert kept.verdict.word == "poor"
 
 
+@pytest.mark.slow
 def test_a_wrong_square_is_not_taken_for_a_shape() -> None:
     points, _ = photographed("flat", 10, 8)
     found = calibrate(replace(points, world=points.world * [1.0, 1.06, 1.0]), distortion="k1k2")
