@@ -16,6 +16,7 @@ from support.clutter import KINDS, Clutter
 from support.occluders import Disc, Rectangle
 from support.picture_bound import edge_bound, noise_free, scene_bound, vertex_bound
 from support.rendered import CONDITIONS, RECIPES, condition, picture
+from support.slow_cases import slow_but
 
 from neurocal_cli.board import Board, Plane
 from neurocal_cli.camera.camera import Camera
@@ -384,9 +385,7 @@ def test_a_condition_shows_what_it_should(name: str) -> None:
     assert (len(visible) == 0) == name.startswith("clutter only")
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in QUICK else pytest.param(name, marks=pytest.mark.slow) for name in CONDITIONS]
-)
+@pytest.mark.parametrize("name", slow_but(QUICK, CONDITIONS))
 def test_a_condition_can_be_rendered(name: str) -> None:
     scene = condition(name, 1)
     shown = picture(name, 1)
@@ -395,10 +394,7 @@ def test_a_condition_can_be_rendered(name: str) -> None:
     assert 20 < 255 * shown.image.mean() / scene.sensor.white_dn < 235
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(one, marks=[pytest.mark.slow] * (k % 3 > 0)) for k, one in enumerate(CONDITIONS)],
-)
+@pytest.mark.parametrize("name", slow_but(CONDITIONS[::3], CONDITIONS))
 def test_the_images_of_a_condition_are_all_different_and_always_the_same(name: str) -> None:
     scenes = [condition(name, seed) for seed in range(4)]
     again = [condition(name, seed) for seed in range(4)]
