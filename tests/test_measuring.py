@@ -244,7 +244,7 @@ def largest_grid(path: Path) -> tuple[np.ndarray, Grid]:
     return image, finding.find_grids(image)[0]
 
 
-@pytest.mark.parametrize("points", ["midpoints", "vertices"])
+@pytest.mark.parametrize("points", slow_but(("midpoints",), ("midpoints", "vertices")))
 def test_photographs_calibrate_better_than_with_opencv_corners(real_files: RealFiles, points: str) -> None:
     cv2 = pytest.importorskip("cv2")
     places_3d, pixels = [], []

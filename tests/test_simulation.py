@@ -155,6 +155,7 @@ def test_the_truth_as_a_calibration_has_no_error() -> None:
     assert found.rmse_px < 1e-9
 
 
+@pytest.mark.slow
 def test_single_starts_of_the_network_reach_the_minimum_and_plain_descent_often_does_not() -> None:
     pytest.importorskip("numba")
     study = study_starts(paper_scene(), 0.5, 6, seed=2)
