@@ -202,7 +202,7 @@ def assert_same_minimum(problem: Problem, mask: Array, poses: bool = True) -> No
 
 
 @pytest.mark.parametrize(
-    ("flat", "whitened"), slow_but({(False, False), (True, True)}, itertools.product((False, True), repeat=2))
+    ("flat", "whitened"), slow_but({(True, True)}, itertools.product((False, True), repeat=2))
 )
 @pytest.mark.parametrize("free", FREE.values(), ids=FREE)
 def test_refine_ends_where_scipy_does(free: list[int], flat: bool, whitened: bool) -> None:
@@ -254,7 +254,7 @@ def test_cameras_side_by_side_do_not_hold_each_other_up() -> None:
         assert together.each_settled[k] == one.each_settled[0]
 
 
-@settings(max_examples=20, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10**6))
 def test_no_step_raises_the_error_or_takes_a_point_behind_the_camera(seed: int) -> None:
     problem = Problem((12, 30), seed=seed)

@@ -394,6 +394,7 @@ def test_fixed_weights_keep_every_bit(problem: int, beta: float, method: Method)
 CONTINUED = BackpropOptions(rate_weights=0.02, beta=10.0, resting_gamma=True)
 
 
+@pytest.mark.parametrize("method", slow_but(("patterns",), ("patterns", "blocks")), indirect=True)
 @pytest.mark.parametrize("problem", slow_but((2,), (1, 2, 3)))
 def test_the_constrained_rule_stays_at_an_optimum_where_it_starts(problem: int, method: Method) -> None:
     task, a = table_1().constrained(problem)
@@ -418,6 +419,7 @@ def test_the_constrained_rule_imposes_what_noise_broke(problem: int, method: Met
     assert best <= trained.loss[0] < 1.03 * best
 
 
+@pytest.mark.parametrize("method", slow_but(("patterns",), ("patterns", "blocks")), indirect=True)
 def test_type_4_finds_the_intrinsic_parameters_for_a_known_pose(method: Method) -> None:
     scene = table_1()
     task, _ = scene.constrained(4)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import re
 from dataclasses import fields, replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -176,7 +177,7 @@ def calibrations(draw):
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(cal=calibrations())
 def test_a_calibration_comes_back_to_the_last_bit(tmp_path_factory, cal):
     path = tmp_path_factory.getbasetemp() / "cal.yaml"
@@ -196,7 +197,7 @@ def all_files_are_long():
         yield
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(cal=calibrations())
 def test_so_does_one_whose_tables_are_columns(tmp_path_factory, all_files_are_long, cal):
     path = tmp_path_factory.getbasetemp() / "cal.yaml"
@@ -458,14 +459,17 @@ TREES = st.recursive(
 )
 
 
+@cache
+def of_four_points():
+    cal = made_calibration()
+    return format_calibration(replace(cal, points=cal.points.select(slice(0, 4))))
+
+
 @settings(max_examples=100, deadline=None)
 @given(seed=st.integers(0, 10**6), junk=TREES)
 def test_a_value_of_another_type_anywhere_is_refused_in_one_line(tmp_path_factory, seed, junk):
     chance = random.Random(seed)
-    cal = made_calibration()
-    tree = yaml.load(
-        format_calibration(replace(cal, points=cal.points.select(slice(0, 4)))), yaml.CSafeLoader
-    )
+    tree = yaml.load(of_four_points(), yaml.CSafeLoader)
     tree["neurocal"]["fit"]["n_points"] = 4
     node = tree
     while True:  # walk down at random and replace what is there

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from support.decomposition import decompose
 from support.distorted import LENSES
 from support.plain_projection import project
+from support.slow_cases import slow_but
 
 from neurocal_cli.calibration import camera_of
 from neurocal_cli.camera.camera import Camera
@@ -227,9 +228,7 @@ def test_project_jacobian_by_central_differences(model: str, theta: float) -> No
     np.testing.assert_allclose(by_camera, numeric, rtol=1e-6, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "model", [pytest.param(m, marks=pytest.mark.slow) if m == "rich" else m for m in MODELS]
-)
+@pytest.mark.parametrize("model", slow_but([model for model in MODELS if model != "rich"], MODELS))
 @with_and_without_skew
 def test_unproject_jacobian_by_central_differences(model: str, theta: float) -> None:
     camera, pixels = camera_with(model, theta), some_pixels()

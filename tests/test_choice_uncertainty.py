@@ -5,13 +5,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.integrate import trapezoid
-from scipy.stats import norm
 from support.distorted import bent_set, through
 from support.scenes import random_flat_set
 
 from neurocal_cli import calibrate
 from neurocal_cli.bundle_adjustment.open_coefficients import OpenPrior, spread_of_open
 from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.geometry import Array
+
+
+def gaussian(x: Array, sigma: float) -> Array:
+    return np.asarray(np.exp(-0.5 * (x / sigma) ** 2) / (np.sqrt(2 * np.pi) * sigma))
 
 
 def test_what_was_left_out_makes_the_camera_less_certain_than_its_model_by_name() -> None:
@@ -36,7 +40,7 @@ def test_the_spread_is_the_mean_square_around_what_is_reported() -> None:
         absent = np.interp(0.0, x, likelihood)
         second, total = 2 * absent * value**2, 2 * absent
         for scale in (3.0, 0.3):
-            density = odds * likelihood * norm.pdf(x, scale=scale * size)
+            density = odds * likelihood * gaussian(x, scale * size)
             second += trapezoid(density * (x - value) ** 2, x)
             total += trapezoid(density, x)
         spread = spread_of_open(np.array([[precision]]), np.array([gradient]), 1.0, prior)

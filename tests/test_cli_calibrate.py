@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from click.testing import Result
 from support.command_line import run
 from support.made_calibration import CAMERA, made_calibration, made_points
 
@@ -26,6 +27,14 @@ def points(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory: pytest.TempPathFactory) -> Result:
+    """What the command prints for the points."""
+    path = tmp_path_factory.mktemp("calibrate") / "points.csv"
+    write_points(made_points(1), path)
+    return run("calibrate", path)
+
+
 @pytest.fixture
 def camera(tmp_path: Path) -> Path:
     """A file with the true camera and pose of the points."""
@@ -41,39 +50,38 @@ def refuse_to_work(monkeypatch: pytest.MonkeyPatch, error: BaseException) -> Non
     monkeypatch.setattr("neurocal_cli.methods.calibrate", fail)
 
 
-def test_the_calibration_goes_to_stdout_and_the_summary_to_stderr(points: Path) -> None:
-    result = run("calibrate", points)
-    assert result.exit_code == 0, result.stderr
-    assert result.stdout.startswith("%YAML 1.1\n---\ncamera_name: camera\n")
-    assert "alpha_u [px]" in result.stderr
-    assert "random start" in result.stderr
+def test_the_calibration_goes_to_stdout_and_the_summary_to_stderr(printed: Result) -> None:
+    assert printed.exit_code == 0, printed.stderr
+    assert printed.stdout.startswith("%YAML 1.1\n---\ncamera_name: camera\n")
+    assert "alpha_u [px]" in printed.stderr
+    assert "random start" in printed.stderr
 
 
-def test_the_command_gives_what_the_library_gives(points: Path) -> None:
+def test_the_command_gives_what_the_library_gives(points: Path, printed: Result) -> None:
 
     from neurocal_cli import calibrate
 
     found = calibrate(read_points(str(points)))
-    assert run("calibrate", points).stdout == format_calibration(found)
+    assert printed.stdout == format_calibration(found)
 
 
-def test_the_file_of_o_is_what_would_go_to_stdout(points: Path, tmp_path: Path) -> None:
+def test_the_file_of_o_is_what_would_go_to_stdout(points: Path, printed: Result, tmp_path: Path) -> None:
     out = tmp_path / "camera.yaml"
     result = run("calibrate", points, "-o", out)
     assert (result.exit_code, result.stdout) == (0, "")
-    assert out.read_text() == run("calibrate", points).stdout == run("calibrate", points, "-o", "-").stdout
+    assert out.read_text() == printed.stdout == run("calibrate", points, "-o", "-").stdout
 
 
-def test_the_camera_is_found(points: Path, tmp_path: Path) -> None:
+def test_the_camera_is_found(printed: Result, tmp_path: Path) -> None:
     out = tmp_path / "camera.yaml"
-    run("calibrate", points, "-o", out)
+    out.write_text(printed.stdout)
     found = read_calibration(out)
     for name in ("alpha_u", "alpha_v", "u0", "v0", "theta"):
         assert abs(getattr(found.intrinsics, name) - getattr(CAMERA, name)) < 5 * found.std[name]
 
 
-def test_points_are_read_from_stdin(points: Path) -> None:
-    assert run("calibrate", "-", stdin=points.read_bytes()).stdout == run("calibrate", points).stdout
+def test_points_are_read_from_stdin(points: Path, printed: Result) -> None:
+    assert run("calibrate", "-", stdin=points.read_bytes()).stdout == printed.stdout
 
 
 def test_several_files_are_calibrated_as_one(tmp_path: Path) -> None:

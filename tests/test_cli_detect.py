@@ -99,7 +99,7 @@ def test_the_number_of_cores_does_not_show(folder: Path) -> None:
         "import os, sys; from neurocal_cli.commands import neurocal; "
         "neurocal(sys.argv[1:], standalone_mode=False); print(os.environ['OPENBLAS_NUM_THREADS'])"
     )
-    words = [sys.executable, "-c", code, "detect", str(folder), *map(str, BOARD)]
+    words = [sys.executable, "-c", code, "detect", str(folder / "board01.png"), *map(str, BOARD)]
     for given, expected in ((None, "1"), ("2", "2")):
         environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_NUM_THREADS"}
         if given is not None:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import Result
 from support.command_line import run
 from support.zoom_laws import FLOOR, between, grid, seen
 
@@ -32,23 +33,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_lens_points(seen("c", grid(4, 3), seed=1, side=4), folder / "points.csv")
     write_lens_points(seen("c", between(4, 3), seed=2, side=4), folder / "between.csv")
     (folder / "cameras.csv").write_text(CAMERAS)
-    result = run(
-        "lens",
-        "fit",
-        folder / "points.csv",
-        "--distortion",
-        "none",
-        "--hidden",
-        0,
-        2,
-        "--plot",
-        folder / "fit.png",
-        "-o",
-        folder / "lens.yaml",
-    )
+    words = ("--distortion", "none", "--hidden", 0, 2, "-o", folder / "lens.yaml")
+    result = run("lens", "fit", folder / "points.csv", *words)
     assert result.exit_code == 0, result.stderr
     (folder / "report.txt").write_text(result.stderr)
     return folder
+
+
+@pytest.fixture(scope="module")
+def known(folder: Path) -> Result:
+    """What is printed for known cameras."""
+    return run("lens", "fit", folder / "cameras.csv", "--hidden", 1, 0)
 
 
 def test_points_with_settings_read_back(folder: Path) -> None:
@@ -60,12 +55,11 @@ def test_points_with_settings_read_back(folder: Path) -> None:
 
 
 def test_a_lens_file_reads_back_to_the_last_bit(folder: Path) -> None:
-    points = read_lens_points(folder / "points.csv")
-    lens = fit_lens(points, distortion="k1", topologies=((0, 2),))
+    lens = fit_lens(seen("c", grid(3, 2), seed=1, side=4), distortion="k1", topologies=((0, 2),))
     write_lens(lens, folder / "k1.yaml")
     again = read_lens(folder / "k1.yaml")
     assert format_lens(again) == format_lens(lens)
-    for setting in between(4, 3):
+    for setting in between(3, 2):
         cameras = [format_calibration(camera_at(which, setting)) for which in (lens, again)]
         assert cameras[0] == cameras[1]
 
@@ -137,19 +131,17 @@ def test_pictures_are_drawn(folder: Path) -> None:
     words = ("lens", "evaluate", folder / "lens.yaml", folder / "between.csv", "--plot")
     result = run(*words, folder / "evaluate.svg")
     assert result.exit_code == 0, result.stderr
+    fit = ("lens", "fit", folder / "cameras.csv", "--hidden", 1, 0, "-o", folder / "drawn.yaml")
+    assert run(*fit, "--plot", folder / "fit.png").exit_code == 0
     for name in ("fit.png", "evaluate.svg"):
         assert (folder / name).stat().st_size > 10_000
     assert run(*words, folder / "x.txt").exit_code == 2
 
 
-def test_known_cameras_go_the_simple_path(folder: Path) -> None:
-    words = ("lens", "fit", folder / "cameras.csv", "--hidden", 1, 0)
-    result = run(*words)
-    assert result.exit_code == 0, result.stderr
-    assert "known cameras" in result.stderr
-    assert run(*words, "-o", folder / "simple.yaml").exit_code == 0
-    assert result.stdout.encode() == (folder / "simple.yaml").read_bytes()
-    camera = run("lens", "camera", "-", "--zoom", 37, stdin=result.stdout.encode())
+def test_known_cameras_go_the_simple_path(folder: Path, known: Result) -> None:
+    assert known.exit_code == 0, known.stderr
+    assert "known cameras" in known.stderr
+    camera = run("lens", "camera", "-", "--zoom", 37, stdin=known.stdout.encode())
     assert camera.exit_code == 0, camera.stderr
     (folder / "known.yaml").write_text(camera.stdout)
     calibration = read_calibration(folder / "known.yaml")
@@ -307,21 +299,11 @@ def test_calibrate_points_to_lens_fit(folder: Path) -> None:
     assert "neurocal lens fit" in result.stderr
 
 
-def test_the_program_gives_the_same_bytes_again(folder: Path) -> None:
-    words = [
-        sys.executable,
-        "-m",
-        "neurocal_cli",
-        "lens",
-        "fit",
-        str(folder / "cameras.csv"),
-        "--hidden",
-        "1",
-        "0",
-    ]
-    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
-    runs = [subprocess.run(words, capture_output=True, check=True, env=environment).stdout for _ in range(2)]
-    assert runs[0] == runs[1]
+def test_the_program_gives_the_same_bytes_again(folder: Path, known: Result) -> None:
+    words = [sys.executable, "-m", "neurocal_cli", "lens", "fit", str(folder / "cameras.csv")]
+    words += ["--hidden", "1", "0", "-o", str(folder / "simple.yaml")]
+    subprocess.run(words, check=True, capture_output=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+    assert (folder / "simple.yaml").read_bytes() == known.stdout.encode()
 
 
 def test_several_files_are_read_as_one(folder: Path) -> None:

@@ -1,13 +1,13 @@
 """Distortion estimated with everything else, or given."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from support.distorted import through
 from support.plain_projection import project
 from support.scenes import Scene, board_midpoints, random_flat_set, table_1
+from support.slow_cases import slow_but
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, read_calibration
 from neurocal_cli.bundle_adjustment.point_batches import batches_of
@@ -67,7 +67,9 @@ def test_columns_of_the_lens_are_those_of_differences(model: str) -> None:
         assert normal[:, column, -1] == pytest.approx(expected, rel=1e-6, abs=1e-8)
 
 
-@pytest.mark.parametrize("model", [name for name in LENSES if name != "rational"])
+@pytest.mark.parametrize(
+    "model", slow_but(("plumb_bob", "fisheye"), [name for name in LENSES if name != "rational"])
+)
 def test_noise_free_views_give_the_lens_back(model: str) -> None:
     scene, points = flat_points(model)
     calibration = calibrate(points, distortion=model)
@@ -117,7 +119,7 @@ def test_zhangs_views_give_the_published_lens(zhang: Correspondences) -> None:
     assert calibration.rmse_px == pytest.approx(0.3364, abs=1e-4)
 
 
-@pytest.mark.parametrize("type", [1, 2, 4])
+@pytest.mark.parametrize("type", slow_but((1, 4), (1, 2, 4)))
 def test_one_view_of_a_folded_target_gives_its_lens(type: int) -> None:
     scene = table_1()
     points = Correspondences(scene.world, through(scene, "k1", [-0.2]).pixels, scene.view, scene.image_size)
@@ -126,15 +128,15 @@ def test_one_view_of_a_folded_target_gives_its_lens(type: int) -> None:
     assert np.abs(calibration.intrinsics.values() - scene.intrinsics.values())[:4].max() < 1e-5
 
 
-def given_lens(tmp_path: Path) -> tuple[Scene, Calibration]:
-    scene, points = flat_points("plumb_bob", 0.1)
-    calibration = calibrate(points, distortion="plumb_bob")
-    write_calibration(calibration, str(tmp_path / "camera.yaml"))
-    return scene, read_calibration(str(tmp_path / "camera.yaml"))
+@pytest.fixture(scope="module")
+def camera(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
+    """A camera with a lens, from its file."""
+    path = tmp_path_factory.mktemp("lens") / "camera.yaml"
+    write_calibration(calibrate(flat_points("plumb_bob", 0.1)[1], distortion="plumb_bob"), str(path))
+    return read_calibration(str(path))
 
 
-def test_type_3_takes_the_lens_of_the_given_camera(tmp_path: Path) -> None:
-    _, camera = given_lens(tmp_path)
+def test_type_3_takes_the_lens_of_the_given_camera(camera: Calibration) -> None:
     posed = calibrate(camera.points, type=3, intrinsics=camera)
     assert posed.converged
     assert np.array_equal(posed.distortion, camera.distortion)
@@ -145,8 +147,7 @@ def test_type_3_takes_the_lens_of_the_given_camera(tmp_path: Path) -> None:
         assert posed.views[name].pose.t == pytest.approx(view.pose.t, abs=1e-3)
 
 
-def test_a_file_with_a_lens_evaluates_as_it_was_calibrated(tmp_path: Path) -> None:
-    _, camera = given_lens(tmp_path)
+def test_a_file_with_a_lens_evaluates_as_it_was_calibrated(camera: Calibration) -> None:
     assert evaluate_camera(camera).rmse_px == pytest.approx(camera.rmse_px, rel=1e-12)
     assert evaluate_camera(camera).max_px == pytest.approx(camera.max_px, rel=1e-12)
 

@@ -1,6 +1,7 @@
 """Finding chessboards: complete, rightly indexed, and nothing where there is none."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from support.occluders import Rectangle
 from support.picture_bound import scene_bound
 from support.real_data import RealFiles
-from support.rendered import condition, picture
+from support.rendered import condition, picture, rendered
 from support.slow_cases import slow_but
 
 from neurocal_cli.detection import Grid
@@ -22,7 +23,7 @@ from neurocal_cli.detection.finding.links import find_links
 from neurocal_cli.detection.finding.seeds import find_seeds_3x3
 from neurocal_cli.detection.finding.subpixel import refine_saddles
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering import PlaneTruth, render
+from neurocal_cli.simulation.rendering import PlaneTruth, ground_truth
 
 cv2 = pytest.importorskip("cv2")
 
@@ -323,12 +324,12 @@ def test_separate_squares_are_no_board(real_files: RealFiles) -> None:
 @pytest.mark.parametrize("seed", slow_but((FIRST,), (FIRST, FIRST + 1)))
 def test_a_board_in_two_halves_is_one_grid(seed: int) -> None:
     scene = condition("base", seed)
-    truth = render(scene, np.random.default_rng(0)).truth.planes[0].vertices
+    truth = ground_truth(scene).planes[0].vertices
     middle = 0.5 * (truth[2, 4] + truth[3, 4])
     along = truth[3, 4] - truth[2, 4]
     angle = float(np.arctan2(along[1], along[0]))
     bar = Rectangle((float(middle[0]), float(middle[1])), (500.0, 30.0), angle, 0.4)
-    shot = render(type(scene)(**{**scene.__dict__, "occluders": (bar,)}), np.random.default_rng(1))
+    shot = rendered(replace(scene, occluders=(bar,)), np.random.default_rng(1))
     grids = find_grids(shot.image)
     hit, wrong = best_match(grids, shot.truth.planes[0])
     visible = open_around(shot.truth.planes[0], shot.image.shape[::-1])

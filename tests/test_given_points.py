@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.command_line import run
 from support.scenes import random_flat_set
+from support.slow_cases import slow_but
 from support.wrong_inputs import CAMERA, board, flat, poses, seen
 
 from neurocal_cli import Calibration, Correspondences, calibrate, evaluate_camera, write_calibration
@@ -67,7 +68,7 @@ def test_an_error_of_100_px_is_never_good() -> None:
     assert word(two) == "poor"
 
 
-@pytest.mark.parametrize("focal", [582.0, 618.0])
+@pytest.mark.parametrize("focal", slow_but((582.0,), (582.0, 618.0)))
 def test_points_of_another_zoom_are_not_good(focal: float) -> None:
     new = other_images(focal)
     assert word(new.select(new.view_index < 4)) != "good"

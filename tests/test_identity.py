@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from support.occluders import Rectangle
-from support.rendered import Recipe, board_pose, condition, folded, single
-from support.rendered import picture as rendered_picture
+from support.rendered import Recipe, board_pose, condition, folded, picture, rendered, single
 from support.seen_grids import labelled_vertices, seen_grid, seen_grids, true_vertices, turned_by
 from support.slow_cases import slow_but
 
@@ -23,15 +21,13 @@ from neurocal_cli.detection.identity.messages import SYMMETRIC_BOARD, NoBoardErr
 from neurocal_cli.detection.identity.placement import Placement, placements
 from neurocal_cli.detection.identity.trim import trimmed
 from neurocal_cli.geometry import Array
-from neurocal_cli.simulation.rendering import Rendered, Scene, Sides, Target, ground_truth, render
-
-picture = cache(rendered_picture)
+from neurocal_cli.simulation.rendering import Rendered, Scene, Sides, Target, ground_truth
 
 EMPTY = np.zeros((480, 640), dtype=np.uint8)
 
 
-def rendered(scene: Scene) -> Rendered:
-    return render(scene, np.random.default_rng(0))
+def shot(scene: Scene) -> Rendered:
+    return rendered(scene, np.random.default_rng(0))
 
 
 def same(found: dict[str, Array], truth: dict[str, Array]) -> bool:
@@ -206,7 +202,7 @@ def test_planes_of_one_size_are_told_apart_by_their_places() -> None:
     scene = replace(
         scene, targets=tuple(replace(t, plane=p) for t, p in zip(scene.targets, planes, strict=True))
     )
-    seen = rendered(scene)
+    seen = shot(scene)
     identified = identify(scene.board, seen_grids(scene, seen, 1), seen.image)
     assert same(labelled_vertices(identified), true_vertices(seen))
 
@@ -242,7 +238,7 @@ def test_the_ends_of_a_board_are_told_from_the_frame_and_from_something_before_i
     assert set(board_ends(seen.image, inner).values()) == {End.PATTERN}
     middle = tuple(np.mean(grid.pixels[0], axis=0))
     paper = Rectangle((float(middle[0]), float(middle[1]) - 10), (500, 40), 0.1, 0.9)
-    hidden = rendered(replace(scene, occluders=(paper,)))
+    hidden = shot(replace(scene, occluders=(paper,)))
     (rest,) = seen_grids(scene, hidden)
     assert board_ends(hidden.image, rest)[0, -1] is End.UNKNOWN
     assert set(board_ends(EMPTY, grid).values()) == {End.UNKNOWN}
@@ -255,7 +251,7 @@ def test_a_board_without_margin_before_a_dark_wall_ends_too() -> None:
     scene = single(Recipe(), np.random.default_rng(0))
     target = replace(scene.targets[0], margin=Sides.all(0.0))
     scene = replace(scene, targets=(target,), background=replace(scene.background, level=0.15))
-    seen = rendered(scene)
+    seen = shot(scene)
     (grid,) = seen_grids(scene, seen)
     assert set(board_ends(seen.image, grid).values()) == {End.BOARD}
 

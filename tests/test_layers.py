@@ -6,6 +6,7 @@ import ast
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,8 @@ import pytest
 import neurocal_cli
 
 ROOT = Path(neurocal_cli.__file__).parent
-MODULES = {str(path.relative_to(ROOT)): ast.parse(path.read_text("utf-8")) for path in ROOT.rglob("*.py")}
-LIBRARY = [name for name in MODULES if not name.startswith("commands/") and name != "__main__.py"]
+NAMES = [str(path.relative_to(ROOT)) for path in ROOT.rglob("*.py")]
+LIBRARY = [name for name in NAMES if not name.startswith("commands/") and name != "__main__.py"]
 
 # Which modules may import a package, by the beginning of their path.
 HOMES = {
@@ -72,6 +73,17 @@ NUMPY_FILES = {"load", "save", "savez", "savetxt", "loadtxt", "genfromtxt", "fro
 DEFERRED = (ast.FunctionDef, ast.If)
 
 
+@cache
+def tree_of(name: str) -> ast.Module:
+    return ast.parse((ROOT / name).read_text("utf-8"))
+
+
+@cache
+def imports(name: str) -> frozenset[str]:
+    """What a module imports anywhere."""
+    return frozenset(imported(tree_of(name)))
+
+
 def imported(tree: ast.Module) -> Iterator[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
@@ -95,25 +107,25 @@ def room(name: str) -> str:
 
 def test_a_module_imports_from_its_own_room_and_from_below() -> None:
     wrong = {}
-    for name in MODULES.keys() - {"__init__.py"}:
+    for name in set(NAMES) - {"__init__.py"}:
         mine = room(name)
         (level,) = (k for k, rooms in enumerate(LEVELS) if mine in rooms)
-        used = {m.split(".")[1] for m in imported(MODULES[name]) if m.startswith("neurocal_cli.")}
+        used = {m.split(".")[1] for m in imports(name) if m.startswith("neurocal_cli.")}
         wrong[name] = used - set().union({mine}, *LEVELS[:level])
     assert {name: rooms for name, rooms in wrong.items() if rooms} == {}
 
 
 @pytest.mark.parametrize("package", HOMES)
 def test_a_package_is_imported_only_where_it_belongs(package: str) -> None:
-    users = [name for name, tree in MODULES.items() if package in {m.split(".")[0] for m in imported(tree)}]
+    users = [name for name in NAMES if package in {m.split(".")[0] for m in imports(name)}]
     assert [name for name in users if not name.startswith(HOMES[package])] == []
 
 
 def test_scipy_is_imported_inside_the_functions_that_use_it() -> None:
     """Loading it takes longer than a calibration."""
     at_once = {
-        name: ast.Module([node for node in tree.body if not isinstance(node, DEFERRED)], [])
-        for name, tree in MODULES.items()
+        name: ast.Module([node for node in tree_of(name).body if not isinstance(node, DEFERRED)], [])
+        for name in NAMES
     }
     assert [
         name for name, tree in at_once.items() if "scipy" in {m.split(".")[0] for m in imported(tree)}
@@ -142,19 +154,15 @@ def test_a_calibration_imports_nothing_that_it_is_not_asked_for() -> None:
 
 
 def test_the_library_does_not_import_the_commands() -> None:
-    users = [
-        name
-        for name in LIBRARY
-        if any(m.startswith("neurocal_cli.commands") for m in imported(MODULES[name]))
-    ]
+    users = [name for name in LIBRARY if any(m.startswith("neurocal_cli.commands") for m in imports(name))]
     assert users == []
 
 
 def test_only_io_opens_files() -> None:
     users = {
         name
-        for name, tree in MODULES.items()
-        for owner, called in calls(tree)
+        for name in NAMES
+        for owner, called in calls(tree_of(name))
         if (called in METHODS if owner else called == "open") or (owner == "np" and called in NUMPY_FILES)
     }
     assert {name for name in users if not name.startswith("io/")} == set()
@@ -162,10 +170,10 @@ def test_only_io_opens_files() -> None:
 
 def test_the_library_neither_prints_nor_exits() -> None:
     forbidden = {("", "print"), ("", "input"), ("", "exit"), ("sys", "exit"), ("os", "_exit")}
-    assert [name for name in LIBRARY if not forbidden.isdisjoint(calls(MODULES[name]))] == []
+    assert [name for name in LIBRARY if not forbidden.isdisjoint(calls(tree_of(name)))] == []
 
 
 def test_a_module_says_what_it_is_for() -> None:
-    assert [name for name, tree in MODULES.items() if not ast.get_docstring(tree)] == []
+    assert [name for name in NAMES if not ast.get_docstring(tree_of(name))] == []
     vague = {"utils", "helpers", "manager"}
-    assert [name for name in MODULES if vague & set(Path(name).with_suffix("").parts)] == []
+    assert [name for name in NAMES if vague & set(Path(name).with_suffix("").parts)] == []

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -78,7 +80,7 @@ def test_edges_sharper_than_a_pixel_reach_the_bound(points: Literal["midpoints",
 
 
 def test_vertices_reach_the_bound() -> None:
-    found_errors = errors("base", range(2, 4), "vertices")
+    found_errors = errors("base", range(2), "vertices")
     assert found_errors.ratio < 1.2
     assert 0.7 < found_errors.normalised < 1.4
     assert found_errors.kept == 1
@@ -102,7 +104,7 @@ def test_hidden_edges_are_left_out(seed: int) -> None:
 
 
 def test_result_is_complete_and_repeatable() -> None:
-    _, picture = take("base", 5)
+    _, picture = take("base", 0)
     plane = picture.truth.planes[0]
     grid, mirrored = found(plane, 5)
     first, again = (measure(picture.image, grid) for _ in range(2))
@@ -131,7 +133,7 @@ def test_start_does_not_matter() -> None:
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64])
 def test_kinds_of_images_agree(dtype: type) -> None:
-    _, picture = take("base", 7)
+    _, picture = take("base", 1)
     grid, _ = found(picture.truth.planes[0], 7)
     factor = 257 if dtype is np.uint16 else 1
     image = (picture.image.astype(float) * factor).astype(dtype)
@@ -142,7 +144,7 @@ def test_kinds_of_images_agree(dtype: type) -> None:
 
 
 def test_images_may_be_views_and_grids_may_be_small() -> None:
-    _, picture = take("base", 8)
+    _, picture = take("base", 0)
     plane = picture.truth.planes[0]
     grid, _ = found(plane, 8)
     wide = np.repeat(picture.image, 2, axis=1)[:, ::2]
@@ -159,7 +161,7 @@ def test_images_may_be_views_and_grids_may_be_small() -> None:
 
 
 def test_parts_of_a_board_are_measured() -> None:
-    _, picture = take("base", 9)
+    _, picture = take("base", 1)
     plane = picture.truth.planes[0]
     grid, _ = found(plane, 9)
     pixels = grid.pixels.copy()
@@ -233,14 +235,21 @@ def test_edges_of_a_sharp_photograph_settle(real_files: RealFiles) -> None:
     assert measured.rejected < 0.06 * 1739
 
 
-@pytest.mark.parametrize("points", ["midpoints", "vertices"])
-def test_photographs_calibrate_better_than_with_opencv_corners(real_files: RealFiles, points: str) -> None:
+@cache
+def largest_grid(path: Path) -> tuple[np.ndarray, Grid]:
+    """A photograph and the largest grid in it."""
     cv2 = pytest.importorskip("cv2")
     finding = pytest.importorskip("neurocal_cli.detection.finding.grids")
+    image = cv2.imread(str(path), 0)
+    return image, finding.find_grids(image)[0]
+
+
+@pytest.mark.parametrize("points", slow_but(("midpoints",), ("midpoints", "vertices")))
+def test_photographs_calibrate_better_than_with_opencv_corners(real_files: RealFiles, points: str) -> None:
+    cv2 = pytest.importorskip("cv2")
     places_3d, pixels = [], []
     for path in real_files("opencv_stereo/left*.jpg"):
-        image = cv2.imread(str(path), 0)
-        grid = finding.find_grids(image)[0]
+        image, grid = largest_grid(path)
         measured = measure(image, grid, points)  # type: ignore[arg-type]
         half = np.array([[0.5, 0], [0, 0.5], [0, 0]])[measured.kind]
         place = np.column_stack([measured.index + half, np.zeros(len(measured.kind))])

@@ -63,7 +63,7 @@ def check(type: int, sigma: float, trials: int) -> None:
 
 @pytest.mark.parametrize("type", [1, 2, 3, 4])
 def test_errors_are_at_the_cramer_rao_bound(type: int) -> None:
-    check(type, 1.0, 60)
+    check(type, 1.0, 36)
 
 
 @pytest.mark.slow

@@ -38,10 +38,14 @@ def test_the_same_calibration_gives_the_same_picture(kind: str) -> None:
     [
         pytest.param(made_calibration(1, noise=0), id="without noise", marks=pytest.mark.slow),
         pytest.param(made_calibration(45), id="many views", marks=pytest.mark.slow),
-        pytest.param(replace(made_calibration(), network=None, camera_name="$x_1$ \n"), id="no network"),
         pytest.param(
-            replace(made_calibration(), points=replace(made_calibration().points, image_size=None)),
-            id="no image size",
+            replace(
+                made_calibration(),
+                network=None,
+                camera_name="$x_1$ \n",
+                points=replace(made_calibration().points, image_size=None),
+            ),
+            id="no network, no image size",
         ),
     ],
 )

@@ -160,6 +160,7 @@ def test_other_processors_give_the_same_zoom_lens(
         assert_same_answer(zoom_reference / f"{name}.yaml", other / f"{name}.yaml", 0.2)
 
 
+@pytest.mark.slow
 def test_the_same_processor_gives_the_same_bytes(reference: Path, tmp_path: Path) -> None:
     again = run_commands(tmp_path / "again", FROM_POINTS + FROM_IMAGES.lstrip())
     names = [path.name for path in reference.iterdir() if path.is_file()]

@@ -7,6 +7,7 @@ import pytest
 from support.campaign import scene
 from support.campaign_reference import reference
 from support.real_data import RealFiles
+from support.slow_cases import slow_but
 
 from neurocal_cli import Correspondences, calibrate, read_points
 from neurocal_cli.bundle_adjustment.problem import problem_for
@@ -28,7 +29,7 @@ def test_the_start_is_near_the_truth_where_a_pinhole_is_not(seed: int) -> None:
     assert found.in_pixels.entries[0, 0] == pytest.approx(truth.A[0, 0], rel=0.03)
 
 
-@pytest.mark.parametrize("seed", [pytest.param(seed, marks=pytest.mark.slow) for seed in STRONG])
+@pytest.mark.parametrize("seed", slow_but((), STRONG))
 def test_no_strong_distortion_ends_in_a_refusal_or_a_wrong_minimum(seed: int) -> None:
     points, truth = scene(seed)
     assert reference(points, truth).excess(calibrate(points)) < 1.005
@@ -40,23 +41,14 @@ def test_a_model_that_is_not_monotonic_is_no_reason_to_refuse_one_that_fits_bett
     assert reference(points, truth).excess(calibrate(points)) < 1.005
 
 
-@pytest.mark.parametrize(
-    "name",
-    [pytest.param(name, marks=pytest.mark.slow if name in ("case262", "case842") else ()) for name in HARD],
-)
+@pytest.mark.parametrize("name", slow_but(("case310",), HARD))
 def test_boards_under_a_strong_lens_are_not_called_parallel(name: str, real_files: RealFiles) -> None:
     found = calibrate(read_points(real_files(f"wrong_data/{name}.csv")))
     alpha, deviations = HARD[name]
     assert abs(found.K[0, 0] - alpha) < deviations * found.std["alpha_u"]
 
 
-@pytest.mark.parametrize(
-    "distortion",
-    [
-        "k1k2",
-        *(pytest.param(model, marks=pytest.mark.slow) for model in ("k1k2p1p2", "plumb_bob", "rational")),
-    ],
-)
+@pytest.mark.parametrize("distortion", slow_but(("k1k2",), ("k1k2", "k1k2p1p2", "plumb_bob", "rational")))
 def test_a_model_never_ends_above_a_simpler_one(distortion: str, real_files: RealFiles) -> None:
     points = read_points(real_files("wrong_data/case842.csv"))
     simple, more = (calibrate(points, distortion=model) for model in ("k1", distortion))

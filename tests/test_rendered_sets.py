@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from support.distorted import coefficients
 from support.image_bound import camera_bound
+from support.rendered import rendered
 
 from neurocal_cli import Calibration, Correspondences, calibrate, detect_points
 from neurocal_cli.board import Board, Plane
@@ -23,7 +24,6 @@ from neurocal_cli.simulation.rendering import (
     Scene,
     Sensor,
     Target,
-    render,
 )
 
 SIZE = (400, 300)
@@ -66,7 +66,7 @@ def pictures(model: str, seed: int) -> list[tuple[Scene, Rendered]]:
             psf=0.7,
             sensor=Sensor(read_noise=2.0),
         )
-        picture = render(scene, rng)
+        picture = rendered(scene, rng, 6)
         if picture.truth.planes[0].vertices_visible.all():
             taken.append((scene, picture))
     return taken
@@ -79,7 +79,7 @@ def detected(taken: list[tuple[Scene, Rendered]], kind: Points) -> Correspondenc
     )
 
 
-def rendered(model: str, seed: int, *kinds: Points) -> list[Correspondences]:
+def sets(model: str, seed: int, *kinds: Points) -> list[Correspondences]:
     """What is detected in eight images, for each kind of points."""
     taken = pictures(model, seed)
     return [detected(taken, kind) for kind in kinds]
@@ -94,7 +94,7 @@ def rms(values: list[list[float]]) -> float:
 
 
 def test_a_set_of_images_gives_the_camera_within_its_standard_deviations() -> None:
-    (points,) = rendered("none", 7, "midpoints")
+    (points,) = sets("none", 7, "midpoints")
     found = calibrate(points, skew=False)
     assert found.distortion_model == "none"
     assert not len(found.rejected)
@@ -106,7 +106,7 @@ def test_a_set_of_images_gives_the_camera_within_its_standard_deviations() -> No
 def test_standard_deviations_hold_from_images_on() -> None:
     one_way, vertices, both_ways = [], [], []
     for seed in range(40):
-        midpoints, corners = rendered("none", seed, "midpoints", "vertices")
+        midpoints, corners = sets("none", seed, "midpoints", "vertices")
         one_way.append(sigmas(calibrate(midpoints, skew=False, distortion="none")))
         vertices.append(sigmas(calibrate(corners, skew=False, distortion="none")))
         naive = Correspondences(
@@ -125,7 +125,7 @@ def test_the_lens_of_rendered_images_is_found(model: str) -> None:
     chosen: Counter[str] = Counter()
     errors, rejected = [], 0
     for seed in range(40):
-        found = calibrate(*rendered(model, seed, "midpoints"), skew=False)
+        found = calibrate(*sets(model, seed, "midpoints"), skew=False)
         chosen[found.distortion_model] += 1
         errors.append(sigmas(found))
         rejected += len(found.rejected)

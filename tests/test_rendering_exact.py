@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import cv2
@@ -78,8 +79,10 @@ def shift(picture: Array, model: Array, gradient: tuple[Array, Array]) -> Array:
     return np.asarray(np.linalg.lstsq(J, (picture - model).ravel(), rcond=None)[0])
 
 
-@pytest.mark.parametrize("psf", slow_but((0.4, 2.0), (0.4, 0.8, 2.0)))
-@pytest.mark.parametrize("roll", slow_but((0.0, 0.3), (0.0, 0.3, np.pi / 4, 1.2)))
+@pytest.mark.parametrize(
+    ("psf", "roll"),
+    slow_but(((0.4, 0.0), (2.0, 0.3)), itertools.product((0.4, 0.8, 2.0), (0.0, 0.3, np.pi / 4, 1.2))),
+)
 def test_a_board_that_faces_the_camera_is_a_product_of_error_functions(psf: float, roll: float) -> None:
     middle = (79.37, 60.21)
     scene = facing(16.3, roll, middle, psf)
@@ -99,7 +102,7 @@ def test_more_cells_to_a_pixel_come_closer_to_the_error_functions() -> None:
 
 @pytest.mark.parametrize("roll", slow_but((0.2,), (0.0, 0.2)))
 def test_every_edge_and_vertex_lies_within_a_ten_thousandth_of_a_pixel(roll: float) -> None:
-    for offset in np.linspace(0.1, 0.6, 3 if roll == 0 else 2):
+    for offset in np.linspace(0.1, 0.6, 3) if roll == 0 else (0.1,):
         middle = (78.0 + offset, 61.0 - 0.7 * offset)
         scene = facing(18.0, roll, middle, 0.7)
         picture = noise_free(scene) / 65535

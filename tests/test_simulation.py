@@ -40,7 +40,7 @@ BOARD = Board.single(9, 6, 25.0)
 
 @pytest.fixture(scope="module")
 def study() -> NoiseStudy:
-    return study_noise(paper_scene(), [0.2, 1.0], 24, METHODS, seed=1)
+    return study_noise(paper_scene(), [0.2, 1.0], 16, METHODS, seed=1)
 
 
 def test_the_papers_scene_is_that_of_table_1() -> None:
@@ -93,10 +93,10 @@ def test_the_bound_is_what_nearly_exact_points_report() -> None:
 
 
 def test_the_number_of_processes_changes_nothing() -> None:
-    one, two = (study_noise(paper_scene(), [0.5], 7, ("neuro", "linear"), seed=3, jobs=n) for n in (1, 2))
+    one, two = (study_noise(paper_scene(), [0.5], 5, ("neuro", "linear"), seed=3, jobs=n) for n in (1, 2))
     for name in one.methods:
         assert np.array_equal(one.methods[name].rms, two.methods[name].rms)
-    other = study_noise(paper_scene(), [0.5], 7, ("neuro",), seed=4)
+    other = study_noise(paper_scene(), [0.5], 5, ("neuro",), seed=4)
     assert not np.array_equal(other.methods["neuro"].rms, one.methods["neuro"].rms)
 
 
@@ -155,6 +155,7 @@ def test_the_truth_as_a_calibration_has_no_error() -> None:
     assert found.rmse_px < 1e-9
 
 
+@pytest.mark.slow
 def test_single_starts_of_the_network_reach_the_minimum_and_plain_descent_often_does_not() -> None:
     pytest.importorskip("numba")
     study = study_starts(paper_scene(), 0.5, 6, seed=2)

@@ -154,7 +154,7 @@ def test_a_singular_normal_matrix_is_called_so_without_a_warning() -> None:
 
 
 @pytest.mark.parametrize(
-    ("n_views", "trials", "least"), slow_but([(5, 40, 0.55)], [(5, 40, 0.55), (5, 400, 0.6), (20, 150, 0.8)])
+    ("n_views", "trials", "least"), slow_but((), [(5, 40, 0.55), (5, 400, 0.6), (20, 150, 0.8)])
 )
 def test_the_std_is_the_spread_over_many_noises(n_views: int, trials: int, least: float) -> None:
     """Never less, and more by what it costs to count views: the variance between five of them is rough."""

@@ -177,14 +177,17 @@ def test_the_new_camera_is_opencv_s_nearly(model: str, alpha: float) -> None:
 @pytest.mark.parametrize("skew", slow_but((True,), (True, False)))
 def test_alpha_0_shows_only_seen_pixels_and_alpha_1_all_of_them(model: str, skew: bool) -> None:
     cam = camera(model, skew)
+    # All pixels along the sides, where the extremes are, and some between them.
     u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    some = (u % 639 == 0) | (v % 479 == 0) | ((u % 9 == 4) & (v % 9 == 4))
+    u, v = u[some], v[some]
     su, sv = sources(cam, undistorted_camera(cam, 0.0), u, v)
     assert su.min() > -0.02
     assert sv.min() > -0.02
     assert su.max() < 639.02
     assert sv.max() < 479.02
     new = undistorted_camera(cam, 1.0)
-    shown = undistort_pixels(cam, new, np.column_stack([u.ravel(), v.ravel()]))
+    shown = undistort_pixels(cam, new, np.column_stack([u, v]))
     assert shown.min() > -0.02
     assert (shown.max(axis=0) < [639.02, 479.02]).all()
     assert new.intrinsics.skewed is False
@@ -308,7 +311,7 @@ def test_images_too_long_for_opencv_are_refused() -> None:
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_any_lens_gives_a_picture_or_a_reason(seed: int) -> None:
     rng = np.random.default_rng(seed)
     model = str(rng.choice(BENDING))

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.slow_cases import slow_but
 from support.wide_cameras import wide_camera, wide_points
 from support.wide_scenes import WideScene, wide_set
 
@@ -32,7 +33,7 @@ def found(scene: WideScene, distortion: str = "", **given: object) -> Calibratio
 
 
 @every_wide_model
-@pytest.mark.parametrize("field", [100.0, 185.0, 215.0])
+@pytest.mark.parametrize("field", slow_but((215.0,), (100.0, 185.0, 215.0)))
 def test_the_minimum_is_found_without_a_guess(model: str, field: float) -> None:
     scene = wide_set(int(field), model, field, n_views=8, sigma=0.1)
     one = found(scene)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from support.slow_cases import slow_but
 from support.wrong_inputs import CAUSES, FLAT, FOLDED, SLOW, UNNAMED, flat, folded, outcome
 from wrong_inputs_table import words
 
@@ -29,9 +30,7 @@ def test_the_points_that_are_spoilt_are_good(scene, seed: int) -> None:
     assert found.n_rejected == 0
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow if name in SLOW else ()) for name in CAUSES]
-)
+@pytest.mark.parametrize("name", slow_but(CAUSES.keys() - SLOW, CAUSES))
 def test_no_wrong_input_ends_as_good_and_its_cause_is_named(name: str) -> None:
     found = outcome(name)
     assert found.word in ("refused", "poor", "usable")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -19,9 +20,14 @@ from support.rendered import condition
 Points = Literal["midpoints", "vertices"]
 
 
+@lru_cache(16)
 def take(name: str, seed: int) -> tuple[Scene, Rendered]:
+    """A condition and its picture, its edges right to 0.0001 px."""
     scene = condition(name, seed)
     return scene, render(scene, np.random.default_rng([seed, 1]))
+
+
+_bound = lru_cache(16)(scene_bound)  # of the same scenes
 
 
 def found(plane: PlaneTruth, seed: int, blur: float = 0.5, hidden: bool = False) -> tuple[Grid, bool]:
@@ -107,7 +113,7 @@ def errors_of(
     visible, kept, polarity = 0, 0, []
     for seed in seeds:
         scene, picture = taken(seed)
-        for plane, bound in zip(picture.truth.planes, scene_bound(scene), strict=True):
+        for plane, bound in zip(picture.truth.planes, _bound(scene), strict=True):
             grid, mirrored = found(plane, seed, hidden=hidden)
             measured = measure(picture.image, grid, points, gamma)
             row = places(measured, plane, mirrored)

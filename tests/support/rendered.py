@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -27,12 +28,12 @@ from neurocal_cli.simulation.rendering import (
     Sides,
     Target,
     ground_truth,
-    render,
 )
+from neurocal_cli.simulation.rendering.light import image_light
+from neurocal_cli.simulation.rendering.sensor import digitised
 from support.clutter import KINDS, Clutter
 from support.occluders import Disc, Rectangle
 
-IMAGES = 8  # per condition, by default
 SQUARE = 28.0  # mm
 PLAIN = Clutter()
 EVEN = Illumination()
@@ -320,6 +321,12 @@ def condition(name: str, seed: int) -> Scene:
     return single(RECIPES[name], rng) if name in RECIPES else OTHERS[name](rng)
 
 
+def rendered(scene: Scene, rng: np.random.Generator, parts: int = 4) -> Rendered:
+    """As by `render`, in half of the time: with fewer cells, edges are right to 0.001 px (of 6: 0.0003)."""
+    return Rendered(digitised(scene.sensor, image_light(scene, parts), rng), ground_truth(scene))
+
+
+@lru_cache(32)
 def picture(name: str, seed: int) -> Rendered:
     """The picture of a condition, its noise decided by the seed as well."""
-    return render(condition(name, seed), np.random.default_rng([seed, 1]))
+    return rendered(condition(name, seed), np.random.default_rng([seed, 1]))

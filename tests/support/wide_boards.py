@@ -16,7 +16,6 @@ from neurocal_cli.simulation.rendering import (
     Sensor,
     Sides,
     Target,
-    ground_truth,
     render,
 )
 from support.clutter import KINDS, Clutter
@@ -137,11 +136,6 @@ def wide_picture(recipe: WideRecipe, seed: int) -> tuple[Scene, Rendered]:
     """A scene and its picture."""
     scene = wide_scene(recipe, seed)
     return scene, render(scene, np.random.default_rng([seed, 78]))
-
-
-def truth_of(scene: Scene) -> Array:
-    """(rows, cols, 2) vertices of the board [px]."""
-    return ground_truth(scene).planes[0].vertices
 
 
 def mixture(seed: int, clutter: float = 0.5) -> tuple[WideRecipe, Scene]:

@@ -505,9 +505,16 @@ UNNAMED = frozenset(
         "folded target: squares of one plane 10 % larger",
     }
 )
-# Those that take a second and more, as all explanations are tried, and what others show as well.
+# Those that take long, as all explanations are tried, and what others show as well.
 SLOW = frozenset(
     {
+        "all points on one line",
+        "every row given twice",
+        "folded target: Z turned round",
+        "folded target: u,v swapped in one view",
+        "folded target: v upwards",
+        "half of the images through another lens",
+        "two cameras mixed",
         "X in mm, Y in cm",
         "Z full of noise",
         "a fifth of the pixels anywhere",

@@ -222,6 +222,22 @@ WRONG: dict[str, tuple[Spoiler, str]] = {
 }  # fmt: skip
 
 
+# Those whose cause others show as well.
+SLOW = frozenset(
+    {
+        "board turned round in every right image",
+        "half of the pairs in inches",
+        "images of every other pair exchanged",
+        "right images early by 10 % of the time to the next pair",
+        "right images late while the target moves by 0.5 mm",
+        "right images of the previous pair",
+        "rig bumped by 0.1 degrees half way",
+        "rig bumped by 0.5 degrees after four pairs",
+        "rig knocked by 5 degrees after eight pairs",
+    }
+)
+
+
 def outcome(name: str) -> Outcome:
     """What becomes of a wrong rig."""
     spoil, _ = WRONG[name]
