@@ -30,6 +30,8 @@ MODELS = {
     "tilted": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY"),
     **WIDE,
 }
+POLYNOMIAL_MODELS = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")
+"""Each has the coefficients of the one before it and more, in the same order."""
 # Models with a thin prism; the second also with a tilted sensor.
 WITH_PRISM = ("thin_prism", "tilted")
 # Coefficients of terms that are not rotationally symmetric.

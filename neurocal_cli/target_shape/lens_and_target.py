@@ -11,12 +11,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from neurocal_cli.bundle_adjustment.adjust import Adjusted
+from neurocal_cli.bundle_adjustment.open_coefficients import log_prior, radius
 from neurocal_cli.bundle_adjustment.problem import Problem
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.target import Target
 from neurocal_cli.target_shape.find import Found, evidence_as_given, find_target
 
 # Nested models: each has the coefficients of the previous one and more.
-_CHAIN = ("none", "k1", "k1k2", "k1k2p1p2", "plumb_bob")
 _RICHER = 4.0  # least gain in log evidence for a richer model: odds of about fifty
 _SIMPLER = -1.0  # and for a simpler one
 
@@ -46,10 +47,14 @@ def _with_other_lens(found: Found, step: int, flat: bool) -> Found | None:
     """Estimate the target with the next lens model of the chain for every camera; None at the chain's end."""
     fits = []
     for problem, adjusted in found.fits:
-        place = _CHAIN.index(adjusted.state.model) + step if adjusted.state.model in _CHAIN else -1
-        if not 0 <= place < len(_CHAIN) or problem.type == 3:
+        place = (
+            POLYNOMIAL_MODELS.index(adjusted.state.model) + step
+            if adjusted.state.model in POLYNOMIAL_MODELS
+            else -1
+        )
+        if not 0 <= place < len(POLYNOMIAL_MODELS) or problem.type == 3:
             return None
-        fits.append(_adjusted_with(problem, adjusted, _CHAIN[place]))
+        fits.append(_adjusted_with(problem, adjusted, POLYNOMIAL_MODELS[place]))
     return find_target(fits, flat, found.target)
 
 
@@ -63,12 +68,31 @@ def named_lens_is_too_simple(fits: Sequence[tuple[Problem, Adjusted]], found: Fo
     found : Found
         For the same lenses.
     """
-    if not any(a.state.model in _CHAIN[:-1] and p.free[0] for p, a in fits):
-        return False
-    richer = [
-        _adjusted_with(p, a, _CHAIN[-1]) if a.state.model in _CHAIN and p.free[0] else (p, a) for p, a in fits
-    ]
-    return evidence_as_given(richer) > found.evidence
+    estimated = [p.free[0] and a.state.model in POLYNOMIAL_MODELS for p, a in fits]
+    simplest = min(
+        (
+            POLYNOMIAL_MODELS.index(a.state.model)
+            for (_, a), free in zip(fits, estimated, strict=True)
+            if free
+        ),
+        default=len(POLYNOMIAL_MODELS),
+    )
+    for model in POLYNOMIAL_MODELS[simplest + 1 :]:
+        richer = [
+            _adjusted_with(*fit, model) if free and _is_simpler(fit[1].state.model, model) else fit
+            for fit, free in zip(fits, estimated, strict=True)
+        ]
+        added = sum(
+            log_prior(after.state, len(before.state.k), radius(problem.views, before.state))
+            for (_, before), (problem, after) in zip(fits, richer, strict=True)
+        )
+        if evidence_as_given(richer) + added > found.evidence:
+            return True
+    return False
+
+
+def _is_simpler(model: str, other: str) -> bool:
+    return POLYNOMIAL_MODELS.index(model) < POLYNOMIAL_MODELS.index(other)
 
 
 def _adjusted_with(problem: Problem, adjusted: Adjusted, model: str) -> tuple[Problem, Adjusted]:

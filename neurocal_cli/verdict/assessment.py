@@ -73,7 +73,6 @@ _STEPS = 5  # steps to the minimum, which given poses and an edited file may mis
 _IN_PLANE = 1e-9  # relative depth below which a point lies in the camera's plane
 _BY_FLEXING = 0.01  # relative change of the focal length that bends of single views can mimic
 _EXACT = 1e-4  # of the spread of the pixels: negligible errors
-_CORRELATED = 0.1  # correlation of neighbouring residuals; noise of 600 points gives 0.04
 _DISTANT = 10.0  # times the distance of the farthest point
 _ORDER = ("alpha_u", "theta", "alpha_v", "u0", "v0")  # of A's entries
 
@@ -208,7 +207,7 @@ class _AtMinimum:
                 *noise_shape(self.points, residuals, alike),
             ),
             groups=None if stated else self._groups(),
-            missing=self._missing(alike),
+            missing=self._missing(),
         )
 
     def _residuals(self) -> Array:
@@ -216,9 +215,11 @@ class _AtMinimum:
         predicted, _ = predicted_pixels(self.given, self.points.world, self.points.view_index)
         return predicted - self.points.pixels
 
+    def _is_exact(self) -> bool:
+        return self.calibration.rmse_px < _EXACT * pixel_spread(self.points)
+
     def _groups(self) -> ViewGroups | None:
-        exact = self.calibration.rmse_px < _EXACT * pixel_spread(self.points)
-        if exact or not (self.free_poses and self.free[:5].any()):
+        if self._is_exact() or not (self.free_poses and self.free[:5].any()):
             return None
         return view_groups(self.views, self.state, self.normal, self.free, self.networks)
 
@@ -279,12 +280,13 @@ class _AtMinimum:
         times = float(self.repeated.variance.mean())
         return board_shape(self.views, self.state, self.free, self.cost / self.spare, self.spare, times, std)
 
-    def _missing(self, alike: float) -> MissingCoefficients | None:
-        chosen = self.calibration.lens_choice or self.calibration.straight_lines is not None
-        if chosen or alike < _CORRELATED or not self.free[0]:
+    def _missing(self) -> MissingCoefficients | None:
+        selected = self.calibration.lens_choice or self.calibration.straight_lines is not None
+        if selected or self._is_exact() or not self.free[0]:
             return None
-        std = float(np.sqrt(self.covariance[0, 0]))
-        return missing_coefficients(self.views, self.state, self.normal, self.free, self.free_poses, std)
+        std = np.zeros(len(self.free))
+        std[self.free] = np.sqrt(np.diagonal(self.covariance))
+        return missing_coefficients(self.views, self.state, self.normal, self.free, self.free_poses, std[:5])
 
     def _disagreement(self) -> float:
         if not self.free.any() or self.calibration.straight_lines is not None:

@@ -67,12 +67,13 @@ def common_errors(evidence: Evidence, unit: str, wide: bool) -> Iterator[Finding
 
 
 def _too_simple(missing: MissingCoefficients) -> Finding:
-    times, off = 1.0 / np.sqrt(1.0 - missing.explained), missing.focal_length
+    times, longer = 1.0 / np.sqrt(1.0 - missing.explained), missing.focal_length
     return (
-        max(_TOO_SIMPLE.grade(times), _worse_by(off, missing.sigmas)),
-        f"the distortion model is too simple: more coefficients make the error {times:.2g} times smaller, "
-        f"and the focal length {100 * abs(off):.2g} % {'shorter' if off > 0 else 'longer'}",
-        "give a --distortion with more coefficients, or --distortion auto",
+        max(_TOO_SIMPLE.grade(times), _worse_by(longer, missing.sigmas)),
+        f"the distortion model is too simple: {missing.model} lowers the error by "
+        f"{100 * (1 - 1 / times):.2g} %, makes the focal length {100 * abs(longer):.2g} % "
+        f"{'longer' if longer > 0 else 'shorter'}, and moves the image centre by {missing.centre:.2g} px",
+        "give --distortion auto, or a model with more coefficients",
     )
 
 
@@ -168,7 +169,7 @@ def _bent(board: BoardShape, unit: str) -> Finding:
 
 
 def _worse_by(off: float, sigmas: float) -> int:
-    """Grade of a share by which the focal length is off."""
+    """Grade of a relative error of the focal length, and of an error in standard deviations."""
     return max(int(sigmas > _SIGMAS), int(abs(off) > _OFF) + int(abs(off) > _MUCH_OFF))
 
 

@@ -1,7 +1,6 @@
 """Test whether the distortion model is too simple: whether more coefficients explain the residuals.
 
-The camera is adjusted again with OpenCV's five coefficients, from the estimated parameters. If it then leaves
-hardly more than noise, the missing coefficients are the cause of the error.
+The camera is adjusted again with richer polynomial models, from the estimated parameters. The Bayesian information criterion selects among them.
 """
 
 from __future__ import annotations
@@ -12,21 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurocal_cli.bundle_adjustment.adjust import adjust
-from neurocal_cli.bundle_adjustment.reprojection import CameraState
+from neurocal_cli.bundle_adjustment.cross_validation import reduced
+from neurocal_cli.bundle_adjustment.reprojection import CameraState, normal_blocks
 from neurocal_cli.bundle_adjustment.residual_correlation import (
     correlation,
     effective_number,
     point_residuals,
 )
 from neurocal_cli.bundle_adjustment.views import Views
-from neurocal_cli.camera.distortion import coefficient_names
+from neurocal_cli.camera.distortion import POLYNOMIAL_MODELS
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
+from neurocal_cli.least_squares.normal_equations import unit_diagonal
 
-_RICHEST = "plumb_bob"  # has the coefficients of all simpler models
 _STEPS = 60
 _ENOUGH = 60  # views: more are not needed
 _DECISIVE = 10.0  # of the Bayesian information criterion, as among models by cross-validation: odds of 150
+_ROUNDING = 1e-12  # of a normal matrix with unit diagonal
+_CENTRE = slice(3, 5)  # of A's entries
 
 
 @frozen_dataclass
@@ -35,21 +37,27 @@ class MissingCoefficients:
 
     Attributes
     ----------
+    model : str
+        The model that has them.
     explained : float
         Share of the squared error that they explain.
     focal_length : float
-        Relative change of the focal length without them.
+        Relative change of the focal length with them.
+    centre : float [px]
+        Shift of the image centre with them.
     sigmas : float
-        The same in standard deviations, without sign.
+        Largest change of an intrinsic parameter, in its standard deviations.
     """
 
+    model: str
     explained: float
     focal_length: float
+    centre: float
     sigmas: float
 
 
 def missing_coefficients(
-    views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], free_poses: bool, std: float
+    views: Views, state: CameraState, normal: Array, free: NDArray[np.bool_], free_poses: bool, std: Array
 ) -> MissingCoefficients | None:
     """Test whether the distortion model lacks coefficients; None if it lacks none, or not significantly.
 
@@ -63,22 +71,54 @@ def missing_coefficients(
     free : (5 + K,) bool array
         Which of A's entries and of the distortion coefficients are estimated.
     free_poses : bool
-    std : float
-        Standard deviation of A11, normalised.
+    std : (5,) array
+        Standard deviations of A's entries, normalised; 0 if given.
     """
-    if not set(coefficient_names(state.model)) < set(coefficient_names(_RICHEST)):
+    if state.model not in POLYNOMIAL_MODELS[:-1]:
         return None
     if views.n_views > _ENOUGH:
         some = np.linspace(0, views.n_views - 1, _ENOUGH).astype(np.intp)
         views, state = views.subset(some), replace(state, R=state.R[some], t=state.t[some])
         normal = normal[some]
-    start = state.with_model(_RICHEST)
-    all_free = np.concatenate([free[:5], np.ones(len(start.k), dtype=bool)])
-    richer = adjust(views.batches, start, all_free, free_poses, _STEPS)
-    left = float(richer.cost.sum()) / max(float(normal[:, -1, -1].sum()), 1e-300)
-    n = effective_number(views.n_equations, correlation(views, point_residuals(views, richer.state)))
-    more = len(start.k) - len(state.k)
-    if not (left > 0 and -n * np.log(left) > more * np.log(n) + _DECISIVE):
+    before, n_coefficients = float(normal[:, -1, -1].sum()), len(state.k)
+    richer = [state.with_model(m) for m in POLYNOMIAL_MODELS[POLYNOMIAL_MODELS.index(state.model) + 1 :]]
+    if not before > 0 or not _promises_enough(views, richer[-1], free, free_poses, before):
         return None
-    f, better = state.entries[0, 0], richer.state.entries[0, 0]
-    return MissingCoefficients(1.0 - left, float((f - better) / better), float(abs(f - better) / std))
+    best, lowest = None, -_DECISIVE
+    for start in richer:
+        found = adjust(views.batches, start, _all_free(free, start), free_poses, _STEPS)
+        left = float(found.cost.sum()) / before
+        n = effective_number(views.n_equations, correlation(views, point_residuals(views, found.state)))
+        criterion = n * np.log(max(left, _ROUNDING)) + (len(start.k) - n_coefficients) * np.log(n)
+        if criterion < lowest:
+            best, lowest = (found.state, left), criterion
+    if best is None:
+        return None
+    better, left = best
+    change = better.entries[0] - state.entries[0]
+    told = std > 0
+    return MissingCoefficients(
+        better.model,
+        1.0 - max(left, _ROUNDING),
+        float(change[0] / state.entries[0, 0]),
+        float(np.linalg.norm(change[_CENTRE])) * views.pixel_scale,
+        float((np.abs(change[told]) / std[told]).max(initial=0.0)),
+    )
+
+
+def _all_free(free: NDArray[np.bool_], state: CameraState) -> NDArray[np.bool_]:
+    return np.concatenate([free[:5], np.ones(len(state.k), dtype=bool)])
+
+
+def _promises_enough(
+    views: Views, start: CameraState, free: NDArray[np.bool_], free_poses: bool, before: float
+) -> bool:
+    """Whether one Gauss-Newton step with all coefficients lowers the error significantly."""
+    all_free = _all_free(free, start)
+    q = reduced(normal_blocks(views.batches, start)[0], all_free, free_poses)
+    S, scale = unit_diagonal(q.S.sum(axis=0))
+    g = scale * q.g.sum(axis=0)
+    if not np.isfinite(S).all():
+        return False
+    gain = float(g @ np.linalg.lstsq(S, g, rcond=_ROUNDING)[0])
+    return gain * views.n_equations > _DECISIVE * before
