@@ -1,6 +1,7 @@
 """Test whether the distortion model is too simple: whether more coefficients explain the residuals.
 
-The camera is adjusted again with richer polynomial models, from the estimated parameters. The Bayesian information criterion selects among them.
+The camera is adjusted again with richer polynomial models, from the estimated parameters. The Bayesian
+information criterion selects among them.
 """
 
 from __future__ import annotations
