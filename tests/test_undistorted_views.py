@@ -144,7 +144,7 @@ def test_points_behind_a_plane_are_named_and_a_cylinder_keeps_them() -> None:
     pixels = cam.project(np.array([[0.1, 0.2, 1], [1, 0.1, -0.03]]))[0]
     points = Correspondences(np.zeros((2, 3)), pixels, image_size=SIZE, source="p.csv", lines=[2, 3])
     with pytest.raises(
-        InputError, match=r"^p.csv:3: .* 90 degrees from the axis or more, which no plane shows"
+        InputError, match=r"^p.csv:3: .* 90 degrees or more from the axis, which no plane shows"
     ):
         undistort_points(points, cam)
     assert shown(points, cam, undistorted_view(cam, SIZE)).tolist() == [True, False]
