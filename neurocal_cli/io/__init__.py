@@ -1,1 +1,1 @@
-"""Files in and out: the only part of the package that knows about text formats and paths."""
+"""Read and write files: the only part of the package that knows text formats and paths."""

@@ -1,8 +1,8 @@
-"""A calibration or a rig in the form that a file's name asks for: YAML, JSON, or OpenCV's XML.
+"""Write a calibration or a rig as YAML, JSON or OpenCV's XML, depending on the file's extension.
 
-JSON holds the same tree as YAML. XML is `cv2.FileStorage`'s, which has no place for more than the cameras and
-the poses of views. A lean file holds the camera and the verdict alone: no points, no poses, no record of the
-network.
+JSON contains the same tree as YAML. XML is the format of `cv2.FileStorage`, with only the cameras and the
+poses of views. A lean file contains only the camera and the verdict, without points, poses and the record of
+the network.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def write_result(
     ----------
     result : Calibration or Rig
     path : str or Path
-        ``.json`` and ``.xml`` are what they say; all others are YAML.
+        ``.json`` gives JSON, ``.xml`` gives XML; all other extensions give YAML.
     lean : bool
         Whether points, poses and the record of the network are left out.
     alpha : float, optional
@@ -40,17 +40,17 @@ def write_result(
     Returns
     -------
     losses : tuple of str
-        What the file cannot hold as it was: an XML file has no skew.
+        What the file cannot represent exactly, such as skew in XML.
 
     Raises
     ------
     InputError
-        An XML file of a camera that OpenCV has no distortion model for.
+        An XML file is wanted, but OpenCV does not have the camera's distortion model.
     """
     if lean:
         result = lean_calibration(result) if isinstance(result, Calibration) else lean_rig(result)
     ending = os.path.splitext(str(path))[1].lower()
-    # Formats that nobody asked for are not loaded.
+    # Modules of other formats are imported only if they are needed.
     if ending == ".xml":
         from neurocal_cli.io.exchange.dictionary import OPENCV
         from neurocal_cli.io.exchange.fitting_in import fitted_in
@@ -59,7 +59,7 @@ def write_result(
         fitted = fitted_in(replace(camera_set(result), unit=result.unit), OPENCV, force=False)
         write_whole(path, OPENCV.text(fitted.cameras, ending)[""])
         return (*fitted.losses, *fitted.remarks)
-    by_rows = ending == ".json"  # which loads at once however long it is
+    by_rows = ending == ".json"  # JSON loads fast at any length
     if not isinstance(result, Calibration):
         from neurocal_cli.io.rig_yaml import format_rig
 
@@ -71,7 +71,7 @@ def write_result(
 
 
 def lean_calibration(calibration: Calibration) -> Calibration:
-    """The camera with its accuracy and its verdict, without what it was found from."""
+    """The camera with its uncertainty and verdict, without the data behind it."""
     return replace(
         calibration,
         points=Correspondences.none(calibration.image_size, calibration.unit),
@@ -84,7 +84,7 @@ def lean_calibration(calibration: Calibration) -> Calibration:
 
 
 def lean_rig(rig: Rig) -> Rig:
-    """Both cameras and how they stand to each other, without what they were found from."""
+    """Both cameras and their relative pose, without the data behind them."""
     return replace(
         rig,
         left=lean_calibration(rig.left),
@@ -96,7 +96,7 @@ def lean_rig(rig: Rig) -> Rig:
 
 
 def _as_json(text: str) -> str:
-    """The tree of a YAML text as JSON, one entry of the upper levels a line."""
+    """Convert YAML text to JSON, with one entry of the upper levels per line."""
     from neurocal_cli.io.yaml_tree import parse_yaml
 
     return _lines(parse_yaml(text, "the calibration"), 3) + "\n"

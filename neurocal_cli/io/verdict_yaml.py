@@ -10,7 +10,7 @@ from neurocal_cli.io.yaml_text import mapping, number, quoted, text
 
 
 def verdict_lines(verdict: Verdict | None) -> Iterator[str]:
-    """Lines of the block ``verdict``; none where there is no verdict."""
+    """Lines of the block ``verdict``; none if there is no verdict."""
     if verdict is None:
         return
     yield "verdict:"
@@ -26,7 +26,7 @@ def read_verdict(field: Field) -> Verdict:
     Raises
     ------
     FormatError
-        A key that is missing or wrong.
+        A key is missing or wrong.
     """
     return Verdict(
         field["word"].text(),

@@ -1,8 +1,8 @@
 """COLMAP's text models: ``cameras.txt``, and in its folder ``images.txt``, ``rigs.txt`` and ``frames.txt``.
 
-The centre of the top-left pixel is (1/2, 1/2), so that principal points are larger by half a pixel than ours.
-An image's pose takes the world into its camera; a rig's sensor has a pose from the rig's frame, which is that
-of its reference camera.
+The centre of the top-left pixel is (1/2, 1/2), so principal points are larger than ours by half a pixel. The
+pose of an image maps the world to its camera. The pose of a rig's sensor maps the rig's frame, which is that
+of its reference camera, to the sensor.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from neurocal_cli.io.exchange.rotations import after, from_quaternion, to_quater
 from neurocal_cli.io.files import read_text, value_failures
 from neurocal_cli.io.yaml_text import number
 
-_HALF = 0.5  # of a pixel, from our origin to COLMAP's
+_HALF = 0.5  # px; COLMAP's pixel coordinates minus ours
 
-# Our model, how many focal lengths, and for each of our coefficients the place of COLMAP's or None for 0.
+# Our model, number of focal lengths, and for each of our coefficients the index of COLMAP's, or None for 0.
 _MODELS: dict[str, tuple[str, int, tuple[int | None, ...]]] = {
     "SIMPLE_PINHOLE": ("none", 1, ()),
     "PINHOLE": ("none", 2, ()),
@@ -35,7 +35,7 @@ _MODELS: dict[str, tuple[str, int, tuple[int | None, ...]]] = {
     "OPENCV_FISHEYE": ("fisheye", 2, (0, 1, 2, 3)),
     "SIMPLE_RADIAL_FISHEYE": ("fisheye", 1, (0, None, None, None)),
     "RADIAL_FISHEYE": ("fisheye", 1, (0, 1, None, None)),
-    # Of versions from 4 on.
+    # Since version 4.
     "SIMPLE_FISHEYE": ("fisheye", 1, (None, None, None, None)),
     "FISHEYE": ("fisheye", 2, (None, None, None, None)),
     "EUCM": ("eucm", 2, (0, 1)),
@@ -50,17 +50,17 @@ _NAMES = {
 
 
 def is_folder(name: str) -> bool:
-    """Whether this is a folder, which only COLMAP's models are."""
+    """Whether this is a folder, which only COLMAP uses for its models."""
     return name != "-" and os.path.isdir(name)
 
 
 def read_folder(folder: str) -> CameraSet:
-    """Read the cameras of a model, with how they stand to each other and the poses of the images.
+    """Read the cameras of a model with their relative poses and the poses of the images.
 
     Raises
     ------
     FormatError
-        No text model.
+        The folder is not a text model.
     """
     path = os.path.join(folder, "cameras.txt")
     if not os.path.exists(path):
@@ -83,7 +83,7 @@ def parse(text: str, source: str) -> CameraSet:
     Raises
     ------
     FormatError, InputError
-        A line that is no camera, a model that is not known, several cameras.
+        A line is not a camera, its model is unknown, or there are several cameras.
     """
     return CameraSet(tuple(_cameras(text, source).values()), program="COLMAP")
 
@@ -121,7 +121,7 @@ def _camera(words: list[str], source: str, line: int) -> Camera:
 
 
 def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
-    """Poses of the further cameras from the first one."""
+    """Poses of the further cameras relative to the first one."""
     path = os.path.join(folder, "rigs.txt")
     if len(ids) == 1 or not os.path.exists(path):
         return ()
@@ -153,7 +153,7 @@ def _poses(folder: str, camera: int) -> dict[str, Pose]:
     if not os.path.exists(path):
         return {}
     text, source = read_text(path)
-    # The two lines of an image: the pose, and its points, which may be none at all.
+    # Each image has two lines: its pose, and its points, which may be empty.
     rows = [(k, line) for k, line in enumerate(text.split("\n"), start=1) if not line.startswith("#")]
     poses = {}
     for k, line in rows[::2]:
@@ -194,7 +194,7 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
         for camera, mounted in enumerate(rig, start=1):
             number_of_image += 1
             data.append(f"CAMERA {camera} {number_of_image}")
-            # As in COLMAP's own rigs, each camera's images are in a folder of its name.
+            # As in COLMAP's rigs, the images of each camera are in a folder with its name.
             name = f"camera{camera}/{_word(view)}" if len(rig) > 1 else _word(view)
             files["images.txt"] += [f"{number_of_image} {_seven(after(mounted, pose))} {camera} {name}", ""]
         files["frames.txt"].append(f"{frame} 1 {_seven(pose)} {len(rig)} {' '.join(data)}")
@@ -202,7 +202,7 @@ def _text(cameras: CameraSet, ending: str) -> dict[str, str | bytes]:
 
 
 def _word(name: str) -> str:
-    """A name without blanks, where COLMAP's reader ends it."""
+    """Replace blanks in a name, because COLMAP's reader ends it there."""
     return "_".join(name.split()) or "_"
 
 

@@ -1,4 +1,4 @@
-"""What of a camera set a format can hold: exactly, nearly or not at all, with the loss in pixels."""
+"""Adapt cameras to a file format, exactly or approximately, with the loss in pixels."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 from neurocal_cli.io.exchange.camera_set import CameraSet, Format
 
-_NO_SKEW = 1e-3  # a loss below this [px] is nobody's concern
-_NO_LOSS = 5e-3  # nor is this share of the image
-_AS_NEAR, _NEARER = 1.1, 0.01  # times the loss of the nearest model, and px
+_NO_SKEW = 1e-3  # px; a smaller loss is not reported
+_NO_LOSS = 5e-3  # share of the image; a smaller lost part is not reported
+_AS_NEAR, _NEARER = 1.1, 0.01  # a simpler model may lose this many times more than the best, or px more
 
-_Fitting = tuple[Camera, NearestCamera | None, str]  # None, "": nothing that matters is lost
+_Fitting = tuple[Camera, NearestCamera | None, str]  # None and "" if there is no loss to report
 
 
 @frozen_dataclass(eq=False)
 class Fitted:
-    """Cameras as a format can hold them.
+    """Cameras adapted to a format.
 
     Attributes
     ----------
     cameras : CameraSet
     losses : tuple of str
-        What is not as it was, with the pixels that it makes, for a warning.
+        Changes of the cameras and the resulting shifts of pixels, for warnings.
     remarks : tuple of str
-        What is not in the file, for a note.
+        Data that are not in the file, for notes.
     moved : tuple of Distance or None
-        What the losses say, as numbers: how far the pixels of each camera are moved.
+        Shifts of the pixels of each camera, as numbers.
     """
 
     cameras: CameraSet
@@ -42,25 +42,25 @@ class Fitted:
 
 
 def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None = None) -> Fitted:
-    """Make cameras fit a format, of one model if it is given.
+    """Adapt cameras to a format, and to a distortion model if one is given.
 
-    Skew that the format's programs ignore is taken out always: written, it would be ignored silently.
-    The nearest camera without skew moves pixels by less than the ignored skew does.
+    If the format's programs ignore skew, it is always removed; otherwise it would be ignored silently. The
+    nearest camera without skew moves pixels less than ignoring the skew.
 
     Parameters
     ----------
     cameras : CameraSet
     target : Format
     force : bool
-        Whether the nearest camera of another distortion model will do.
+        Whether the nearest camera of another distortion model is accepted.
     model : str, optional
-        One of `MODELS`: the cameras become the nearest ones of this distortion model.
+        One of `MODELS`: the cameras are replaced by the nearest ones with this distortion model.
 
     Raises
     ------
     InputError
-        What the format cannot hold: a distortion model unless forced, too many cameras, an unknown unit or
-        image size.
+        The format cannot represent the distortion model (unless forced), the number of cameras, or an unknown
+        unit or image size.
     """
     if len(cameras.cameras) > target.most_cameras:
         raise InputError(
@@ -100,7 +100,7 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None
 
 
 def _pixels_of(cameras: CameraSet) -> list[Array | None]:
-    """Where each camera saw the points that it was calibrated with."""
+    """Pixels of the points with which each camera was calibrated; None if unknown."""
     origin = cameras.origin
     if origin is None:
         return [None] * len(cameras.cameras)
@@ -135,7 +135,7 @@ def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -
         )
     nearest = [nearest_camera(camera, m, target.skew, points) for m in target.models]
     best = min(nearest, key=lambda n: (n.lost > _NO_LOSS, n.over_image.max_px))
-    # More coefficients are not worth having for next to nothing.
+    # Prefer a simpler model if it is nearly as good.
     most = max(_AS_NEAR * best.over_image.max_px, best.over_image.max_px + _NEARER)
     near = next(
         n for n in nearest if n.over_image.max_px <= most and (n.lost <= _NO_LOSS or best.lost > _NO_LOSS)
@@ -150,7 +150,7 @@ def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -
 
 
 def _as_model(camera: Camera, model: str) -> Camera:
-    """The camera under the name of a model that holds its distortion; itself if it has that name."""
+    """Express the camera in a model that includes its distortion model; unchanged if that is the same."""
     distortion = with_model(camera.distortion, model)
     if distortion is camera.distortion or distortion is None:
         return camera
@@ -158,7 +158,7 @@ def _as_model(camera: Camera, model: str) -> Camera:
 
 
 def _straightened(camera: Camera) -> Camera:
-    """A camera whose angle of the axes is pi/2 to the last bit."""
+    """Set the angle of the axes to exactly pi/2."""
     a, _, b, u0, v0 = camera.entries
     return replace(camera, intrinsics=Intrinsics(a, b, u0, v0))
 
