@@ -1,6 +1,5 @@
-"""The methods that the paper compares its network with, and OpenCV: from points to a camera, each by itself.
+"""The methods that the paper compares with its network, and OpenCV's `calibrateCamera`.
 
-Each is a function of a `Problem` that returns a `Found`; `calibrate_by` makes a `Calibration` of it, as the
-network's is made. None of them shares its way to the answer with the network, so that each is also an
-independent check of it.
+Each is a function of a `Problem` that returns a `Found`; `calibrate_by` converts it to a `Calibration` as for
+the network. None of them shares its solution method with the network, so each is also an independent check.
 """

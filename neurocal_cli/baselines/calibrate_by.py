@@ -1,4 +1,4 @@
-"""A calibration by one of the baselines: the same checks, result and refusals as the network's."""
+"""Calibrate by one of the baselines, with the same checks, result and refusals as for the network."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _ASSUMING: dict[str, Callable[[Problem], Problem]] = {"tsai": with_known_centre,
 
 
 def as_posed(method: str, problem: Problem) -> Problem:
-    """The problem that a method solves: some take more for given than the user does."""
+    """The problem that a method solves; some methods take more parameters as given than the user."""
     return _ASSUMING[method](problem) if method in _ASSUMING else problem
 
 
@@ -53,15 +53,15 @@ def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibra
     Returns
     -------
     Calibration
-        Its standard deviations are of the normal matrix at the answer. Where the method does not minimise
-        the reprojection error, they are what least squares would have, and a warning says so.
+        Its standard deviations come from the normal matrix at the solution. If the method does not minimise
+        the reprojection error, they are those of a least-squares fit, and a warning says so.
 
     Raises
     ------
     UsageError
-        What the method cannot do.
+        The method cannot solve this kind of problem.
     InputError, DegenerateGeometryError
-        Points that cannot give an answer, with the reason.
+        The points do not determine a solution; the message gives the reason.
     """
     found = BASELINES[method](as_posed(method, _unweighted(problem)))
     solution = _solution(found)
@@ -86,9 +86,9 @@ def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibra
 
 
 def _unweighted(problem: Problem) -> Problem:
-    """Without the covariances that `detect` measures: (3) has none, and they may not hold.
+    """Remove the covariances measured by `detect`, because (3) has none and they may be wrong.
 
-    A sigma that somebody states counts.
+    A sigma stated by the user is kept.
     """
     covariance, views = problem.points.covariance, problem.views
     if covariance is None or not measured(covariance):
@@ -98,7 +98,7 @@ def _unweighted(problem: Problem) -> Problem:
 
 
 def _solution(found: Found) -> Solution:
-    """The answer as a solution of the problem, with the normal matrices of points as they were measured."""
+    """Convert the result to a solution of the problem, with normal matrices for the measured covariances."""
     problem, state = found.problem, found.state
     residuals = point_residuals(problem.views, state) * problem.views.pixel_scale
     order = problem.views.order

@@ -1,4 +1,4 @@
-"""SciPy's least squares, as the baselines use it: none of this package's own descent."""
+"""SciPy's least squares for the baselines, independent of this package's own descent."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from neurocal_cli.frozen_dataclass import frozen_dataclass
 from neurocal_cli.geometry import Array
 
-_DENSE = 150  # unknowns up to which MINPACK is quicker than a sparse trust region
+_DENSE = 150  # greatest number of unknowns for which MINPACK is faster than a sparse trust region
 _TOLERANCE = 1e-12
 _MOST = 200  # steps
-_STEP = 1.5e-8  # of differences
+_STEP = 1.5e-8  # relative step of forward differences
 
 
 @frozen_dataclass(eq=False)
@@ -44,12 +44,13 @@ def least_squares(
     Parameters
     ----------
     residuals : callable
-        From unknowns (n,) to residuals (m,).
+        Maps unknowns (n,) to residuals (m,).
     start : (n,) array
     view : (m,) int array, optional
-        View of each residual. None: every unknown moves every residual.
+        View of each residual. Without it, every residual may depend on every unknown.
     shared : int
-        With `view`: the first unknowns, which all views share; the others are each view's own, in order.
+        With `view`: number of the first unknowns, which all views share; the others belong to single views,
+        in order.
     """
     from scipy.optimize import least_squares as minimise
 
@@ -79,7 +80,7 @@ def least_squares(
 def _differences(
     residuals: Callable[[Array], Array], x: Array, view: NDArray[np.intp] | None, shared: int, sparse: bool
 ) -> Any:
-    """Derivatives (m, n) by differences; the unknowns of different views are varied at once."""
+    """Derivatives (m, n) by forward differences; the unknowns of different views are varied together."""
     at = residuals(x)
     if view is None:
         view, shared = np.zeros(len(at), dtype=np.intp), len(x)

@@ -1,8 +1,8 @@
-"""OpenCV's `calibrateCamera`, for comparison: the tool that most people use.
+"""OpenCV's `calibrateCamera`, the most widely used tool, for comparison.
 
-It has no skew, and a distortion model of its own choice; here the one that is asked for. Flat boards start
-from its closed form. For other targets it wants a first camera: it gets the one that tutorials give, with the
-centre in the middle of the image and a focal length of the image's width.
+It has no skew; its distortion model is set to the requested one. For flat boards it computes initial values
+in closed form. For other targets it needs an initial camera, which is that of tutorials: with the centre in
+the middle of the image and a focal length equal to the image's width.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _COEFFICIENTS = 8  # k1 k2 p1 p2 k3 k4 k5 k6
 
 
 def without_skew(problem: Problem) -> Problem:
-    """The problem as OpenCV has it: with right angles given."""
+    """The problem that OpenCV solves: with right angles given."""
     free = problem.free.copy()
     free[1] = False
     return replace(problem, free=free, fixed=problem.fixed | {"theta"})
@@ -42,9 +42,9 @@ def opencv(problem: Problem) -> Found:
     Raises
     ------
     UsageError
-        Types 3 and 4; a distortion model that it does not have.
+        The problem is of type 3 or 4, or OpenCV does not have the distortion model.
     DegenerateGeometryError
-        OpenCV refuses, with its reason, or ends at numbers that are no camera.
+        OpenCV refuses the points, or its result is not a valid camera.
     """
     import cv2
 
@@ -85,7 +85,7 @@ def opencv(problem: Problem) -> Found:
 
 
 def _flags(cv2: object, model: str) -> int:
-    """Flags that leave the coefficients of a model free, and no others."""
+    """Flags that free only the coefficients of a model."""
     free = {
         "none": 0, "k1": 1, "k1k2": 2, "k1k2p1p2": 2, "plumb_bob": 3, "rational": 6,
         "thin_prism": 6, "tilted": 6,

@@ -1,1 +1,1 @@
-"""The network and the methods beside it, on the same points."""
+"""Comparison of the network with other methods on the same points."""

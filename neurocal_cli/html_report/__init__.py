@@ -1,1 +1,1 @@
-"""Reports as one HTML page each, which needs no network and prints well."""
+"""Reports as single HTML pages, which need no internet access and print well."""

@@ -1,4 +1,4 @@
-"""How a result came about, which its page tells to those who want to repeat it."""
+"""Origin of a result, shown on its page so that it can be reproduced."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ class Origin:
     Attributes
     ----------
     files : dict of str by name
-        SHA-256 of the files that it was made from; the result's own file where the run is not known.
+        SHA-256 of the input files; of the result's own file if the run is unknown.
     command : str, optional
-        What was typed.
+        The command line.
     versions : dict of str by name
-        Of the programs that computed it.
+        Of the programs that computed the result.
     """
 
     files: Mapping[str, str]
@@ -31,11 +31,11 @@ class Origin:
 
 
 def versions() -> dict[str, str]:
-    """The versions of what computes now."""
+    """Versions of the running programs."""
     found = {"neurocal": __version__, "Python": platform.python_version()}
     for name in ("numpy", "scipy"):
         try:
             found[name] = version(name)
-        except PackageNotFoundError:  # installed by other means than a package
+        except PackageNotFoundError:  # not installed as a package
             continue
     return found

@@ -13,7 +13,7 @@ _SIDES = ("right", "lower right", "lower", "lower left", "left", "upper left", "
 
 
 def advice_lines(advice: Advice) -> list[str]:
-    """A line for each view, with what it brings."""
+    """A line for each view, with the uncertainty after it."""
     lines = [
         "largest std of a projected pixel, for points at half to ten times the distance of the views: "
         f"{_px(advice.before)}"
@@ -24,7 +24,7 @@ def advice_lines(advice: Advice) -> list[str]:
 
 
 def advice_json(advice: Advice) -> dict[str, Any]:
-    """The same as values that JSON can hold."""
+    """The advice as values for JSON."""
     return {
         "worst_px": number_or_none(advice.before),
         "views": [
@@ -45,7 +45,7 @@ def advice_json(advice: Advice) -> dict[str, Any]:
 
 
 def _described(view: Candidate) -> str:
-    """Where, how large, tilted and turned; the places of the candidates are five in each direction."""
+    """Describe position, width, tilt and roll of a view; there are five positions in each direction."""
     across, down = (min(int(5 * share), 4) for share in view.position)
     if across == down == 2:
         place = "in the middle"
