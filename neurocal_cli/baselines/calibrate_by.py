@@ -34,7 +34,7 @@ BASELINES: dict[str, Callable[[Problem], Found]] = {
 _ASSUMING: dict[str, Callable[[Problem], Problem]] = {"tsai": with_known_centre, "opencv": without_skew}
 
 
-def as_posed(method: str, problem: Problem) -> Problem:
+def problem_for_method(method: str, problem: Problem) -> Problem:
     """The problem that a method solves; some methods take more parameters as given than the user."""
     return _ASSUMING[method](problem) if method in _ASSUMING else problem
 
@@ -63,7 +63,7 @@ def calibrate_by(method: str, problem: Problem, name: str = "camera") -> Calibra
     InputError, DegenerateGeometryError
         The points do not determine a solution; the message gives the reason.
     """
-    found = BASELINES[method](as_posed(method, _unweighted(problem)))
+    found = BASELINES[method](problem_for_method(method, _unweighted(problem)))
     solution = _solution(found)
     calibration = calibration_of(solution, Rejected(), trainer="none", method=method, seed=0, name=name)
     warnings = (*found.remarks, *calibration.warnings)

@@ -18,7 +18,7 @@ _STEP = 1.5e-8  # relative step of forward differences
 
 
 @frozen_dataclass(eq=False)
-class Least:
+class Minimum:
     """A minimum.
 
     Attributes
@@ -38,7 +38,7 @@ def least_squares(
     start: Array,
     view: NDArray[np.intp] | None = None,
     shared: int = 0,
-) -> Least:
+) -> Minimum:
     """Minimise a sum of squares by Levenberg-Marquardt or, for many unknowns of views, by a trust region.
 
     Parameters
@@ -74,7 +74,7 @@ def least_squares(
             max_nfev=_MOST,
             **options,
         )
-    return Least(found.x, int(found.njev or found.nfev), bool(found.status > 0))
+    return Minimum(found.x, int(found.njev or found.nfev), bool(found.status > 0))
 
 
 def _differences(

@@ -5,7 +5,7 @@ from c. So (x, y) = m - c has the direction of (s X_c, Y_c), s = alpha_u / alpha
 
     x (r_2.M + t_y) = y s (r_1.M + t_x)
 
-1. R, t_x and t_y of each view from these equations, linear in s r_1, s t_x and r_2 over t_y. This fails if t_y
+1. R, t_x and t_y of each view from these equations, linear in s r_1, s t_x and r_2 over t_y. They fail if t_y
    is 0. Tsai requires a world origin that is seen well above or below the centre; here the origin is
    moved to the target point that is farthest above or below. Solid views determine s. A flat view gives two
    columns of R; the rest follows from unit length and perpendicularity of the rows, with the sign for which
@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from neurocal_cli.baselines.constrained_least_squares import smallest
 from neurocal_cli.baselines.found import Found, as_seen
-from neurocal_cli.baselines.least_squares import Least, least_squares
+from neurocal_cli.baselines.least_squares import Minimum, least_squares
 from neurocal_cli.baselines.linear import whole_groups
 from neurocal_cli.baselines.nonlinear import view_of_residual, whitened_residuals
 from neurocal_cli.bundle_adjustment.observability import check_points
@@ -245,7 +245,7 @@ def _poses_of_given_camera(problem: Problem) -> CameraState:
     return CameraState(entries[None], R, t)
 
 
-def _camera_and_poses(problem: Problem) -> tuple[CameraState, Least]:
+def _camera_and_poses(problem: Problem) -> tuple[CameraState, Minimum]:
     """Types 1 and 2: both stages."""
     views, centre = problem.views, problem.normalised_entries[3:]
     stages = _Stages(problem, *(views.pixels - centre).T)

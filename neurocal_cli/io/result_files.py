@@ -52,13 +52,13 @@ def write_result(
     ending = os.path.splitext(str(path))[1].lower()
     # Modules of other formats are imported only if they are needed.
     if ending == ".xml":
+        from neurocal_cli.io.exchange.adapt_cameras import adapt_cameras
         from neurocal_cli.io.exchange.dictionary import OPENCV
-        from neurocal_cli.io.exchange.fitting_in import fitted_in
         from neurocal_cli.io.exchange.neurocal import camera_set
 
-        fitted = fitted_in(replace(camera_set(result), unit=result.unit), OPENCV, force=False)
-        write_whole(path, OPENCV.text(fitted.cameras, ending)[""])
-        return (*fitted.losses, *fitted.remarks)
+        adapted = adapt_cameras(replace(camera_set(result), unit=result.unit), OPENCV, force=False)
+        write_whole(path, OPENCV.text(adapted.cameras, ending)[""])
+        return (*adapted.losses, *adapted.remarks)
     by_rows = ending == ".json"  # JSON loads fast at any length
     if not isinstance(result, Calibration):
         from neurocal_cli.io.rig_yaml import format_rig

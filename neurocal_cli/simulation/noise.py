@@ -12,7 +12,7 @@ from dataclasses import field
 import numpy as np
 from numpy.typing import NDArray
 
-from neurocal_cli.baselines.calibrate_by import as_posed
+from neurocal_cli.baselines.calibrate_by import problem_for_method
 from neurocal_cli.bundle_adjustment.covariance import covariance
 from neurocal_cli.bundle_adjustment.parameter_uncertainty import parameter_covariance, pose_std
 from neurocal_cli.bundle_adjustment.problem import problem_for
@@ -158,7 +158,7 @@ def cramer_rao(scene: SimulatedScene, method: str) -> Array:
         the method; nan if the points do not determine the others.
     """
     camera, points = scene.camera, scene.points()
-    problem = as_posed(method, problem_for(points, 1, distortion=Distortion(camera.model)))
+    problem = problem_for_method(method, problem_for(points, 1, distortion=Distortion(camera.model)))
     views = problem.views
     R = np.stack([scene.poses[name].R for name in views.names])
     t = np.stack([scene.poses[name].t for name in views.names])

@@ -219,7 +219,7 @@ class BatchFit:
         return np.count_nonzero(self.pixels.root, axis=1)
 
     @property
-    def roughness(self) -> Array:
+    def chi2_per_pixel(self) -> Array:
         """(E,) chi2 per pixel."""
         return self.chi2 / np.maximum(self.count, 1)
 

@@ -31,7 +31,7 @@ _MOST_STEP, _MOST_MOVE = 1.0, 0.03
 def is_typical(fit: BatchFit) -> NDArray[np.bool_]:
     """(E,) mask of fits whose contrast and chi2 are like those of most fits of the board."""
     contrast = fit.values[:, CONTRAST] / upper_median(fit.values[:, CONTRAST])
-    rough = fit.roughness
+    rough = fit.chi2_per_pixel
     usual = upper_median(rough)
     scatter = MAD_TO_SIGMA * upper_median(np.abs(rough - usual)) + 0.2 * usual
     return (contrast > _LEAST_CONTRAST**2) & (rough < usual + 4 * scatter) & (fit.count >= _LEAST_COUNT)
@@ -62,7 +62,7 @@ def is_reliable(fit: BatchFit, departure: Array, known: Array | None = None) -> 
     good &= (fit.step < _MOST_STEP) | (moved < _MOST_MOVE)
     good &= spread.max(axis=1) < (_MOST_SPREAD * fit.values[:, BLUR]) ** 2
     good &= np.abs(departure) < _LIMIT
-    rough = fit.roughness
+    rough = fit.chi2_per_pixel
     among = rough[good] if known is None else known
     usual = upper_median(among) if len(among) else 1.0
     scatter = MAD_TO_SIGMA * upper_median(np.abs(among - usual)) if len(among) else 0.0

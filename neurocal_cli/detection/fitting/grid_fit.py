@@ -301,7 +301,7 @@ def _last_fit(grid_image: GridImage, first: GridFit) -> GridFit:
     lines = grid_image.edges.lines(first.map.map)
     shading = _shading(first)
     fit, noise = _fine_fit(grid_image, first, lines, shading)
-    scale = max(upper_median(fit.roughness[good]) if good.any() else 1.0, _LEAST_SCALE)
+    scale = max(upper_median(fit.chi2_per_pixel[good]) if good.any() else 1.0, _LEAST_SCALE)
     fit, noise = fit.scaled(scale), noise.times(scale)
     variance = np.maximum(fit.covariance[:, OFFSET, OFFSET], _LEAST_VARIANCE)
     trusted = np.where(is_typical(fit) & (variance > _LEAST_VARIANCE), variance, _ANCHOR**2)
@@ -376,7 +376,7 @@ def fit_rim(grid_image: GridImage, fitted: GridFit) -> tuple[GridEdges, GridFit]
     variance = fit.covariance[:, OFFSET, OFFSET] + fitted.map.map.variance(edges.centre, lines.normal)
     departure = (fit.values[:, OFFSET] - shift) / np.sqrt(variance * fitted.map.excess)
     # Compare with the other edges, because the edges of a rim that is bad all around agree with each other.
-    good = is_reliable(fit, departure, known=fitted.fit.roughness[fitted.good])
+    good = is_reliable(fit, departure, known=fitted.fit.chi2_per_pixel[fitted.good])
     return edges, replace(fitted, lines=lines, fit=fit, good=good)
 
 
@@ -397,7 +397,7 @@ def fit_grid_vertices(
     unit = replace(data, root=data.root / np.float32(np.sqrt(fitted.noise.edge)))
     fit = fit_batch(vertex_model, unit, start, prior, shape, _STEPS)
     fit = fit.continued(shape, _STEPS, weight=fitted.noise.weights(fit.linear.x))
-    fit = fit.scaled(max(upper_median(fit.roughness), _LEAST_SCALE))
+    fit = fit.scaled(max(upper_median(fit.chi2_per_pixel), _LEAST_SCALE))
     departure = np.zeros(len(grid))
     for line, which in zip(lines, (FIRST, SECOND), strict=True):
         variance = fit.covariance[:, which, which] + fitted.map.map.variance(grid, line.normal)

@@ -71,7 +71,7 @@ def fit_initial(
         start = np.where(typical[:, None], started.values, start)
         start[:, BLUR] = found
         again = _with_best_profile(_few_steps(image, lines, start, known, shading, noise), lines, found)
-        if upper_median(again.roughness) < _WORSE * upper_median(started.roughness):
+        if upper_median(again.chi2_per_pixel) < _WORSE * upper_median(started.chi2_per_pixel):
             return again
     return _with_best_profile(started, lines, sigma)
 
@@ -92,7 +92,7 @@ def _few_steps(
 def _with_best_profile(started: BatchFit, lines: Lines, sigma: float) -> BatchFit:
     """Continue the fits with each blur profile, and choose the one with the lower chi2."""
     results = [_converged(started, shape) for shape in _blur_profiles(lines, sigma)]
-    smooth, box = (upper_median(results[k].roughness) for k in (0, -1))
+    smooth, box = (upper_median(results[k].chi2_per_pixel) for k in (0, -1))
     # Prefer the pixel's box if they are about equal, as they are if all edges run along the pixels.
     return results[0] if smooth < _CLEARLY * box else results[-1]
 

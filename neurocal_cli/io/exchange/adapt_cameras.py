@@ -17,11 +17,11 @@ _NO_SKEW = 1e-3  # px; a smaller loss is not reported
 _NO_LOSS = 5e-3  # share of the image; a smaller lost part is not reported
 _AS_NEAR, _NEARER = 1.1, 0.01  # a simpler model may lose this many times more than the best, or px more
 
-_Fitting = tuple[Camera, NearestCamera | None, str]  # None and "" if there is no loss to report
+_Adaptation = tuple[Camera, NearestCamera | None, str]  # None and "" if there is no loss to report
 
 
 @frozen_dataclass(eq=False)
-class Fitted:
+class AdaptedCameras:
     """Cameras adapted to a format.
 
     Attributes
@@ -41,7 +41,9 @@ class Fitted:
     moved: tuple[Distance | None, ...] = ()
 
 
-def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None = None) -> Fitted:
+def adapt_cameras(
+    cameras: CameraSet, target: Format, force: bool, model: str | None = None
+) -> AdaptedCameras:
     """Adapt cameras to a format, and to a distortion model if one is given.
 
     If the format's programs ignore skew, it is always removed; otherwise it would be ignored silently. The
@@ -74,16 +76,16 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None
     if model is not None and model not in target.models:
         held = ", ".join(target.models)
         raise InputError(f"{target.program} has no distortion model {model}; choose one of {held}")
-    losses, remarks, fitted, moved = [], [], [], []
+    losses, remarks, adapted, moved = [], [], [], []
     for camera, points in zip(cameras.cameras, _pixels_of(cameras), strict=True):
         if model is None:
-            new, near, loss = _fitted(camera, target, force, points)
+            new, near, loss = _adapted(camera, target, force, points)
         else:
             new, near, loss = _of_model(camera, model, target, points)
-        fitted.append(new)
+        adapted.append(new)
         losses += [f"{camera.name}: {loss}"] if loss else []
         moved.append(None if near is None else near.over_image)
-    changed = any(new is not old for new, old in zip(fitted, cameras.cameras, strict=True))
+    changed = any(new is not old for new, old in zip(adapted, cameras.cameras, strict=True))
     own = target.program == "neurocal"
     if cameras.origin is not None and (changed or not own):
         remarks.append(
@@ -94,8 +96,8 @@ def fitted_in(cameras: CameraSet, target: Format, force: bool, model: str | None
     if cameras.poses and not target.poses:
         remarks.append(f"a file of {target.program} has no place for the poses of {len(cameras.poses)} views")
     origin = cameras.origin if own and not changed else None
-    return Fitted(
-        replace(cameras, cameras=tuple(fitted), origin=origin), tuple(losses), tuple(remarks), tuple(moved)
+    return AdaptedCameras(
+        replace(cameras, cameras=tuple(adapted), origin=origin), tuple(losses), tuple(remarks), tuple(moved)
     )
 
 
@@ -108,7 +110,7 @@ def _pixels_of(cameras: CameraSet) -> list[Array | None]:
     return [part.points.pixels for part in parts]
 
 
-def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> _Fitting:
+def _of_model(camera: Camera, model: str, target: Format, points: Array | None) -> _Adaptation:
     straight = target.skew or not camera.intrinsics.skewed
     if with_model(camera.distortion, model) is not None and straight:
         return _as_model(camera, model), None, ""
@@ -116,7 +118,7 @@ def _of_model(camera: Camera, model: str, target: Format, points: Array | None) 
     return near.camera, near, f"the nearest {model}{'' if straight else ' without skew'} {_pixels(near)}"
 
 
-def _fitted(camera: Camera, target: Format, force: bool, points: Array | None) -> _Fitting:
+def _adapted(camera: Camera, target: Format, force: bool, points: Array | None) -> _Adaptation:
     model = next((m for m in target.models if with_model(camera.distortion, m) is not None), None)
     straight = target.skew or not camera.intrinsics.skewed
     if model is not None and straight:
