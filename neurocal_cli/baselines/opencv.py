@@ -79,7 +79,7 @@ def opencv(problem: Problem) -> Found:
     width = len(problem.free_camera) - 5
     state = CameraState(np.array([A[ENTRIES]]), R, t, names, np.array(k, dtype=float).ravel()[:width])
     if not (np.isfinite(state.entries).all() and (state.entries[0, [0, 2]] > 0).all()):
-        raise DegenerateGeometryError("OpenCV ended at numbers that are no camera")
+        raise DegenerateGeometryError("OpenCV's result is not a valid camera; use the method neuro")
     remarks = ("OpenCV's calibrateCamera has no skew: theta is a right angle",)
     return Found(problem, normalised(state, views), minimised=True, remarks=remarks)
 

@@ -17,7 +17,7 @@ _ELLIPTIC = 0.05  # deviation from an ellipse over its radius; that of a square 
 _EVEN = 0.5  # greatest spread of the distances between neighbours over their median
 _ALIKE = 1.0  # greatest logarithm of an area over the median area
 _SHARP = 1.25  # greatest ratio of areas at two brightness levels; a blurred square may look like a circle
-_WANTED = "neurocal takes a chessboard; `neurocal detect --help` says which"
+_WANTED = "neurocal takes a chessboard; `neurocal detect --help` describes it"
 
 
 def other_target(grey: NDArray[np.generic]) -> str:

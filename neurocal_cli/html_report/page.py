@@ -122,7 +122,7 @@ def figure(drawing: str, caption: str) -> str:
 def verdict_block(verdict: Verdict | None) -> str:
     """Show the word of the verdict, its measures, reasons and advice."""
     if verdict is None:
-        return '<div class="verdict">no verdict: the file has no points to be judged by. </div>'
+        return '<div class="verdict">no verdict, because the file has no points</div>'
     lists = ""
     for title, entries in (("Reasons", verdict.reasons), ("Advice", verdict.advice)):
         if entries:

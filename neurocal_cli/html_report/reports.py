@@ -285,7 +285,7 @@ def _repeat(command: str, calibration: Calibration, origin: Origin) -> str:
 
 def _origin(likely: str, origin: Origin, facts: Mapping[str, str]) -> str:
     """Describe the run, or a command with a similar result if the run is unknown."""
-    entries = {"command" if origin.command else "a command that gives the like": origin.command or likely}
+    entries = {"command" if origin.command else "a command with a similar result": origin.command or likely}
     entries |= facts
     if origin.versions:
         entries["versions"] = ", ".join(f"{name} {number}" for name, number in origin.versions.items())

@@ -110,7 +110,7 @@ def _common_model(lenses: Sequence[Distortion], source: str) -> tuple[str, Array
         return "fisheye", np.array(rows)
     if other := sorted(set(models) - set(_NESTED)):
         raise InputError(
-            f"{source}: cameras of the model {other[0]} are none of a zoom lens's; convert them with "
+            f"{source}: a zoom lens cannot have the distortion model {other[0]}; convert the cameras with "
             "neurocal convert --model rational, or fisheye"
         )
     padded = np.zeros((len(rows), len(MODELS[_NESTED[-1]])))

@@ -95,9 +95,7 @@ def advise(calibration: Calibration, count: int = 3) -> Advice:
     known, world = _Known.of(calibration), _target(calibration)
     options = candidates(calibration)
     if not options:
-        raise InputError(
-            "the camera can see the target whole in no view; check the image size and the target"
-        )
+        raise InputError("no view shows the whole target; check the image size and the target")
     told = [view_information(known.camera, known.free, option.pose, world) for option in options]
     before, more = known.worst(), np.zeros_like(known.information)
     chosen, after = [], []
@@ -173,9 +171,7 @@ def _free(calibration: Calibration) -> NDArray[np.bool_]:
     if not calibration.camera.intrinsics.skewed:
         free[1] = False
     if not free.any():
-        raise InputError(
-            "all parameters of the camera are given; there is nothing to be learnt from more views"
-        )
+        raise InputError("all parameters of the camera are given; more views cannot improve it")
     return free
 
 

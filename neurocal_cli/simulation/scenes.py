@@ -160,7 +160,7 @@ def random_poses(camera: Camera, board: Board, count: int, rng: np.random.Genera
         The camera has no image size, or no pose shows the whole board.
     """
     if camera.image_size is None:
-        raise InputError("the camera has no image size, so that nothing can be put into its image")
+        raise InputError("the camera has no image size; give a camera with one")
     corners = np.concatenate([plane.vertices().reshape(-1, 3) for plane in board.planes])
     centre = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
     facing = sum((plane.normal for plane in board.planes), np.zeros(3))

@@ -44,7 +44,7 @@ class CameraSet:
     def __post_init__(self) -> None:
         if len(self.relative) != len(self.cameras) - 1:
             raise InputError(
-                f"holds {len(self.cameras)} cameras, but not how they stand to each other; give a file with "
+                f"holds {len(self.cameras)} cameras, but not their relative poses; give a file with "
                 "one camera, or with the poses"
             )
 

@@ -97,7 +97,7 @@ def _cameras(text: str, source: str) -> dict[int, Camera]:
     cameras = {}
     for k, words in _lines(text):
         if not words[0].isdecimal():
-            raise FormatError("is no line of a camera; correct it", source, k)
+            raise FormatError("is not the line of a camera; correct it", source, k)
         cameras[int(words[0])] = _camera(words, source, k)
     return cameras
 
@@ -114,7 +114,9 @@ def _camera(words: list[str], source: str, line: int) -> Camera:
         if len(values) != focal + 2 + len([p for p in places if p is not None]):
             raise ValueError
     except (ValueError, IndexError) as error:
-        raise FormatError(f"is no line of a {model} camera; correct it", source, line) from error
+        raise FormatError(
+            f"is not the line of a camera with the model {model}; correct it", source, line
+        ) from error
     f, (cx, cy), k = values[:focal], values[focal : focal + 2] - _HALF, values[focal + 2 :]
     coefficients = np.array([0.0 if p is None else k[p] for p in places])
     return Camera(Intrinsics(f[0], f[-1], cx, cy), Distortion(ours, coefficients), size, f"camera{words[0]}")
@@ -144,7 +146,7 @@ def _rig(folder: str, ids: list[int]) -> tuple[Pose, ...]:
     except (ValueError, IndexError, KeyError) as error:
         if isinstance(error, FormatError):
             raise
-        raise FormatError("is no line of a rig of these cameras; correct it", source, line) from error
+        raise FormatError("is not the line of a rig of these cameras; correct it", source, line) from error
 
 
 def _poses(folder: str, camera: int) -> dict[str, Pose]:
@@ -164,7 +166,7 @@ def _poses(folder: str, camera: int) -> dict[str, Pose]:
             if int(words[8]) == camera:
                 poses[words[9].strip()] = _pose(np.array(words[1:8], dtype=float))
         except (ValueError, IndexError) as error:
-            raise FormatError("is no line of an image; correct it", source, k) from error
+            raise FormatError("is not the line of an image; correct it", source, k) from error
     return poses
 
 

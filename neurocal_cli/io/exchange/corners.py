@@ -207,7 +207,7 @@ def _assembled(
     views, count = pixels.shape[:2]
     found = np.isfinite(pixels).all(axis=2)
     if not found.any():
-        raise FormatError("holds no corner that was found; give another file", source)
+        raise FormatError("has no detected corner; give another file", source)
     labels = ids if ids is not None else [str(k) for k in range(count)]
     with value_failures(""):
         return Correspondences(
@@ -273,7 +273,7 @@ def _vnl(text: str, source: str, board: Board | None) -> Correspondences:
             level = float(words[3]) if len(words) > 3 and words[3] != "-" else 0.0
             corners.append((float(words[1]), float(words[2]), level))
         except (ValueError, IndexError) as error:
-            raise FormatError("is no line 'filename x y level'; correct it", source, number) from error
+            raise FormatError("is not a line 'filename x y level'; correct it", source, number) from error
     seen = {name: corners for name, corners in rows.items() if corners}
     counts = {len(corners) for corners in seen.values()}
     if len(counts) != 1:
@@ -329,7 +329,7 @@ def _table(name: str) -> Array:
         try:
             rows.append([float(word) for word in words if word])
         except ValueError as error:
-            raise FormatError("is no row of numbers; correct it", source, number) from error
+            raise FormatError("is not a row of numbers; correct it", source, number) from error
         if len(rows[-1]) != len(rows[0]) or len(rows[0]) not in (2, 3):
             raise FormatError("must be a row of 2 numbers or of 3, as all the others", source, number)
     if not rows:

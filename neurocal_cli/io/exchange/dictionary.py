@@ -57,9 +57,7 @@ def from_tree(root: Field) -> CameraSet:
     R = next((root[key] for key in _ROTATIONS if key in root), None)
     t = next((root[key] for key in _TRANSLATIONS if key in root), None)
     if R is None or t is None:
-        raise InputError(
-            "holds two cameras, but not R and T, how they stand to each other; give their file as well"
-        )
+        raise InputError("holds two cameras, but not their relative pose, R and T; give its file as well")
     pose = Pose(matrix_data(R, 9).reshape(3, 3), matrix_data(t, 3))
     return CameraSet(cameras, (pose,), _poses(root), unit)
 
@@ -90,9 +88,9 @@ def arrays_of(data: bytes, source: str) -> dict[str, Any]:
             raise FormatError(
                 "holds Python objects, which are not read; save each view's corners as numbers", source
             ) from error
-        raise FormatError("is no .npz file; save it again with numpy.savez", source) from error
+        raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
     except (OSError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise FormatError("is no .npz file; save it again with numpy.savez", source) from error
+        raise FormatError("is not an .npz file; save it again with numpy.savez", source) from error
 
 
 def _sides(root: Field) -> tuple[str, str] | None:

@@ -47,7 +47,7 @@ def parse(text: str, source: str) -> CameraSet:
     try:
         tree: Any = ast.literal_eval(text.strip())
     except (ValueError, SyntaxError, RecursionError, MemoryError) as error:
-        raise FormatError("is no camera model of mrcal; write it again", source) from error
+        raise FormatError("is not a camera model of mrcal; write it again", source) from error
     root = Field(tree, source)
     model = root["lensmodel"].text().removeprefix("LENSMODEL_")
     if model not in _LENGTHS:

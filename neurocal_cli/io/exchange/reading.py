@@ -102,7 +102,7 @@ def _joined(left: CameraSet, right: CameraSet, names: Sequence[str]) -> CameraSe
             raise FormatError("holds several cameras itself; give it alone", name)
     if left.program != right.program or left.program not in ("ROS", "mrcal"):
         raise InputError(
-            f"{names[0]} and {names[1]} do not say how the cameras stand to each other; give two files of "
+            f"{names[0]} and {names[1]} do not give the relative pose of the cameras; give two files of "
             "ROS or of mrcal, or the file of the rig"
         )
     if left.program == "ROS":
