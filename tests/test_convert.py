@@ -231,10 +231,10 @@ REFUSED = {
     "{K: [9, 0, 3, 0, 9, 2, 0, 0, 1], xi: 1, D: [1, 2, 3, 4], distortion_model: plumb_bob}": "'plumb_bob'",
     "1 THIN_PRISM_FISHEYE 640 480 1 2 3\n": ":1: the camera model 'THIN_PRISM_FISHEYE' is not known",
     "# a list\n1 OPENCV 640 480 1 2 3\n": ":2: is not the line of a camera with the model OPENCV",
-    "1 PINHOLE 640 480 1 2 3 4\n2 PINHOLE 640 480 1 2 3 4\n": "holds 2 cameras, but not how they stand",
+    "1 PINHOLE 640 480 1 2 3 4\n2 PINHOLE 640 480 1 2 3 4\n": "holds 2 cameras, but not their relative poses",
     "{ 'lensmodel': 'LENSMODEL_CAHVOR', 'intrinsics': [1] }": "the lens model 'CAHVOR' is not known",
     "{ 'lensmodel': __import__('os') }": "is not a camera model of mrcal",
-    "M1: [1,0,1,0,1,1,0,0,1]\nM2: [1,0,1,0,1,1,0,0,1]\n": "holds two cameras, but not R and T",
+    "M1: [1,0,1,0,1,1,0,0,1]\nM2: [1,0,1,0,1,1,0,0,1]\n": "holds two cameras, but not their relative pose, R and T",
 }
 
 
